@@ -1,4 +1,4 @@
-"""LCM takes any words for a URL, and then nobody hears it."""
+"""URLs of an LCM bus, which `DrakeLcm` does not check."""
 
 import pytest
 
@@ -7,11 +7,11 @@ from guiderail.models.common.errors import InputError
 
 
 @pytest.mark.parametrize("url", ["memq://", "udpm://239.255.76.67:7668?ttl=0"])
-def test_a_bus_is_the_one_that_was_named(url):
+def test_open_bus_has_the_given_url(url):
     assert open_bus(url).get_lcm_url() == url
 
 
-def test_without_a_url_it_is_lcms_own(monkeypatch):
+def test_open_bus_uses_lcms_default_without_a_url(monkeypatch):
     monkeypatch.delenv("LCM_DEFAULT_URL", raising=False)
     assert open_bus("").get_lcm_url().startswith("udpm://")
 
@@ -21,6 +21,6 @@ def test_without_a_url_it_is_lcms_own(monkeypatch):
     ["nonsense", "udp://239.255.76.67:7667", "memq:", "udpm://999.1.1.1:7667", "udpm://10.0.0.1:7667",
      "udpm://239.255.76.67:70000", "udpm://239.255.76.67:0", "udpm://host:7667"],
 )  # fmt: skip
-def test_where_nobody_hears_a_word_is_refused(url):
+def test_open_bus_raises_when_the_url_is_unusable(url):
     with pytest.raises(InputError, match="LCM"):
         open_bus(url)

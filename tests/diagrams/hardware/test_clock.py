@@ -1,4 +1,4 @@
-"""Who waits for whom; the wall's clock is never judged, only what is made of it."""
+"""Clocks of a hardware station, without assertions on real time."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from guiderail.diagrams.hardware import clock as pace_module
+from guiderail.diagrams.hardware import clock as clock_module
 from guiderail.diagrams.hardware.clock import IntervalHistogram, WallClock
 from guiderail.diagrams.hardware.driver import STATUS_PERIOD
 from guiderail.diagrams.hardware.lcm.driver import HEAD_SIZE, IiwaDriver
@@ -27,7 +27,7 @@ class Statuses(IiwaDriver):
     status_channel = "STATUS"
 
 
-class Told:
+class ClockRecorder:
     def __init__(self):
         self.clocks = []
 
@@ -35,35 +35,35 @@ class Told:
         self.clocks.append(clock)
 
 
-def test_a_step_for_each_status_and_without_one_after_a_while():
+def test_wall_clock_steps_per_status_or_after_a_timeout():
     lcm = DrakeLcm("memq://")
-    pace, told = WallClock(Statuses(lcm)), Told()
+    clock, recorder = WallClock(Statuses(lcm)), ClockRecorder()
     simulator = Simulator(ConstantVectorSource([0.0]))
-    pace.begin()
+    clock.begin()
     for number in range(3):
         lcm.Publish("STATUS", bytes([number]))
-        pace.advance(simulator, told, 1)
-    pace.advance(simulator, told, 2)  # nobody speaks: it goes on all the same
+        clock.advance(simulator, recorder, 1)
+    clock.advance(simulator, recorder, 2)  # without a status
     assert simulator.get_context().get_time() == 5 * STATUS_PERIOD
-    assert (np.diff(told.clocks) >= 0.5 * STATUS_PERIOD).all()
-    assert (np.diff(told.clocks)[-2:] >= 1.5 * STATUS_PERIOD).all()
+    assert (np.diff(recorder.clocks) >= 0.5 * STATUS_PERIOD).all()
+    assert (np.diff(recorder.clocks)[-2:] >= 1.5 * STATUS_PERIOD).all()
 
 
 @pytest.mark.parametrize("milliseconds", [1, 2, 4])
-def test_a_robot_that_speaks_too_often_does_not_hurry_it(monkeypatch, milliseconds):
-    """On a clock of its own, on which waiting passes time and every so often a status arrives."""
-    lcm, now, said = DrakeLcm("memq://"), 0.0, 0
+def test_wall_clock_skips_statuses_that_come_too_often(monkeypatch, milliseconds):
+    """On a simulated wall clock, which waiting advances."""
+    lcm, now, sent = DrakeLcm("memq://"), 0.0, 0
 
-    def speak():
-        nonlocal said
-        while said * milliseconds <= 1000 * now:
-            lcm.Publish("STATUS", said.to_bytes(8, "big"))
-            said += 1
+    def send():
+        nonlocal sent
+        while sent * milliseconds <= 1000 * now:
+            lcm.Publish("STATUS", sent.to_bytes(8, "big"))
+            sent += 1
 
     def sleep(seconds):
         nonlocal now
         now += seconds
-        speak()
+        send()
 
     class Bus:
         def Subscribe(self, *arguments):
@@ -74,20 +74,20 @@ def test_a_robot_that_speaks_too_often_does_not_hurry_it(monkeypatch, millisecon
                 sleep(1e-3)
                 lcm.HandleSubscriptions(0)
 
-    monkeypatch.setattr(pace_module.time, "monotonic", lambda: now)
-    monkeypatch.setattr(pace_module.time, "sleep", sleep)
-    pace, told = WallClock(Statuses(Bus())), Told()
+    monkeypatch.setattr(clock_module.time, "monotonic", lambda: now)
+    monkeypatch.setattr(clock_module.time, "sleep", sleep)
+    clock, recorder = WallClock(Statuses(Bus())), ClockRecorder()
     simulator = Simulator(ConstantVectorSource([0.0]))
-    pace.begin()
-    pace.advance(simulator, told, 400)
-    assert told.clocks[-1] >= 399 * STATUS_PERIOD
-    # Held up once, it makes up for nothing: it is half a step ahead at most.
+    clock.begin()
+    clock.advance(simulator, recorder, 400)
+    assert recorder.clocks[-1] >= 399 * STATUS_PERIOD
+    # A delay is not made up for: the clock is at most half a step ahead.
     now += 1.0
-    pace.advance(simulator, told, 200)
-    assert told.clocks[-1] >= told.clocks[399] + 1.0 + 198.5 * STATUS_PERIOD - 1e-9
+    clock.advance(simulator, recorder, 200)
+    assert recorder.clocks[-1] >= recorder.clocks[399] + 1.0 + 198.5 * STATUS_PERIOD - 1e-9
 
 
-def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():
+def test_events_of_an_instant_have_its_wall_clock_time():
     class Clocked(LeafSystem):
         def __init__(self):
             super().__init__()
@@ -106,11 +106,11 @@ def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():
     assert station.seen == [None, 0.0, STATUS_PERIOD]
 
 
-def test_a_slower_clock_is_told_as_such():
-    slow, fast = Told(), Told()
-    for told, rate in ((slow, 0.25), (fast, 1.0)):
-        pace = WallClock(Statuses(DrakeLcm("memq://")), rate=rate)
-        pace.advance(Simulator(ConstantVectorSource([0.0])), told, 2)
+def test_wall_clock_scales_time_by_the_rate():
+    slow, fast = ClockRecorder(), ClockRecorder()
+    for recorder, rate in ((slow, 0.25), (fast, 1.0)):
+        clock = WallClock(Statuses(DrakeLcm("memq://")), rate=rate)
+        clock.advance(Simulator(ConstantVectorSource([0.0])), recorder, 2)
     assert slow.clocks[1] - slow.clocks[0] >= 1.5 * STATUS_PERIOD
     assert slow.clocks[0] == pytest.approx(0.25 * fast.clocks[0], rel=0.01)
     for rate in (0.0, 1.1, np.nan):
@@ -118,7 +118,7 @@ def test_a_slower_clock_is_told_as_such():
             WallClock(Statuses(DrakeLcm("memq://")), rate=rate)
 
 
-def test_a_message_that_is_sent_again_counts_once():
+def test_message_counter_counts_repeats_once():
     lcm = DrakeLcm("memq://")
     messages = Statuses(lcm).statuses
     for message in (b"one", b"one", b"two", b"one"):
@@ -127,7 +127,7 @@ def test_a_message_that_is_sent_again_counts_once():
     assert messages.count == 3
 
 
-def test_gaps_are_counted_without_being_kept():
+def test_interval_histogram_has_quantiles_and_longest():
     gaps = IntervalHistogram()
     assert np.isnan(gaps.quantile(0.5))
     for seconds in [0.005] * 98 + [0.0312, 1.5]:
@@ -137,7 +137,7 @@ def test_gaps_are_counted_without_being_kept():
     assert gaps.longest == 1.5
 
 
-def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
+def test_message_counter_compares_type_and_time():
     lcm = DrakeLcm("memq://")
     messages = Statuses(lcm).statuses
     head = bytes(range(16))
@@ -147,30 +147,30 @@ def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
     assert messages.count == 2
 
 
-def test_in_step_a_status_that_comes_again_is_answered_again_and_is_no_step():
-    lcm, words = DrakeLcm("memq://"), []
-    pace, simulator = LockstepClock(Statuses(lcm), 0.01), Simulator(ConstantVectorSource([0.0]))
-    lcm.Subscribe("STATUS" + ACKNOWLEDGED, words.append)
-    pace.begin()
+def test_lockstep_clock_acknowledges_repeats_without_a_step():
+    lcm, acknowledgements = DrakeLcm("memq://"), []
+    clock, simulator = LockstepClock(Statuses(lcm), 0.01), Simulator(ConstantVectorSource([0.0]))
+    lcm.Subscribe("STATUS" + ACKNOWLEDGED, acknowledgements.append)
+    clock.begin()
     for number in range(3):
         for _ in range(3):
             lcm.Publish("STATUS", bytes([number]) * 40)
-        pace.advance(simulator, Told(), 1)
+        clock.advance(simulator, ClockRecorder(), 1)
         lcm.HandleSubscriptions(0)
     assert simulator.get_context().get_time() == 3 * STATUS_PERIOD
-    # What is asked for is the status after this one, and not before anybody wants it.
-    assert words == [b"", *(bytes([number]) * HEAD_SIZE for number in range(2))]
-    words.clear()
+    # A status is acknowledged when the next one is needed.
+    assert acknowledgements == [b"", *(bytes([number]) * HEAD_SIZE for number in range(2))]
+    acknowledgements.clear()
     lcm.Publish("STATUS", bytes([2]) * 40)
-    pace.advance(simulator, Told(), 1)  # nobody speaks but of what is known: the word was lost, and it goes on without
+    clock.advance(simulator, ClockRecorder(), 1)  # only repeats arrive: the step is made without a status
     while lcm.HandleSubscriptions(0):
         pass
-    assert len(words) > 1
-    assert set(words) == {bytes([2]) * HEAD_SIZE}
+    assert len(acknowledgements) > 1
+    assert set(acknowledgements) == {bytes([2]) * HEAD_SIZE}
 
 
-def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
-    """Words about the one before, which was sent again meanwhile, move it no further."""
+def test_serve_waits_for_the_acknowledgement_of_its_status():
+    """A repeated acknowledgement of the previous status has no effect."""
     within, lcm, heard = DrakeLcm("memq://"), DrakeLcm("memq://"), []
     simulator = Simulator(SimulatedIiwa(BncWorkcell(), within))
 
@@ -187,8 +187,8 @@ def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
     assert [heard.count(head) for head in dict.fromkeys(heard)][:4] == [3] * 4
 
 
-def test_in_step_it_does_not_matter_who_is_faster():
-    """An answer to the first status that says so, or to its repetition, counts for the same step."""
+def test_lockstep_is_independent_of_timing():
+    """An answer to a status or to its repetition counts for the same step."""
     moved = []
     for wait in (1, 2):
         within, lcm, heard = DrakeLcm("memq://"), DrakeLcm("memq://"), []
@@ -210,7 +210,7 @@ def test_in_step_it_does_not_matter_who_is_faster():
     assert np.abs(moved[0] - moved[0].round(1)).max() > 1e-4
 
 
-def test_a_word_that_is_none_answers_nothing():
+def test_serve_ignores_a_malformed_acknowledgement():
     within, lcm = DrakeLcm("memq://"), DrakeLcm("memq://")
     simulator = Simulator(SimulatedIiwa(BncWorkcell(), within))
     lcm.Subscribe(
@@ -221,8 +221,8 @@ def test_a_word_that_is_none_answers_nothing():
 
 
 @pytest.mark.parametrize(("periods", "says"), [(MAX_MISSED_MESSAGES - 1, False), (MAX_MISSED_MESSAGES + 1, True)])
-def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch, periods, says):
-    said, wall = [], [0.0]
+def test_serve_in_real_time_reports_a_delay_once(monkeypatch, periods, says):
+    sent, wall = [], [0.0]
     monkeypatch.setattr("guiderail.diagrams.hardware.lcm.simulated.time.monotonic", lambda: wall[0])
 
     def attend():
@@ -231,8 +231,8 @@ def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch,
 
     attended = []
     simulator = Simulator(ConstantVectorSource([0.0]))
-    serve_in_real_time(simulator, 3 * STATUS_PERIOD, attend, 1.0, said.append)
+    serve_in_real_time(simulator, 3 * STATUS_PERIOD, attend, 1.0, sent.append)
     assert len(attended) == 3
-    assert bool(said) == says
-    assert len(said) <= 1
-    assert all("give a smaller --rate" in words for words in said)
+    assert bool(sent) == says
+    assert len(sent) <= 1
+    assert all("give a smaller --rate" in acknowledgements for acknowledgements in sent)

@@ -8,7 +8,7 @@ from guiderail.diagrams.hardware.lcm.simulated import LockstepClock, serve_in_lo
 from guiderail.models.common.errors import InputError
 
 
-def test_where_a_handler_would_end_the_process_nobody_listens(monkeypatch):
+def test_clocks_raise_when_message_handlers_are_unsafe(monkeypatch):
     monkeypatch.setattr(lcm_driver, "handlers_are_safe", lambda: False)
     lcm = DrakeLcm("memq://")
     driver = IiwaDriver(lcm)

@@ -1,4 +1,4 @@
-"""Who stands by at a robot, on a bus in memory."""
+"""Safety monitor on a bus in memory."""
 
 import numpy as np
 import pytest
@@ -22,19 +22,19 @@ def known():
 
 
 class Bus:
-    """A robot that says how fast it is, a deputy, and everything that is said to the robot."""
+    """Bus with statuses of a robot, a safety monitor, and records of commands and heartbeats."""
 
     def __init__(self, known):
-        self.lcm, self.time, self.heard, self.words = DrakeLcm("memq://"), 100.0, [], []
+        self.lcm, self.time, self.commands, self.heartbeats = DrakeLcm("memq://"), 100.0, [], []
         self.limits = safety_limits(known.plant, IiwaDriver)
         self.monitor = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits)
-        self.lcm.Subscribe("IIWA_COMMAND", self.hear)
-        self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self.words.append)
+        self.lcm.Subscribe("IIWA_COMMAND", self.record_command)
+        self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self.heartbeats.append)
 
-    def hear(self, message):
+    def record_command(self, message):
         torque = IiwaDriver.decode_command(message)
         if torque is not None:
-            self.heard.append(torque)
+            self.commands.append(torque)
 
     def status(self, velocities=MOVING, steps=1, **changed):
         for _ in range(steps):
@@ -57,91 +57,91 @@ class Bus:
             pass
 
 
-def test_damps_within_the_limits_where_commands_stop_then_says_no_torque_and_falls_silent(known):
+def test_monitor_damps_then_rests_when_commands_stop(known):
     bus = Bus(known)
     for _ in range(10):
         bus.status()
         bus.command([1.0] * 7)
-    bus.heard.clear()
+    bus.commands.clear()
     bus.status(steps=MAX_MISSED_MESSAGES)
-    assert bus.heard == []
+    assert bus.commands == []
     bus.status(velocities=10.0 * MOVING, steps=2)
     assert bus.monitor.state == MonitorState.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
     decay_time = bus.limits.decay_time
     wanted = -(M @ (10.0 * MOVING)) * (1.0 - np.exp(-PERIOD / decay_time)) / PERIOD
-    np.testing.assert_allclose(bus.heard[-1], np.clip(wanted, -np.array(bus.limits.torque), bus.limits.torque))
+    np.testing.assert_allclose(bus.commands[-1], np.clip(wanted, -np.array(bus.limits.torque), bus.limits.torque))
     assert (np.abs(wanted) > bus.limits.torque).any()
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
     assert bus.monitor.state == MonitorState.RESTING
-    np.testing.assert_array_equal(bus.heard[-1], 0.0)
+    np.testing.assert_array_equal(bus.commands[-1], 0.0)
     bus.status(steps=20)
     assert bus.monitor.state == MonitorState.IDLE
-    said = len(bus.heard)
+    count = len(bus.commands)
     bus.status(steps=20)
-    assert len(bus.heard) == said
+    assert len(bus.commands) == count
 
 
-def test_goes_on_to_the_end_where_commands_come_back_and_says_so(known):
+def test_monitor_finishes_damping_when_commands_return(known):
     bus = Bus(known)
     bus.status()
     bus.command([1.0] * 7)
     bus.status(steps=MAX_MISSED_MESSAGES + 2)
-    acting = bus.words[-1]
+    acting = bus.heartbeats[-1]
     assert acting[-1] == 1
     for _ in range(5):
         bus.command([1.0] * 7)
         bus.status()
     assert bus.monitor.state == MonitorState.DAMPING
-    assert bus.words[-1][-1] == 1
-    assert bus.words[-1] != acting
+    assert bus.heartbeats[-1][-1] == 1
+    assert bus.heartbeats[-1] != acting
 
 
-def test_has_nothing_to_do_where_the_last_command_was_no_torque_or_none_ever_came(known):
+def test_monitor_is_idle_without_a_torque_to_stop(known):
     bus = Bus(known)
     bus.status(steps=50)
     assert bus.monitor.state == MonitorState.IDLE
     bus.command([1.0] * 7)
     bus.status()
     bus.command([0.0] * 7)
-    bus.heard.clear()
+    bus.commands.clear()
     bus.status(steps=50)
-    assert (bus.monitor.state, bus.heard) == (MonitorState.IDLE, [])
+    assert (bus.monitor.state, bus.commands) == (MonitorState.IDLE, [])
 
 
-def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
+def test_monitor_ignores_malformed_messages(known):
     bus = Bus(known)
     bus.status()
     bus.command([1.0] * 7)
-    said = len(bus.words)
+    count = len(bus.heartbeats)
     for message in (bytes(range(100)), b""):
         bus.publish("IIWA_STATUS", message)
         bus.publish("IIWA_COMMAND", message)
     bus.status(joint_velocity_estimated=[np.nan] * 7)
     bus.status(num_joints=3, **{name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]})
-    assert len(bus.words) == said
+    assert len(bus.heartbeats) == count
     bus.status(steps=MAX_MISSED_MESSAGES)
     assert bus.monitor.state == MonitorState.DAMPING
 
 
-def test_a_robot_that_was_started_anew_is_brought_to_rest_at_once(known):
-    """What was on its way to the one before arrives at this one; statuses that were merely overtaken start nothing."""
+def test_monitor_damps_at_once_when_the_robot_restarts(known):
+    """Commands for the robot before its restart may still arrive; reordered statuses have no effect."""
     bus = Bus(known)
     bus.status(steps=5)
     bus.command([1.0] * 7)
     bus.time -= 3.5 * PERIOD
     bus.status()
     assert bus.monitor.state == MonitorState.WATCHING
-    bus.heard.clear()
+    bus.commands.clear()
     bus.time = 0.0
     bus.status(velocities=0.1 * MOVING)
     assert bus.monitor.state == MonitorState.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
     share = -np.expm1(-PERIOD / bus.limits.decay_time)
-    np.testing.assert_allclose(bus.heard[-1], -(M @ (0.1 * MOVING)) * share / PERIOD, rtol=1e-6)
+    np.testing.assert_allclose(bus.commands[-1], -(M @ (0.1 * MOVING)) * share / PERIOD, rtol=1e-6)
 
 
-def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
+def test_monitor_rests_in_time_when_the_clock_is_set_back(known):
     bus = Bus(known)
     bus.status()
     bus.command([1.0] * 7)
@@ -153,11 +153,11 @@ def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
     assert bus.monitor.state == MonitorState.RESTING
 
 
-def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
+def test_monitor_damps_in_time_with_reordered_statuses(known):
     bus = Bus(known)
     bus.status()
     bus.command([1.0] * 7)
     for _ in range(MAX_MISSED_MESSAGES):
-        for ahead in (2, 0):  # the second of two comes first
+        for ahead in (2, 0):  # the second of two arrives first
             bus.status(utime=round((bus.time + ahead * PERIOD) * 1e6))
     assert bus.monitor.state == MonitorState.DAMPING

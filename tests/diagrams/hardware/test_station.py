@@ -1,4 +1,4 @@
-"""The hardware station against a simulated arm at the other end of LCM."""
+"""Hardware station with a simulated arm on LCM."""
 
 import itertools
 import os
@@ -34,7 +34,7 @@ ALIASES = ("position_measured", "velocity_estimated", "state_estimated", "torque
 
 
 class OneProcess:
-    """Both sides of a bus in memory, stepped in turn."""
+    """Station and robot on a bus in memory, stepped in turn."""
 
     def __init__(self, settled=True):
         self.lcm = lcm = DrakeLcm("memq://")
@@ -53,10 +53,10 @@ class OneProcess:
         self._steps = 0
         if settled:
             self.go(START, 0.4)
-            assert self.phase == ArmState.RUNNING
+            assert self.arm_state == ArmState.RUNNING
 
     @property
-    def phase(self):
+    def arm_state(self):
         return ArmState(int(self["arm_state"][0]))
 
     @property
@@ -64,7 +64,7 @@ class OneProcess:
         return Fault(int(self["fault"][0]))
 
     def go(self, pose, seconds, robot=True):
-        """Both for some time, or the station alone: then no status comes."""
+        """Advance both, or the station only, without statuses."""
         self.desired.GetMutableData().set_value(pose)
         for _ in range(round(seconds / PERIOD)):
             self._steps += 1
@@ -77,18 +77,18 @@ class OneProcess:
         return self.station.GetOutputPort(port).Eval(self.context)
 
 
-def test_starts_by_holding_where_the_robot_is():
+def test_station_starts_by_holding_the_pose():
     both = OneProcess()
     np.testing.assert_allclose(both["pose"], START, atol=1e-6)
     both.go(np.full(6, np.nan), 0.3)  # no command yet
     np.testing.assert_allclose(both["pose"], START, atol=1e-3)
 
 
-def test_follows_pushes_and_feels_over_messages():
+def test_station_follows_and_measures_force():
     both = OneProcess()
     both.go(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0], 1.0)
     np.testing.assert_allclose(both["pose"][:3], START[:3] + [0.01, 0, 0], atol=1e-3)
-    # Turned by 45°, the mouth stands on the lugs: 10 N of push come back as 10 N.
+    # Turned by 45°, the mouth rests on the lugs, and a push of 10 N is measured as 10 N.
     lug_top = 0.005975
     turned = np.array([0.0, 0.0, 0.012, np.pi / 4, 0.0, 0.0])
     both.go(turned, 1.75)
@@ -98,8 +98,8 @@ def test_follows_pushes_and_feels_over_messages():
     assert both["pose"][2] == pytest.approx(lug_top, abs=5e-4)
 
 
-def test_two_processes_on_one_machine(monkeypatch):
-    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "lcm")  # with a time to live of zero: no message leaves this machine
+def test_station_moves_a_robot_in_another_process(monkeypatch):
+    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "lcm")  # no message leaves this machine with a time to live of zero
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     call = f"from guiderail.tools.cli.main import main; main(['sim-driver', '--url', {url!r}, '--seconds', '1.5'])"
     command = [sys.executable, "-c", call]
@@ -122,7 +122,7 @@ def test_two_processes_on_one_machine(monkeypatch):
 
 
 def status(both, **changed):
-    """The next status as the robot would send it at rest, with some fields changed."""
+    """Return the next status of the robot at rest, with some fields changed."""
     message = lcmt_iiwa_status()
     positions = both["iiwa.position_measured"].tolist()
     message.utime, message.num_joints = round((both.context.get_time() + PERIOD) * 1e6), 7
@@ -149,8 +149,8 @@ def pushing():
 
 
 @pytest.mark.parametrize("name", FAULTY)
-def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told(pushing, name):
-    """The arm is on its way; one wrong status comes, in place of the robot's."""
+def test_station_stops_at_a_faulty_status_and_resumes(pushing, name):
+    """One faulty status replaces the robot's while the arm moves."""
     both, (fault, changed) = pushing, FAULTY[name]
     side = 0.01 * (-1.0) ** list(FAULTY).index(name)
     goal = START + [side, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -161,11 +161,11 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     both.go(goal, PERIOD, robot=False)
     assert both.fault == fault
     both.go(goal, 0.1)
-    assert both.phase == ArmState.DAMPING
+    assert both.arm_state == ArmState.DAMPING
     assert np.isfinite(both.torques).all()
     assert (np.abs(both.torques) <= both.station.limits.torque).all()
     both.go(goal, 0.25)
-    assert (both.phase, both.fault) == (ArmState.OFF, fault)
+    assert (both.arm_state, both.fault) == (ArmState.OFF, fault)
     np.testing.assert_array_equal(both["iiwa.torque_commanded"], 0.0)
     assert both.commands[-1].joint_torque == (0.0,) * 7
     left = np.abs(both["iiwa.velocity_estimated"]).max()
@@ -174,13 +174,13 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     both.go(goal, 0.05)
     assert np.linalg.norm((both["pose"] - before)[:3]) < 1e-3
     both.go(goal, 0.4)
-    assert both.phase == ArmState.RUNNING
+    assert both.arm_state == ArmState.RUNNING
     assert np.linalg.norm((both["pose"] - goal)[:3]) < 0.5 * np.linalg.norm((before - goal)[:3])
     assert np.isfinite(both["wrench"]).all()
     assert left < 0.02
 
 
-def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
+def test_station_stops_and_is_silent_when_statuses_stop():
     both = OneProcess()
     goal = START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
     both.go(goal, 0.06)
@@ -190,12 +190,12 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     both.go(goal, 0.5, robot=False)
     found = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
     assert found * PERIOD <= 0.05
-    assert (both.phase, both.fault) == (ArmState.OFF, Fault.STALE)
+    assert (both.arm_state, both.fault) == (ArmState.OFF, Fault.STALE)
     sent = len(both.commands)
     assert both.commands[-1].joint_torque == (0.0,) * 7
     both.go(goal, 1.0, robot=False)
     assert len(both.commands) == sent
-    # The robot is back: nothing is sent to it before it has settled, and then no torque.
+    # After the robot is back nothing is sent until the settling time is over, and then zero torque.
     back = len(both.torques)
     both.robot_simulator.AdvanceTo(both.robot_simulator.get_context().get_time() + PERIOD)
     both.go(goal, 0.2)
@@ -205,11 +205,11 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     np.testing.assert_array_equal(both.torques[back:], 0.0)
     both.station.resume(both.context)
     both.go(goal, 1.0)
-    assert both.phase == ArmState.RUNNING
+    assert both.arm_state == ArmState.RUNNING
     np.testing.assert_allclose(both["pose"][:3], goal[:3], atol=2e-3)
 
 
-def test_no_command_before_the_drivers_start_up_is_over():
+def test_station_sends_nothing_during_the_hold_off():
     both = OneProcess(settled=False)
     both.go(START, 0.25)
     assert both.commands == []
@@ -217,15 +217,15 @@ def test_no_command_before_the_drivers_start_up_is_over():
     assert both.commands
 
 
-def test_stops_when_asked():
+def test_stop_damps_the_arm():
     both = OneProcess()
     both.station.stop(both.context)
     both.go(START, 0.05)
-    assert (both.phase, both.fault) == (ArmState.DAMPING, Fault.USER_STOP)
+    assert (both.arm_state, both.fault) == (ArmState.DAMPING, Fault.USER_STOP)
     assert both["command_timed_out"][0] == 1.0
 
 
-def test_another_station_takes_over_without_letting_go():
+def test_copy_state_from_continues_without_a_gap():
     both = OneProcess()
     goal = START + [0.005, 0.0, 0.0, 0.0, 0.0, 0.0]
     both.go(goal, 0.3)
@@ -247,8 +247,8 @@ def test_another_station_takes_over_without_letting_go():
     np.testing.assert_allclose(other.get_pose_output_port().Eval(context)[:3], goal[:3], atol=1.5e-3)
 
 
-def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
-    """An iiwa's driver says it so; a Franka's says what the arm does to them."""
+def test_external_torque_is_that_of_the_surroundings():
+    """An iiwa reports this torque, a Franka the opposite."""
     iiwa, panda = lcmt_iiwa_status(), lcmt_panda_status()
     for message in (iiwa, panda):
         message.num_joints = 7
@@ -262,7 +262,7 @@ def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
 
 
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
-def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
+def test_limits_are_below_the_drivers_reflex_limits(robot):
     station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), robot=robot)
     torque_reflex_limits = np.array(station.driver.torque_reflex_limits)
     assert (np.array(station.limits.torque) < torque_reflex_limits).all()
@@ -270,26 +270,26 @@ def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
     assert station.HasOutputPort(f"{station.driver.name}.torque_external")
 
 
-def test_the_full_wrench_at_the_longest_lever_is_clipped_on_the_wrist_alone():
-    """With an outstretched tool the impedance's limits would take more than the driver allows on joints 4 to 6."""
+def test_full_wrench_exceeds_limits_of_the_wrist_only():
+    """With a stretched tool the impedance's limits exceed those of the torques on joints 4 to 6."""
     station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))
     load = station.max_torque_shares(station.controller_plant.solve(START, station.controller_plant.posture))
     assert (load[[0, 1, 2, 6]] < 0.7).all()
     assert 1.0 < load[3:6].max() < 1.5
 
 
-def test_no_wrench_within_its_limits_loads_a_joint_more_than_is_read_out():
+def test_max_torque_shares_bound_all_wrenches():
     station = HardwareStation(
         WORKCELL, IiwaDriver(DrakeLcm("memq://")), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1))
     )
     positions = station.controller_plant.solve(START, station.controller_plant.posture)
-    J = np.roll(station._jacobian(positions), 3, axis=0)  # the force first
+    J = np.roll(station._jacobian(positions), 3, axis=0)  # force first
     corners = np.array(list(itertools.product(*((-limit, limit) for limit in (40.0, 30.0, 20.0, 1, 2, 3)))))
     worst = np.abs(corners @ J).max(axis=0) / np.array(station.limits.torque)
     np.testing.assert_allclose(station.max_torque_shares(positions), worst)
 
 
-def test_says_that_no_robot_answers():
+def test_start_raises_when_no_robot_answers():
     station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), robot_timeout=0.1)
     simulator = Simulator(station)
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
@@ -297,13 +297,13 @@ def test_says_that_no_robot_answers():
         station.start(simulator)
 
 
-def test_a_real_arm_is_not_put_anywhere():
+def test_set_pose_raises():
     station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))
     with pytest.raises(InputError, match="move it there"):
         station.set_pose(station.CreateDefaultContext(), START)
 
 
-def test_a_deputy_is_heard_in_a_larger_diagram_too():
+def test_heartbeat_is_received_within_a_larger_diagram():
     lcm, builder = DrakeLcm("memq://"), DiagramBuilder()
     station = builder.AddSystem(HardwareStation(WORKCELL, IiwaDriver(lcm), robot_timeout=0.0))
     simulator = Simulator(builder.Build())
@@ -316,7 +316,7 @@ def test_a_deputy_is_heard_in_a_larger_diagram_too():
     assert station.has_safety_monitor(context)
 
 
-def test_all_stations_have_the_same_ports():
+def test_stations_have_the_same_ports():
     stations = [
         GantryStation(WORKCELL),
         ArmStation(WORKCELL),
@@ -336,13 +336,13 @@ def test_all_stations_have_the_same_ports():
 @pytest.mark.parametrize(
     "wrong", [{"stiffness": (1.0,) * 5}, {"limits": (0.0,) * 6}, {"damping_ratio": 0.0}, {"stiffness": (np.nan,) * 6}]
 )
-def test_refuses_an_impedance_that_makes_no_sense(wrong):
+def test_impedance_raises_when_a_parameter_is_invalid(wrong):
     with pytest.raises(InputError):
         Impedance(**wrong)
 
 
-def test_a_pandas_commands_say_the_time_on_the_wall():
-    """Drake's driver for it drops what is older than a tenth of a second, by that clock."""
+def test_panda_commands_have_the_wall_clock_time():
+    """Drake's driver drops commands that are older than 0.1 s by this clock."""
     before = time.time_ns() // 1000
     command = lcmt_panda_command.decode(find_driver("panda").encode(np.arange(7.0), 0.005))
     assert before <= command.utime <= time.time_ns() // 1000

@@ -1,4 +1,4 @@
-"""Every arm under the same impedance, by what it does: it holds, yields, follows, locks a connector and grips."""
+"""Behavior of the arm station with every arm: compliance, tracking, insertion, gripping."""
 
 import dataclasses
 
@@ -25,11 +25,11 @@ from guiderail.models.robots.robot import find_robot
 
 WORKCELL = BncWorkcell()
 ROBOTS = ("iiwa14", "panda", "ur5e")
-STIFFNESS = np.array([1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0])  # the station's, of [force, torque]
+STIFFNESS = np.array([1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0])  # of the station, force first
 
 
 class Held:
-    """A station with its jack far away, told to stay where it is put, and a hand that pushes its tool."""
+    """Arm station with its jack far away, which holds a pose while a wrench acts on its tool."""
 
     def __init__(self, robot, pose, *, impedance=None):
         self.station = ArmStation(WORKCELL, impedance or Impedance(), robot=robot)
@@ -57,7 +57,7 @@ class Held:
         return self.arm.tool_centre.CalcPose(self.plant_context, self.arm.target)
 
     def put(self, q):
-        """At rest in a posture, and told to stay there."""
+        """Put the arm at rest in a posture, which it holds."""
         self.plant.SetPositions(self.plant_context, self.arm.model, q)
         pose = self.station.get_pose_output_port().Eval(self.station.GetMyContextFromRoot(self.context))
         self.desired.GetMutableData().set_value(pose)
@@ -74,7 +74,7 @@ def displacement(before, after):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_every_arm_inserts_and_locks_where_the_pose_is_known(robot):
+def test_arm_inserts_and_locks_at_the_nominal_pose(robot):
     times, motion = insert_and_lock()
     driven, recording = drive_along(ArmStation(WORKCELL, robot=robot), times, motion)
     X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
@@ -82,12 +82,12 @@ def test_every_arm_inserts_and_locks_where_the_pose_is_known(robot):
     assert np.abs(X.translation()).max() < 0.3 * MM
     assert recording["contact_force"].max() < 15.0
     assert not recording["saturation"].any()
-    # In the first second, before anything touches, it lags behind by little.
+    # In the first second, before contact, the tracking error is small.
     assert np.abs(recording["pose"] - recording["desired_pose"])[:50, :3].max() < 1.5 * MM
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_static_displacement_is_the_compliance_times_the_wrench(robot):
+def test_static_displacement_equals_compliance_times_wrench(robot):
     held = Held(robot, np.array([-0.10, 0.12, 0.15, 1.2, 0.2, -0.3]))
     before = held.X_TP()
     wrench = np.array([6.0, -4.0, 8.0, 0.3, -0.2, 0.4])
@@ -99,8 +99,8 @@ def test_static_displacement_is_the_compliance_times_the_wrench(robot):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_pushed_and_released_it_comes_to_rest_at_the_plants_step(robot):
-    """With a tenth of the usual damping even: a controller that is too slow for what it controls would ring."""
+def test_arm_rests_after_a_push_at_the_plant_time_step(robot):
+    """With a tenth of the damping, where a controller that is too slow would oscillate."""
     held = Held(robot, MID_TURN_POSE, impedance=Impedance(damping_ratio=0.1))
     before = held.X_TP()
     held.push([15.0, -10.0, 12.0, 0.5, -0.5, 0.5])
@@ -116,22 +116,22 @@ def test_pushed_and_released_it_comes_to_rest_at_the_plants_step(robot):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_a_quarter_turn_lies_in_the_middle_of_the_last_joints_range(robot):
+def test_quarter_turn_is_centered_in_the_last_joints_range(robot):
     known = ArmControllerPlant(WORKCELL, robot)
     lower, upper = known.plant.GetPositionLowerLimits()[-1], known.plant.GetPositionUpperLimits()[-1]
     last = [known.solve(MID_TURN_POSE + [0, 0, 0, turn, 0, 0], known.posture)[-1] for turn in (-np.pi / 4, np.pi / 4)]
     assert abs(known.posture[-1] - 0.5 * (lower + upper)) < np.deg2rad(15.0)
-    # A redundant arm turns with its elbow too, so that its last joint turns by less.
+    # A redundant arm also moves its elbow, so its last joint turns less.
     assert np.deg2rad(70.0) < abs(last[1] - last[0]) < np.deg2rad(91.0)
     assert min(min(last) - lower, upper - max(last)) > np.deg2rad(90.0)
 
 
-# The wrist's axes in line, and the arm stretched out: an arm of six joints loses a direction there.
+# Aligned wrist axes, and a stretched arm, where an arm of six joints loses a direction.
 WRIST, ELBOW = np.array([-0.24, -1.4, 1.85, -2.0, 0.0, 0.0]), np.array([-0.24, -1.4, 0.0, -2.0, -1.57, 0.0])
 
 
 @pytest.mark.parametrize("singular", [WRIST, ELBOW])
-def test_an_arm_of_six_joints_rests_in_a_singular_posture(singular):
+def test_six_joint_arm_rests_in_a_singular_posture(singular):
     held = Held("ur5e", MID_TURN_POSE)
     held.put(singular)
     held.push([8.0, 5.0, -6.0, 0.3, 0.3, -0.3])
@@ -145,8 +145,8 @@ def test_an_arm_of_six_joints_rests_in_a_singular_posture(singular):
     assert held.speeds.max() < 0.03
 
 
-def test_pulled_to_its_full_length_an_arm_does_not_jerk():
-    """The tool is told to go 20 cm farther than the arm is long. Torques change by little from step to step.
+def test_torques_are_smooth_at_the_end_of_the_workspace():
+    """With a command 20 cm outside of the workspace, torques change little from step to step.
 
     With the plain inverse of the inertia at the tool they jump by more than 10 Nm, back and forth.
     """
@@ -167,7 +167,7 @@ def test_pulled_to_its_full_length_an_arm_does_not_jerk():
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_arms_have_the_same_ports_and_a_reset_is_exact(robot):
+def test_ports_are_equal_and_reset_is_exact(robot):
     station = ArmStation(WORKCELL, robot=robot)
     assert [station.get_input_port(i).get_name() for i in range(station.num_input_ports())] == [
         "desired_pose",
@@ -181,7 +181,7 @@ def test_arms_have_the_same_ports_and_a_reset_is_exact(robot):
         np.testing.assert_allclose(station.get_pose_output_port().Eval(context), pose, atol=1e-9)
 
 
-def test_a_robot_is_chosen_by_name_where_an_environment_is_made():
+def test_environment_selects_robot_by_name():
     env = make_env("GridClamp", station="arm", robot="ur5e")
     assert env.task.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
     with pytest.raises(InputError, match="did you mean ur5e"):
@@ -190,7 +190,7 @@ def test_a_robot_is_chosen_by_name_where_an_environment_is_made():
         make_env("GridClamp", robot="panda")
 
 
-def test_refuses_a_robot_whose_model_moves_by_more_than_its_joints():
+def test_station_raises_when_the_model_has_other_joints():
     fewer = dataclasses.replace(
         find_robot("iiwa14"), joints=find_robot("iiwa14").joints[:6], home=(0.0,) * 6, drives=None, level_posture=None
     )
@@ -199,7 +199,7 @@ def test_refuses_a_robot_whose_model_moves_by_more_than_its_joints():
 
 
 class BlockOnATable:
-    """A block between the fingers of a gripper that holds nothing yet."""
+    """Workcell with a block between the fingers of a gripper."""
 
     X_WT = RigidTransform([0.5, 0.0, 0.2])
     WEIGHT = 0.2 * 9.81
@@ -229,7 +229,7 @@ class BlockOnATable:
 
 
 @pytest.mark.parametrize("robot", ["panda", "ur5e"])
-def test_a_gripper_grips_lifts_and_lets_go(robot):
+def test_gripper_grips_lifts_and_releases(robot):
     workcell = BlockOnATable()
     station = ArmStation(workcell, robot=robot, end_effector="parallel_gripper")
     simulator = Simulator(station)
@@ -244,35 +244,35 @@ def test_a_gripper_grips_lifts_and_lets_go(robot):
     def block_height():
         return workcell.block.EvalPoseInWorld(plant_context).translation()[2]
 
-    simulator.AdvanceTo(0.2)  # not connected, it stays open
+    simulator.AdvanceTo(0.2)  # open, because the port is not connected
     assert state.Eval(context)[0] == pytest.approx(0.04, abs=1e-4)
     fingers = station.get_gripper_position_input_port().FixValue(context, [0.0])
     simulator.AdvanceTo(0.7)
-    assert state.Eval(context)[0] == pytest.approx(0.02, abs=5e-4)  # the block is between the fingers
+    assert state.Eval(context)[0] == pytest.approx(0.02, abs=5e-4)  # width of the block
     force = station.plant.get_net_actuation_output_port(station.arm.tool_model).Eval(plant_context)
-    np.testing.assert_allclose(force, [-60.0], atol=1e-6)  # the motor's limit, not its drive's 100 N
+    np.testing.assert_allclose(force, [-60.0], atol=1e-6)  # limit of the motor; the drive's is 100 N
     desired.GetMutableData().set_value([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     simulator.AdvanceTo(2.2)
-    fingers.GetMutableData().set_value([np.nan])  # no command: it goes on holding
+    fingers.GetMutableData().set_value([np.nan])  # NaN: it continues to grip
     simulator.AdvanceTo(2.5)
     assert block_height() > 0.28
     wrench = station.get_wrench_output_port().Eval(context)
     assert wrench[2] == pytest.approx(-workcell.WEIGHT, abs=0.05)
     assert np.abs(wrench[:2]).max() < 0.05
-    fingers.GetMutableData().set_value([1.0])  # wider than it can
+    fingers.GetMutableData().set_value([1.0])  # above the upper limit
     simulator.AdvanceTo(3.2)
     assert state.Eval(context)[0] == pytest.approx(0.04, abs=1e-3)
     assert block_height() < 0.21
 
 
-def test_a_rigid_tool_has_no_gripper():
+def test_rigid_tool_has_no_gripper_ports():
     station = ArmStation(WORKCELL)
     assert not station.HasInputPort("gripper_position")
     assert not station.HasOutputPort("gripper_state")
 
 
-def test_pose_and_transform_agree_over_the_arms_workspace():
-    """The tool centre is where its pose says, tilted or not, for a tool that is bolted on turned."""
+def test_pose_equals_the_transform_in_the_workspace():
+    """The tool center has the commanded pose, tilted or not, with a tool that is mounted rotated."""
     known = ArmControllerPlant(WORKCELL, "ur5e")
     context = known.plant.CreateDefaultContext()
     pose = np.array([0.03, -0.02, 0.08, 0.9, 0.15, -0.2])

@@ -1,4 +1,4 @@
-"""The connector's physics, by pushing, turning and pulling it."""
+"""Physics of the connector: pushing, turning and pulling."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def run(times, z_mm, yaw_deg, *, time_step=0.005, impedance=None, prepare=None):
 
 
 def lock_and(times, z_mm, yaw_deg):
-    """What was recorded until the plug was locked, and from there on, along more poses."""
+    """Return the recordings until the plug is locked, and along further poses."""
     lock_times, lock_poses = insert_and_lock()
     t = np.concatenate([lock_times, lock_times[-1] + np.array(times)])
     z = np.concatenate([lock_poses[:, 2] / MM, z_mm])
@@ -39,7 +39,7 @@ def lock_and(times, z_mm, yaw_deg):
 
 @pytest.fixture(scope="module")
 def locked_and_pulled():
-    pull = 40.0 / STIFFNESS / MM + 5.0  # beyond the effort limit, which is what pulls
+    pull = 40.0 / STIFFNESS / MM + 5.0  # beyond the effort limit
     return lock_and([0.5, 1.0], [pull, pull], [0, 0])
 
 
@@ -48,7 +48,7 @@ def locked(locked_and_pulled):
     return locked_and_pulled[0]
 
 
-def test_known_pose_inserts_and_locks(locked):
+def test_plug_locks_at_the_nominal_pose(locked):
     final = locked["pose"][-1]
     assert np.abs(final[:3]).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
@@ -56,16 +56,16 @@ def test_known_pose_inserts_and_locks(locked):
     assert not locked["saturation"].any()
 
 
-def test_the_sensor_feels_what_the_impedance_pushes_with(locked):
-    """At rest on the seat, and while turning slowly, the two are one force."""
+def test_wrench_equals_the_force_of_the_impedance(locked):
+    """At rest on the seat, and while turning slowly."""
     turning = slice(250, 330)
     np.testing.assert_allclose(
         np.linalg.norm(locked["wrench"][turning, :3], axis=1), locked["contact_force"][turning, 0], atol=0.6
     )
 
 
-def test_rotating_before_insertion_is_blocked_by_the_lugs():
-    """Turned by 45°, the mouth's face sits on the lugs, 30 N of push or not."""
+def test_rotation_is_blocked_before_insertion():
+    """Turned by 45°, the mouth's face rests on the lugs, with and without a push of 30 N."""
     depth = LUG_TOP - 30.0 / STIFFNESS / MM
     _, recording = run([0, 1.5, 2.5, 3.5], [CLEAR / MM, LUG_TOP + 1, depth, depth], [45, 45, 45, 45])
     assert recording["wrench"][-1, 2] == pytest.approx(30.0, abs=1.5)
@@ -74,22 +74,22 @@ def test_rotating_before_insertion_is_blocked_by_the_lugs():
 
 @pytest.mark.parametrize("lug_depth_in_slot", [1.5, 2.4])
 def test_rotation_is_blocked_in_the_entry_slot(lug_depth_in_slot):
-    """With the lugs between the entry's walls, a quarter turn commanded leaves a few degrees of play."""
+    """With the lugs between the walls of the entry, a commanded quarter turn turns it by a few degrees of play."""
     z = WORKCELL.dimensions.lug_height / MM - WORKCELL.dimensions.locked_height / MM - lug_depth_in_slot
     _, recording = run([0, 1.5, 3.0, 3.5], [CLEAR / MM, z, z, z], [90, 90, 0, 0])
     assert np.rad2deg(recording["pose"][-1, 3]) > 80.0
     assert abs(recording["wrench"][-1, 5]) > 1.0
 
 
-def test_pulling_after_locking_holds(locked_and_pulled):
+def test_locked_plug_resists_a_pull(locked_and_pulled):
     _, recording = locked_and_pulled
     assert recording["saturation"][-1, 0] == 1.0
     assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
     assert recording["pose"][-1, 2] < 0.5 * MM
 
 
-def test_the_detent_has_a_break_out_torque():
-    """Turning back without a push is resisted by the ramp's apex, and possible with enough torque."""
+def test_detent_has_a_break_out_torque():
+    """The ramp's apex resists turning back without a push, up to a torque."""
     _, recording = lock_and([1.5, 1.7], [0, 0], [80, 80])
     resistance = np.abs(recording["wrench"][:, 5])
     in_detent = np.rad2deg(recording["pose"][:, 3]) < 8.0
@@ -98,8 +98,8 @@ def test_the_detent_has_a_break_out_torque():
 
 
 @pytest.mark.parametrize(("z_mm", "yaw_deg"), [(-40.0, 45.0), (-40.0, 90.0)])
-def test_the_plug_does_not_tunnel_when_pushed_at_the_effort_limit(z_mm, yaw_deg):
-    """On the lugs or on the seat, with all the force there is."""
+def test_plug_does_not_tunnel_at_the_effort_limit(z_mm, yaw_deg):
+    """On the lugs and on the seat, with the largest force."""
     _, recording = run([0, 1.0, 2.0, 3.0], [CLEAR / MM, 9.0, z_mm, z_mm], [yaw_deg] * 4)
     floor = (
         LUG_TOP
@@ -110,13 +110,13 @@ def test_the_plug_does_not_tunnel_when_pushed_at_the_effort_limit(z_mm, yaw_deg)
     assert recording["pose"][-1, 2] > (floor - 0.6) * MM
 
 
-def test_the_lugs_do_not_tunnel_when_turned_at_the_effort_limit():
+def test_lugs_do_not_tunnel_at_the_effort_limit():
     _, recording = run([0, 1.0, 2.5, 3.5], [CLEAR / MM, 3.0, 3.0, 3.0], [90, 90, -90, -90])
     assert recording["saturation"][-1, 0] == 1.0
     assert np.rad2deg(recording["pose"][-1, 3]) > 80.0
 
 
-def test_halving_the_plant_step_changes_the_locked_pose_little(locked):
+def test_locked_pose_is_insensitive_to_the_time_step(locked):
     times, motion = insert_and_lock()
     _, recording = drive_along(GantryStation(WORKCELL, time_step=0.0025), times, motion)
     difference = recording["pose"][-1] - locked["pose"][-1]
@@ -124,7 +124,7 @@ def test_halving_the_plant_step_changes_the_locked_pose_little(locked):
     assert np.abs(np.rad2deg(difference[3:])).max() < 0.5
 
 
-def test_a_jack_that_was_moved_in_the_context_is_locked_where_it_is():
+def test_plug_locks_on_a_jack_moved_in_the_context():
     X_TTactual = RigidTransform([3.0 * MM, -2.0 * MM, 1.0 * MM])
     times, motion = insert_and_lock()
     shifted = motion + np.array([*X_TTactual.translation(), 0, 0, 0])
@@ -138,14 +138,14 @@ def test_a_jack_that_was_moved_in_the_context_is_locked_where_it_is():
     np.testing.assert_allclose(recording["pose"][-1, :3], X_TTactual.translation(), atol=0.3 * MM)
 
 
-def test_a_plug_that_was_held_askew_is_what_has_to_hit_the_jack():
+def test_plug_locks_with_a_grasp_offset():
     offset = np.array([1.5 * MM, 0.0, 0.0])
     times, motion = insert_and_lock()
 
     def grasp(plant, context):
         WORKCELL.set_grasp_offset(plant, context, RigidTransform(offset))
 
-    # The offset turns with the tool: the tool centre has to go around, and not straight from corner to corner.
+    # The offset turns with the tool, so the path of the tool center is an arc.
     fine = np.linspace(0.0, times[-1], 401)
     dense = np.stack([np.interp(fine, times, column) for column in motion.T], axis=1)
     dense[:, 0] -= offset[0] * np.cos(dense[:, 3])
@@ -155,7 +155,7 @@ def test_a_plug_that_was_held_askew_is_what_has_to_hit_the_jack():
     assert np.abs(X.translation()).max() < 0.3 * MM
 
 
-def test_without_correction_an_offset_of_one_and_a_half_millimetres_jams():
+def test_uncorrected_offset_of_1_5_mm_jams():
     def move(plant, context):
         WORKCELL.set_jack_offset(plant, context, RigidTransform([1.5 * MM, 0.0, 0.0]))
 

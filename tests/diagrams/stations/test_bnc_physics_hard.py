@@ -1,4 +1,4 @@
-"""The connector's physics where it is hard: with hardly any chamfer it locks and holds, at a finer contact too."""
+"""Physics of the hard connector, with a smaller chamfer, also with finer contact."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORK
 
 @pytest.fixture(scope="module", params=[{}, FINE], ids=["as studied", "fine"])
 def build(request):
-    """Makes the station."""
+    """Return a function that builds the station."""
     options = {"difficulty": "hard", **request.param}
     workcell = EnvConfig.resolve("BncConnector", options).make_task().workcell()
     return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
@@ -28,7 +28,7 @@ def build(request):
 
 @pytest.fixture(scope="module")
 def locked_and_pulled(build):
-    """Locked where the pose is known, then pulled at by more than the effort limit gives."""
+    """Lock the plug, then command a pull beyond the effort limit."""
     times, motion = insert_and_lock()
     pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
     times = np.concatenate([times, times[-1] + [1.0, 1.5]])
@@ -36,23 +36,23 @@ def locked_and_pulled(build):
     return recording
 
 
-def test_it_is_another_connector():
+def test_hard_connector_differs_from_the_standard():
     assert WORKCELL.dimensions != BncDimensions()
 
 
-def test_known_pose_inserts_and_locks(locked_and_pulled):
+def test_plug_locks_at_the_nominal_pose(locked_and_pulled):
     final = locked_and_pulled["pose"][round(insert_and_lock()[0][-1] / 0.02) - 1]
     assert np.abs(final[:3]).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
     assert locked_and_pulled["contact_force"][:400].max() < HARD.collision.above
 
 
-def test_pulling_after_locking_holds(locked_and_pulled):
+def test_locked_plug_resists_a_pull(locked_and_pulled):
     assert locked_and_pulled["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
     assert locked_and_pulled["pose"][-1, 2] < 0.5 * MM
 
 
-def test_rotating_before_insertion_is_blocked_by_the_lugs(build):
+def test_rotation_is_blocked_before_insertion(build):
     depth = LUG_TOP - 30.0 / STIFFNESS
     motion = poses(np.array([CLEAR, LUG_TOP + 1.0 * MM, depth, depth]), np.deg2rad(45.0))
     _, recording = drive_along(build(), np.array([0.0, 1.0, 2.0, 2.5]), motion)

@@ -1,4 +1,4 @@
-"""What may be other than it should be: each disturbance does what it says, and none is there unless asked for."""
+"""Effects of the disturbances, all of which are off by default."""
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.units import MM
 
 DOWN = np.array([0.0, 0.0, -1.0])
-CLAMP = {"fixture_offset": "none", "action_repeat": 25}  # where nothing else is drawn that matters
+CLAMP = {"fixture_offset": "none", "action_repeat": 25}  # without other random effects
 
 
 def descended(decisions=3, seed=1, **options):
-    """Environment and observations of a clamp that comes down beside its holes, onto the table."""
+    """Return environment and observations of a clamp that is pushed onto the table next to its holes."""
     env = make_env("GridClamp", **CLAMP, **options)
     observation, info = env.reset(seed=seed, options={"offset": (1.5 * MM, 1.5 * MM)})
     seen = [observation]
@@ -31,14 +31,14 @@ def plain():
     return descended()
 
 
-def test_nothing_is_between_unless_asked_for(plain):
+def test_station_is_undisturbed_by_default(plain):
     env, _, info = plain
     assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
     assert "friction_factor" not in info
     assert not EnvConfig.resolve("GridClamp", {}).parts["disturbances"].any
 
 
-def test_drawn_errors_repeat_with_their_seed_and_differ_without_it(plain):
+def test_disturbances_depend_on_the_seed(plain):
     options = {"wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.02), "wrench_noise": (0.2, 0.01), "pose_bias": 1e-3}
     _, first, info = descended(**options)
     _, again, _ = descended(**options)
@@ -51,7 +51,7 @@ def test_drawn_errors_repeat_with_their_seed_and_differ_without_it(plain):
     assert not np.array_equal(first, plain[1])
 
 
-def test_friction_and_modulus_are_the_plants_own_until_the_next_reset():
+def test_contact_factors_last_until_the_next_reset():
     env, _, info = descended(1, friction_factor=(0.5, 0.5), modulus_factor=(0.1, 0.1))
     assert info["friction_factor"] == pytest.approx(0.5)
 
@@ -73,23 +73,23 @@ def test_friction_and_modulus_are_the_plants_own_until_the_next_reset():
     assert surfaces()["pad"].GetProperty("hydroelastic", "hydroelastic_modulus") == pytest.approx(1e5)
 
 
-def test_a_softer_impedance_pushes_less_for_the_same_command(plain):
+def test_smaller_stiffness_leads_to_a_smaller_force(plain):
     soft, _, _ = descended(stiffness_factor=0.5)
     assert max(soft.trace.force) < 0.7 * max(plain[0].trace.force)
 
 
-def test_another_clock_is_another_control_period():
+def test_control_period_is_that_of_the_disturbed_clock():
     env, _, _ = descended(1, control_period=3 * PLANT_PERIOD)
     assert env.task.control_period == pytest.approx(3 * PLANT_PERIOD)
     assert env.task.control_period != CONTROL_PERIOD
 
 
-def test_lost_and_late_commands_leave_the_tool_behind(plain):
+def test_lost_and_late_commands_delay_the_tool(plain):
     late, _, _ = descended(1, late_commands=20)
     assert late.trace.measured[-1, 2] > plain[0].trace.measured[24, 2] + 1.0 * MM
 
 
-def test_which_commands_are_lost_is_not_read_off_the_stream_of_the_noise():
+def test_lost_commands_are_independent_of_the_noise():
     env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, action_repeat=1)
     station = env.task.diagram.GetSubsystemByName("station")
     commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
@@ -104,10 +104,10 @@ def test_which_commands_are_lost_is_not_read_off_the_stream_of_the_noise():
         lost.append(is_lost)
         of_one_stream.append(stream.uniform() < 0.3)
     assert 0.1 < np.mean(lost) < 0.5
-    assert np.mean(np.equal(lost, of_one_stream)) < 0.8  # of independent ones 0.58
+    assert np.mean(np.equal(lost, of_one_stream)) < 0.8  # 0.58 for independent ones
 
 
-def test_a_payload_hangs_from_the_arms_tool_and_its_controller_knows_nothing_of_it():
+def test_payload_lowers_the_tool_of_an_arm():
     env = make_env("GridClamp", station="arm", payload=0.3)
     env.reset(seed=0)
     arm = env.task.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
@@ -127,12 +127,12 @@ def test_a_payload_hangs_from_the_arms_tool_and_its_controller_knows_nothing_of_
         ({"lost_commands": 1.0}, "less than 1"),
     ],
 )
-def test_what_makes_no_sense_is_refused(options, words):
+def test_environment_raises_when_a_disturbance_is_invalid(options, words):
     with pytest.raises(InputError, match=words):
         make_env("GridClamp", **options)
 
 
-def test_a_robot_is_not_disturbed():
+def test_environment_raises_when_hardware_is_disturbed():
     from guiderail.diagrams.envs.make import make_skill
 
     with pytest.raises(InputError, match="real robot"):

@@ -1,4 +1,4 @@
-"""The rails under their own springs and under a controller: the same impedance, by what it does."""
+"""Behavior of the gantry station with joint springs and with a Cartesian controller."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.stations import gantry as gantry
+from guiderail.diagrams.stations import gantry
 from guiderail.diagrams.stations.gantry import GantryStation, max_stable_time_step
 from guiderail.diagrams.stations.station import INPUTS, PLANT_PERIOD, Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
@@ -22,7 +22,7 @@ STIFFNESS = np.array(Impedance().stiffness)
 
 
 class Held:
-    """The rails with their jack far away, told to stay where they are put, and a hand that pushes the tool."""
+    """Gantry with its jack far away, which holds a pose while a wrench acts on its tool."""
 
     def __init__(self, pose, control, impedance=None, time_step=None):
         self.station = GantryStation(WORKCELL, impedance or Impedance(), time_step, impedance_control=control)
@@ -55,7 +55,7 @@ class Held:
 
 
 @pytest.mark.parametrize("control", CONTROLS)
-def test_static_displacement_is_the_compliance_times_the_wrench(control):
+def test_static_displacement_equals_compliance_times_wrench(control):
     held = Held(np.array([0.01, -0.02, 0.05, 0.0, 0.0, 0.0]), control)
     before = held.out("pose").copy()
     wrench = np.array([6.0, -4.0, 8.0, 0.3, -0.2, 0.4])
@@ -68,8 +68,8 @@ def test_static_displacement_is_the_compliance_times_the_wrench(control):
     assert held.out("saturation")[0] == 0.0
 
 
-def test_a_step_is_answered_alike():
-    """At a fine time step: angles within 5 % of the step, positions within 2 %, and all within 1 % from 0.1 s on."""
+def test_step_responses_of_both_controls_agree():
+    """At a fine time step: angles within 5 % of the step, positions within 2 %, and all within 1 % after 0.1 s."""
     own, controlled = (np.array(step_response(control, 0.00125)["response"]) for control in CONTROLS)
     assert np.abs(own - controlled).max() < 0.05
     assert np.abs(own - controlled)[:, :3].max() < 0.02
@@ -77,7 +77,7 @@ def test_a_step_is_answered_alike():
     assert controlled.max() < 1.001  # critically damped: no overshoot
 
 
-def test_it_pushes_with_no_more_than_its_limits():
+def test_force_is_limited():
     held = Held(np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]), "cartesian")
     held.push([60.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     held.advance(0.2)
@@ -85,7 +85,7 @@ def test_it_pushes_with_no_more_than_its_limits():
     assert held.out("contact_force")[0] == pytest.approx(40.0)
 
 
-def test_the_station_has_the_same_ports():
+def test_ports_are_equal_for_both_controls():
     own, controlled = (GantryStation(WORKCELL, impedance_control=control) for control in CONTROLS)
     for count, get in (("num_input_ports", "get_input_port"), ("num_output_ports", "get_output_port")):
         names = [[getattr(s, get)(i).get_name() for i in range(getattr(s, count)())] for s in (own, controlled)]
@@ -105,16 +105,16 @@ def fastest_after_a_push(impedance, time_step):
 
 
 @pytest.mark.parametrize("impedance", [Impedance(), Impedance(damping_ratio=0.4)])
-def test_a_time_step_at_which_the_controller_would_ring_is_refused(impedance, monkeypatch):
+def test_station_raises_when_the_time_step_is_unstable(impedance, monkeypatch):
     longest = max_stable_time_step(impedance)
     with pytest.raises(InputError, match="too long for impedance_control='cartesian'"):
         GantryStation(WORKCELL, impedance, longest, impedance_control="cartesian")
     assert fastest_after_a_push(impedance, 0.95 * longest) < 0.01
-    monkeypatch.setattr(gantry, "_refuse_long_step", lambda impedance, time_step: None)
-    assert fastest_after_a_push(impedance, 1.1 * longest) > 1.0  # until the limits hold it
+    monkeypatch.setattr(gantry, "_check_time_step", lambda impedance, time_step: None)
+    assert fastest_after_a_push(impedance, 1.1 * longest) > 1.0  # unstable up to the limits
 
 
-def test_the_control_is_chosen_where_an_environment_is_made():
+def test_environment_selects_the_impedance_control():
     env = make_env("BncConnector", impedance_control="cartesian")
     station = env.task.diagram.GetSubsystemByName("station")
     assert station.HasSubsystemNamed("controller")

@@ -1,4 +1,4 @@
-"""The grid clamp's physics, by pushing, tilting and pulling it."""
+"""Physics of the grid clamp: pushing, tilting and pulling."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.models.common.units import MM
 
 WORKCELL = GridClampWorkcell()
-SURFACE = WORKCELL.dimensions.peg_length  # height of the tips in T when they stand on the table
-BESIDE = 1.0 * MM  # farther than this from its hole's centre a tip is not in the hole
+SURFACE = WORKCELL.dimensions.peg_length  # height of the tips on the table, in T
+MAX_OFFSET = 1.0 * MM  # of a tip in its hole from the hole's center
 PUSH_60_N = Impedance(limits=(60.0, 60.0, 60.0, 3.0, 3.0, 3.0))
 
 
 def descend(times, z_mm, *, xy_mm=(0.0, 0.0), tilt_deg=0.0, grasp_mm=None, table_mm=None, station=GantryStation, **kw):
-    """Drives along z at a place and a tilt; returns the driven station and the recording."""
+    """Drive along z at a position and a tilt; return the driven station and the recording."""
     poses = np.zeros((len(times), 6))
     poses[:, :2] = np.array(xy_mm) * MM
     poses[:, 2] = np.array(z_mm) * MM
@@ -38,7 +38,7 @@ def inserted():
     return descend([0.0, 0.88, 1.2], [16.0, -6.0, -6.0])
 
 
-def test_known_pose_snaps_in_with_at_most_ten_newtons(inserted):
+def test_clamp_snaps_in_with_at_most_10_n(inserted):
     driven, recording = inserted
     X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.1 * MM
@@ -46,8 +46,8 @@ def test_known_pose_snaps_in_with_at_most_ten_newtons(inserted):
     assert np.abs(recording["wrench"][:, :3]).max() <= 10.0
 
 
-def test_the_snap_resists_and_then_gives_way(inserted):
-    """Force grows over the lip, falls away past it, and only then comes back: from the shoulder."""
+def test_snap_resists_then_yields(inserted):
+    """The force grows up to the lip, drops behind it, and grows again at the shoulder."""
     _, recording = inserted
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     at_lip, past_lip = (z > 0.9) & (z < 1.3), (z > 0.1) & (z < 0.5)
@@ -56,17 +56,17 @@ def test_the_snap_resists_and_then_gives_way(inserted):
     assert force[-1] > force[past_lip].max()
 
 
-def test_the_snap_holds_against_a_light_pull_and_yields_to_a_strong_one():
+def test_snap_resists_a_light_pull_and_yields_to_a_strong_one():
     _, recording = descend([0, 0.9, 1.4, 2.0, 3.5, 4.2], [16, -6, -6, 1, 1, 16])
     z, force = recording["pose"][:, 2], recording["wrench"][:, 2]
-    assert z[170] < 0.6 * MM  # pulled by 1 mm of spring, 1.5 N, and still in
+    assert z[170] < 0.6 * MM  # still in, pulled by 1 mm of spring, 1.5 N
     assert z[-1] > 10.0 * MM
     assert -12.0 < force.min() < -2.0
 
 
 @pytest.mark.parametrize(("xy_mm", "tilt_deg"), [((2.5, 0.0), 0.0), ((1.5, 1.5), 0.0), ((0.0, 0.0), 6.0), ((0, 3), 4)])
-def test_sixty_newtons_do_not_force_the_pegs_through_the_table(xy_mm, tilt_deg):
-    """Beside its hole or tilted: no tip gets below the table's face anywhere but in its own hole."""
+def test_pegs_do_not_tunnel_through_the_table_at_60_n(xy_mm, tilt_deg):
+    """Next to its hole or tilted, no tip is below the table's surface except in its own hole."""
     driven, recording = descend(
         [0, 0.5, 1.5, 2.5], [22, 12, -40, -40], xy_mm=xy_mm, tilt_deg=tilt_deg, impedance=PUSH_60_N
     )
@@ -74,12 +74,12 @@ def test_sixty_newtons_do_not_force_the_pegs_through_the_table(xy_mm, tilt_deg):
     X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
     d = WORKCELL.dimensions
     tips = X @ np.column_stack([d.peg_positions, np.zeros(5)]).T
-    beside = np.hypot(*(tips[:2] - d.peg_positions.T)) > BESIDE
+    beside = np.hypot(*(tips[:2] - d.peg_positions.T)) > MAX_OFFSET
     assert (tips[2][beside] > SURFACE - 0.2 * MM).all()
     assert beside.all() or tilt_deg != 0.0
 
 
-def test_sixty_newtons_sideways_do_not_pull_a_seated_clamp_through_the_walls():
+def test_seated_clamp_does_not_tunnel_sideways_at_60_n():
     poses = np.zeros((4, 6))
     poses[:, 2] = np.array([16.0, -4.0, -4.0, -4.0]) * MM
     poses[2:, 0] = 60.0 * MM
@@ -88,7 +88,7 @@ def test_sixty_newtons_sideways_do_not_pull_a_seated_clamp_through_the_walls():
     assert np.abs(WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context).translation()).max() < 0.3 * MM
 
 
-def test_halving_the_plant_step_changes_the_snap_little(inserted):
+def test_snap_is_insensitive_to_the_time_step(inserted):
     _, fine = descend([0.0, 0.88, 1.2], [16.0, -6.0, -6.0], time_step=0.0025)
     assert np.abs(fine["pose"][-1, :3] - inserted[1]["pose"][-1, :3]).max() < 0.05 * MM
     peak, fine_peak = (r["wrench"][r["pose"][:, 2] > 0.9 * MM, 2].max() for r in (inserted[1], fine))
@@ -96,8 +96,8 @@ def test_halving_the_plant_step_changes_the_snap_little(inserted):
 
 
 @pytest.mark.parametrize("moved", ["grasp_mm", "table_mm"])
-def test_offsets_moved_in_the_context_are_where_the_clamp_goes_in(moved):
-    """Blocked where the nominal pose leads; in where the command makes up for the offset."""
+def test_clamp_inserts_at_offsets_set_in_the_context(moved):
+    """It is blocked at the nominal pose, and inserts if the command compensates the offset."""
     offset = np.array([1.8, -1.2])
     _, blocked = descend([0, 0.88, 1.2], [16, -6, -6], **{moved: offset})
     assert blocked["pose"][-1, 2] > SURFACE - 0.2 * MM
@@ -108,8 +108,8 @@ def test_offsets_moved_in_the_context_are_where_the_clamp_goes_in(moved):
     assert found["contact_force"].max() <= 10.0
 
 
-def test_what_friction_bears_does_not_creep():
-    """Beside its holes, 27 N down and 2 N sideways, where 5.4 N would slip: it keeps its place for three seconds."""
+def test_sticking_contact_does_not_creep():
+    """Next to its holes with 27 N down and 2 N sideways, below the 5.4 N at which it slips, for 3 s."""
     poses = np.array([[16.0, 2.5], [-6.0, 2.5], [-6.0, 2.5 + 2.0 / 1.5], [-6.0, 2.5 + 2.0 / 1.5]])  # 1.5 N/mm
     _, recording = drive_along(
         GantryStation(WORKCELL),
@@ -122,7 +122,7 @@ def test_what_friction_bears_does_not_creep():
     assert abs(x[-1] - x[-150]) < 0.03 * MM
 
 
-def test_the_arm_inserts_too():
+def test_arm_inserts_the_clamp():
     driven, recording = descend([0.0, 1.8, 2.0], [16.0, -6.0, -6.0], station=ArmStation)
     X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM

@@ -1,4 +1,4 @@
-"""Insertion is simulated with pressure fields throughout: no contact of one falls back to a single point."""
+"""Insertions have hydroelastic contact only, without a fallback to point contact."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_no_contact_of_an_insertion_is_a_point(case):
+def test_insertion_has_no_point_contact(case):
     task, options, action, drawn = CASES[case]
     env = make_env(task, **options)
     env.reset(seed=0, options=drawn)

@@ -1,4 +1,4 @@
-"""The connector's and the clamp's physics in another engine, held to what Drake's is held to."""
+"""Physics of connector and clamp in MuJoCo, with the criteria of those in Drake."""
 
 import sys
 
@@ -44,7 +44,7 @@ def workpiece_in_fixture(driven, workpiece, fixture):
 
 @pytest.fixture(scope="module")
 def locked_and_pulled():
-    """Locked where the pose is known, on a jack that was moved, then pulled at by more than the effort limit gives."""
+    """Lock the plug on a moved jack, then command a pull beyond the effort limit."""
     beside = np.array([3.0 * MM, -2.0 * MM, 1.0 * MM])
     times, motion = insert_and_lock()
     pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
@@ -57,26 +57,26 @@ def locked_and_pulled():
     return driven, recording, beside
 
 
-def test_known_pose_inserts_and_locks(locked_and_pulled):
+def test_plug_locks_at_the_nominal_pose(locked_and_pulled):
     _, recording, beside = locked_and_pulled
     final = recording["pose"][LOCKED - 1]
     assert np.abs(final[:3] - beside).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
     assert recording["contact_force"][:LOCKED].max() < 15.0
-    assert not recording["saturation"][1:LOCKED].any()  # before the first command arrives it is told to be at zero
+    assert not recording["saturation"][1:LOCKED].any()  # from the first command on
 
 
-def test_the_sensor_feels_what_the_impedance_pushes_with(locked_and_pulled):
+def test_wrench_equals_the_force_of_the_impedance(locked_and_pulled):
     turning = slice(250, 315)
     _, recording, _ = locked_and_pulled
     felt = np.linalg.norm(recording["wrench"][turning, :3], axis=1)
-    # Sliding over facets rattles: the two agree over a tenth of a second, and not in every sample.
+    # Sliding over facets causes vibrations, so the averages over 0.1 s are compared.
     over = np.ones(5) / 5
     pushed = np.convolve(recording["contact_force"][turning, 0], over, "valid")
     np.testing.assert_allclose(np.convolve(felt, over, "valid"), pushed, atol=0.6)
 
 
-def test_pulling_after_locking_holds(locked_and_pulled):
+def test_locked_plug_resists_a_pull(locked_and_pulled):
     driven, recording, beside = locked_and_pulled
     assert recording["saturation"][-1, 0] == 1.0
     assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
@@ -84,7 +84,7 @@ def test_pulling_after_locking_holds(locked_and_pulled):
     assert CONNECTOR.is_locked(CONNECTOR.X_JT.inverse() @ workpiece_in_fixture(driven, "plug", "jack"))
 
 
-def test_rotating_before_insertion_is_blocked_by_the_lugs():
+def test_rotation_is_blocked_before_insertion():
     depth = LUG_TOP - 30.0 / STIFFNESS
     motion = poses(np.array([CLEAR, LUG_TOP + 1.0 * MM, depth, depth]), np.deg2rad(45.0))
     _, recording = drive(CONNECTOR, [0.0, 0.8, 1.6, 2.0], motion)
@@ -93,16 +93,16 @@ def test_rotating_before_insertion_is_blocked_by_the_lugs():
 
 
 @pytest.mark.parametrize("axis", [0, 2, 3, 4])
-def test_what_is_commanded_beyond_a_stop_deflects_by_the_inverse_stiffness(axis):
-    """Static displacement under a known load is within 2 % of K⁻¹ f: the load is what the sensor feels."""
+def test_static_displacement_equals_compliance_times_wrench(axis):
+    """Static displacement is within 2 % of K⁻¹ f for the measured wrench f."""
     stiffness = np.array(Impedance().stiffness)
     beyond = np.array([3.0 * MM, 3.0 * MM, -3.0 * MM, 0.05, 0.05, 0.05])
     motion = np.tile([0.0, 0.0, 2.0 * MM, np.pi / 2, 0.0, 0.0], (4, 1))
-    motion[1:, 2] = -2.0 * MM  # seated: then something bears a load about any axis
+    motion[1:, 2] = -2.0 * MM  # seated, so that the contact resists torques about all axes
     motion[2:, axis] += beyond[axis]
     _, recording = drive(CONNECTOR, [0.0, 0.5, 0.7, 1.0], motion)
     f, t = np.split(recording["wrench"][-1], 2)
-    load = np.array([*f, t[2], -t[0], t[1]])  # turned by a quarter, the second hinge is −x and the third y
+    load = np.array([*f, t[2], -t[0], t[1]])  # after a quarter turn the second hinge is −x and the third y
     deflection = recording["pose"][-1] - recording["desired_pose"][-1]
     assert abs(load[axis]) > 0.3 * abs(stiffness * beyond)[axis]
     assert deflection[axis] == pytest.approx(load[axis] / stiffness[axis], rel=0.02)
@@ -113,7 +113,7 @@ def inserted():
     return drive(CLAMP, [0.0, 1.6, 1.9], descent([4.0, -6.0, -6.0]))
 
 
-def test_the_clamp_snaps_in_and_the_snap_gives_way(inserted):
+def test_snap_resists_then_yields(inserted):
     driven, recording = inserted
     tip = workpiece_in_fixture(driven, "clamp", "table")
     assert np.abs((CLAMP.X_GT.inverse() @ tip).translation()).max() < 0.1 * MM
@@ -121,11 +121,11 @@ def test_the_clamp_snaps_in_and_the_snap_gives_way(inserted):
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     resistance = force[z > 0.85].max()
     assert 2.0 < resistance < 8.0
-    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # past the crest it jumps in
-    assert recording["wrench"][:, 2].max() > resistance  # only then comes the shoulder
+    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # it jumps in behind the crest
+    assert recording["wrench"][:, 2].max() > resistance  # later, at the shoulder
 
 
-def test_the_clamps_snap_holds_against_a_light_pull_and_yields_to_a_strong_one():
+def test_snap_resists_a_light_pull_and_yields_to_a_strong_one():
     _, recording = drive(CLAMP, [0.0, 0.4, 0.6, 0.9, 1.2, 1.5], descent([2.0, -4.0, 1.0, 1.0, 8.0, 16.0]))
     z, force = recording["pose"][:, 2], recording["wrench"][:, 2]
     assert z[44] < 0.6 * MM
@@ -133,8 +133,8 @@ def test_the_clamps_snap_holds_against_a_light_pull_and_yields_to_a_strong_one()
     assert -12.0 < force.min() < -2.0
 
 
-def test_a_clamp_beside_its_holes_stands_still_on_the_table():
-    """27 N down and 2 N sideways, where 5.4 N would slip."""
+def test_clamp_next_to_its_holes_does_not_creep():
+    """With 27 N down and 2 N sideways, below the 5.4 N at which it slips."""
     sideways = 2.0 + 2.0 / STIFFNESS / MM
     motion = descent([13.0, -6.0, -6.0, -6.0], [2.0, 2.0, sideways, sideways], 1.5)
     _, recording = drive(CLAMP, [0.0, 0.5, 0.6, 1.6], motion)
@@ -158,8 +158,8 @@ def episode(env, seed):
     ("task", "options"),
     [("BncConnector", {"fixture_offset": "per_episode"}), ("GridClamp", {"fixture_offset": "per_episode"})],
 )
-def test_the_same_seed_is_the_same_episode_bit_for_bit(task, options):
-    """With another episode between, and pushed at: nothing of it is left anywhere."""
+def test_episode_is_bit_identical_for_the_same_seed(task, options):
+    """With a disturbed episode in between, which leaves no state."""
     env = make_env(task, station="mujoco", action_repeat=25, **options)
     first = episode(env, 3)
     episode(env, 4)
@@ -177,8 +177,8 @@ def test_the_same_seed_is_the_same_episode_bit_for_bit(task, options):
     ],
     ids=lambda value: None if isinstance(value, dict) else str(value),
 )
-def test_a_stiff_contact_does_not_blow_up(task, options, modulus, most):
-    """Gasket and bead are on springs, which an explicit step as long as the nominal ones' would excite."""
+def test_stiff_contact_is_stable(task, options, modulus, most):
+    """Gasket and bead are on stiffer springs, which would be unstable at the nominal time step."""
     env = make_env(task, station="mujoco", modulus_factor=(modulus, modulus), **options)
     env.reset(seed=2)
     rng, over = np.random.default_rng(2), False
@@ -193,8 +193,8 @@ def test_a_stiff_contact_does_not_blow_up(task, options, modulus, most):
     assert max(env.trace.force) < 20.0
 
 
-def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_next(tmp_path, monkeypatch):
-    """MuJoCo by itself goes on from its zero, where the connector is locked, and writes a file about it."""
+def test_divergence_ends_only_the_present_episode(tmp_path, monkeypatch):
+    """MuJoCo itself would continue from zero, where the connector is locked, and write a file."""
     monkeypatch.chdir(tmp_path)
 
     def generate_assets():
@@ -218,8 +218,8 @@ def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_nex
 
 
 @pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
-def test_an_engine_without_room_for_its_contacts_ends_the_episode(warning, monkeypatch):
-    """MuJoCo by itself goes on without the contacts that are too many: a plug would go through a socket."""
+def test_episode_ends_when_the_engine_runs_out_of_contacts(warning, monkeypatch):
+    """MuJoCo itself would drop the contacts that are too many, and a plug would penetrate a socket."""
     step = mujoco.mj_step
 
     def step_and_warn(model, data):
@@ -234,7 +234,7 @@ def test_an_engine_without_room_for_its_contacts_ends_the_episode(warning, monke
     assert "the simulation failed in MuJoCo" in info["simulation_failure"]
 
 
-def test_what_a_task_draws_is_where_the_engine_has_it():
+def test_engine_has_the_offsets_of_the_task():
     env = make_env("BncConnector", station="mujoco", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=2)
     station = env.task.diagram.GetSubsystemByName("station")
@@ -247,15 +247,15 @@ def test_what_a_task_draws_is_where_the_engine_has_it():
 
 
 class Unknown:
-    """A workcell of somebody who never wrote its surfaces down."""
+    """Workcell without contact surfaces."""
 
 
-def test_a_world_that_nobody_described_gets_a_sentence():
+def test_station_raises_when_surfaces_are_missing():
     with pytest.raises(InputError, match="Unknown doesn't say which"):
         MujocoStation(Unknown())
 
 
-def test_without_the_engine_there_is_a_sentence(monkeypatch):
+def test_station_raises_when_mujoco_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"pip install 'guiderail\[mujoco\]'"):
         MujocoStation(CONNECTOR)

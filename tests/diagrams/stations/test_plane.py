@@ -1,4 +1,4 @@
-"""Physics of the plane: the robot goes where it is sent, and walls are walls."""
+"""Physics of the plane station: tracking and contact with walls."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ WORLD, CONFIG = PassageGeometry(), PlaneConfig()
 
 
 class Run:
-    """The station, commanded once a control step."""
+    """Plane station with one command per control step."""
 
     def __init__(self, start):
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", PlaneStation(WORLD, CONFIG))
-        # Samples what a system of ours sees at a control instant.
+        # Samples the pose as a system does at a control instant.
         self.sample = builder.AddNamedSystem("sample", ZeroOrderHold(CONFIG.control_period, 2))
         builder.Connect(self.station.GetOutputPort("pose"), self.sample.get_input_port())
         builder.ExportInput(self.station.GetInputPort("desired_pose"), "desired_pose")
@@ -30,7 +30,7 @@ class Run:
         self.steps = 0
 
     def go(self, desired, steps=1):
-        """Commands a pose for some control steps; returns the pose at the end of every plant step."""
+        """Command a pose for some control steps; return the pose at the end of every plant step."""
         self.command.GetMutableData().set_value(desired)
         path = []
         for _ in range(steps):
@@ -51,7 +51,7 @@ def inside_wall(points, depth=0.0):
     return ((points > lower + depth) & (points < upper - depth)).all(axis=2).any(axis=1)
 
 
-def test_arrives_within_a_control_step_and_never_overshoots():
+def test_robot_reaches_a_command_in_one_step_without_overshoot():
     run = Run([0.3, 0.1])
     rng = np.random.default_rng(0)
     pose = np.array([0.3, 0.1])
@@ -66,17 +66,17 @@ def test_arrives_within_a_control_step_and_never_overshoots():
     assert run.read("contact_force") == 0
 
 
-def test_stands_still_where_it_was_put():
+def test_robot_stays_where_it_was_put():
     run = Run([0.3, 0.2])
     path = run.go([0.3, 0.2], 5)
     np.testing.assert_array_equal(path, np.tile([0.3, 0.2], (len(path), 1)))
 
 
-def test_a_wall_stops_the_robots_centre_where_the_world_says():
+def test_wall_stops_the_robots_center_at_its_geometry():
     run = Run([0.2, 0.4])
     path = run.go([0.2, 0.9], 10)
     assert path[-1] == pytest.approx([0.2, WORLD.wall_y[0]], abs=2e-4)
-    # At full force it presses with what the drive has, and the wall presses back.
+    # The robot presses with the largest force, and the wall with the opposite force.
     np.testing.assert_allclose(run.read("wrench"), [0, -CONFIG.max_force], atol=0.5)
     assert run.read("saturation")[1] > 0
     run = Run([0.35, 0.55])
@@ -84,7 +84,7 @@ def test_a_wall_stops_the_robots_centre_where_the_world_says():
     assert path[-1] == pytest.approx([WORLD.gap_x[0], 0.55], abs=2e-4)
 
 
-def test_a_robot_pressed_against_a_wall_does_not_slide():
+def test_robot_does_not_slide_when_pressed_against_a_wall():
     run = Run([0.2, 0.45])
     touching = run.go([0.2, 0.6], 3)[-1]
     pressed = run.go([0.28, 0.6], 20)[-1]
@@ -93,15 +93,15 @@ def test_a_robot_pressed_against_a_wall_does_not_slide():
     assert away == pytest.approx([0.25, 0.45], abs=1e-4)
 
 
-def test_the_gap_is_open():
+def test_robot_passes_the_gap():
     run = Run([0.35, 0.4])
     assert run.go([0.35, 0.8], 5)[-1] == pytest.approx([0.35, 0.8], abs=1e-4)
     assert run.read("contact_force") == 0
 
 
-def test_a_touch_within_a_control_step_is_not_missed():
+def test_contact_within_a_control_step_is_measured():
     run = Run([0.2, 0.45])
-    # Out and back within one control step: in touch only between two readings.
+    # Out and back within one control step: contact only between two readings.
     run.command.GetMutableData().set_value([0.2, 0.6])
     run.simulator.AdvanceTo(5 * CONFIG.plant_period)
     assert run.read("pose")[1] > 0.499
@@ -112,7 +112,7 @@ def test_a_touch_within_a_control_step_is_not_missed():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_nothing_tunnels_whatever_is_commanded(seed):
+def test_robot_never_tunnels_for_random_commands(seed):
     rng = np.random.default_rng(seed)
     start = np.array([rng.uniform(-1, 2), 0.3])
     run, path, side = Run(start), [start], []
@@ -120,7 +120,7 @@ def test_nothing_tunnels_whatever_is_commanded(seed):
         far = rng.uniform([-3, -3], [3, 3]) if rng.random() < 0.5 else [rng.uniform(-1, 2), rng.choice([-3.0, 3.0])]
         path.extend(run.go(far, int(rng.integers(1, 4))))
     path = np.array(path)
-    # A plant step ends a little inside a wall at most, and never beyond it other than through the gap.
+    # A plant step ends at most slightly inside a wall, and behind it only through the gap.
     assert not inside_wall(path, depth=CONFIG.max_speed * CONFIG.plant_period + 1e-3).any()
     middle = sum(WORLD.wall_y) / 2
     crossing = np.flatnonzero((path[1:, 1] > middle) != (path[:-1, 1] > middle))
@@ -129,7 +129,7 @@ def test_nothing_tunnels_whatever_is_commanded(seed):
     assert ((side > WORLD.gap_x[0] - slack) & (side < WORLD.gap_x[1] + slack)).all()
 
 
-def test_a_system_of_ours_samples_what_the_environment_reads():
+def test_sampled_pose_equals_that_of_the_environment():
     """With the plant's sampled output ports this would be one plant step later (see `PlaneStation`)."""
     run = Run([0.3, 0.1])
     for k in range(5):

@@ -1,4 +1,4 @@
-"""The pouring station with another arm: six joints under Cartesian position control."""
+"""Pouring station with an arm of six joints."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ UPRIGHT = np.array([-0.15, -0.20, 0.15, 0.0, 0.0, 0.0])
 TILTED = MID_POURING_POSE + [0.0, 0.0, 0.0, 0.0, 0.0, -1.2]
 
 
-def test_an_arm_of_six_joints_tilts_the_thermos_over_the_mug():
-    """From where episodes start to a tilt at which it pours, along a straight line; the drives follow the command."""
+def test_six_joint_arm_tilts_the_thermos_over_the_mug():
+    """Move along a straight line from the start of an episode to a pouring tilt; the drives track the command."""
     station = PouringStation(PouringConfig(robot="ur5e"))
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
@@ -31,9 +31,9 @@ def test_an_arm_of_six_joints_tilts_the_thermos_over_the_mug():
         assert station.GetOutputPort("touched").Eval(context)[0] == 0.0
     assert max(lags) < 0.008
     np.testing.assert_allclose(pose.Eval(context), TILTED, atol=2e-3)
-    assert balls.Eval(context)[2] > 0.0  # a ball has left the thermos through its tip
+    assert balls.Eval(context)[2] > 0.0  # a ball has left the thermos through the tip
 
 
-def test_refuses_an_arm_whose_data_do_not_say_how():
+def test_config_raises_when_the_arm_has_no_drives():
     with pytest.raises(InputError, match="'panda' can't pour: its data have no drives or no level posture"):
         PouringStation(PouringConfig(robot="panda"))

@@ -15,7 +15,7 @@ PLACES = [
 
 
 @pytest.mark.parametrize(("task", "place"), PLACES)
-def test_a_robot_is_put_only_to_a_pose_of_finite_numbers(task, place):
+def test_set_pose_raises_when_the_pose_is_not_finite(task, place):
     station = make_station(EnvConfig.resolve(task, {"station": place}).make_task())
     context = station.CreateDefaultContext()
     whole = np.zeros(station.pose_size)

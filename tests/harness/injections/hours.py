@@ -2,8 +2,8 @@
 
     python tests/harness/injections/hours.py --seconds 480     # wall clock time
 
-The arm moves for 20 s of simulated time, then a fault stops it, and it resumes. The exit code is 1 if a stop was missed,
-or if the process has grown by more than 1 % between the first quarter and the end.
+The arm moves for 20 s of simulated time, then a fault stops it, and it resumes. The exit code is 1 if a stop was
+missed, or if the process has grown by more than 1 % between the first quarter and the end.
 """
 
 import argparse

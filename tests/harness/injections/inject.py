@@ -1,7 +1,7 @@
 """Inject random faults of the bus and its programs while an arm moves: `make injections`.
 
-The test suite has one fault of each kind. Both programs are stepped in turn, so the same seed gives the same injections.
-A round has one fault of each kind; `--first` starts with a later round.
+The test suite has one fault of each kind. Both programs are stepped in turn, so the same seed gives the same
+injections. A round has one fault of each kind; `--first` starts with a later round.
 """
 
 import argparse

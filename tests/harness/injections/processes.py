@@ -28,8 +28,8 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 
 STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] of the robot's clock
-# Time by the robot's clock after which a robot that is gone is sent no command: detection, damping, zero torque; without
-# a status a step takes one and a half periods [s].
+# Time by the robot's clock after which a robot that is gone is sent no command: detection, damping, zero torque [s].
+# Without a status a step takes one and a half periods.
 SILENT_AFTER = 0.95
 PAUSES = (0.1, 0.3, 1.0)  # by the robot's clock [s]
 MOVING = 0.15  # speed of the fastest joint of a moving arm [rad/s]

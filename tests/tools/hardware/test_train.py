@@ -1,4 +1,4 @@
-"""Learning on a robot: episodes as motions, both sides of the bus in one process."""
+"""Episodes and training on a robot, with both sides of the bus in one process."""
 
 from contextlib import contextmanager
 
@@ -79,7 +79,7 @@ def still(observation):
     return np.zeros(2)
 
 
-def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
+def test_reset_moves_to_the_start_and_an_episode_ends(env):
     assert all(check.passed for check in env.preflight.run())
     for index in range(2):
         row = rollout(env, still, index=index)
@@ -91,13 +91,13 @@ def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
         env.reset(options={"offset": (0.0, 0.0)})
 
 
-def test_in_a_rehearsal_a_reset_draws_what_a_simulations_does(env, monkeypatch):
+def test_reset_randomizes_parts_with_its_seed_and_options(env, monkeypatch):
     monkeypatch.setattr(env, "_randomize_parts", lambda rng, options: {"drawn": (float(rng.random()), options)})
     _, info = env.reset(seed=3, options={"held_out": True})
     assert info["drawn"] == (float(np.random.default_rng(3).random()), {"held_out": True})
 
 
-def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_path):
+def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
     @contextmanager
     def fake_session(config, connection, *, assume_yes, log):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
@@ -119,14 +119,14 @@ def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_pat
         evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
     with pytest.raises(InputError, match="at least one"):
         evaluate_on_robot(tmp_path, RobotConnection(), 0)
-    # Two at once, neither of which has a row yet: nobody replaces the other's.
+    # Two evaluations at once, neither of which has a row yet, do not overwrite each other's file.
     elsewhere = tmp_path / "elsewhere"
     with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
         evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still, out=elsewhere)
     assert not list(elsewhere.glob("*.csv"))
 
 
-def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, tmp_path, forkserver):
+def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path, forkserver):
     small = {"net_arch": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_freq": 1}
     given = {"algorithm": "sac", "episodes": 5, "settings": small}
     config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **given)
@@ -135,7 +135,7 @@ def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, t
     def refuse():
         before.append([file.name for file in tmp_path.rglob("*") if file.is_file()])
         idle()
-        if len(before) == 4:  # the first of the second episode
+        if len(before) == 4:  # the first call of the second episode
             raise InputError("not confirmed: nothing moves")
 
     monkeypatch.setattr(env, "idle", refuse)
@@ -148,7 +148,7 @@ def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, t
     assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP  # at rest
 
 
-def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
+def test_operator_stop_truncates_and_reset_resumes(env):
     env.reset()
     env.step(np.zeros(2))
     env.keys.request_stop()
@@ -163,18 +163,18 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     assert env.asked == ["stop requested by the user"]
 
 
-def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decision_that_was_cut(monkeypatch):
+def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
     monkeypatch.setattr("guiderail.tools.hardware.slow_motion.SETTLING_TIME", 0.1)
     env = make(monkeypatch, START, guidance="residual", bound=0.0005)
-    decisions = []
+    observations = []
 
     def act(observation):
-        decisions.append(observation)
-        if len(decisions) == 2:
+        observations.append(observation)
+        if len(observations) == 2:
             env.clock.happens = {
                 env.clock.step + 16: env.keys.request_stop
-            }  # in the decision's fourth of five control steps
-        return np.full(2, len(decisions) - 1.0)
+            }  # in the fourth of five control steps of the action
+        return np.full(2, len(observations) - 1.0)
 
     infos = []
     step = env.step
@@ -193,7 +193,7 @@ def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decisi
 
 @pytest.fixture
 def ready(monkeypatch):
-    """An arm that waits for `robot_session`, which is told to begin; and what a person is asked."""
+    """Return clock of a waiting arm, list of the questions, and function that starts a `robot_session`."""
     lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
     clock, asked = Together(declared.workcell(), lcm, START), []
 
@@ -211,7 +211,7 @@ def ready(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["start", "monitor", "commands"])
-def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready, monkeypatch, name):
+def test_session_raises_when_a_check_fails_after_the_question(ready, monkeypatch, name):
     clock, _, begin = ready
     driver = clock.monitor._driver
 
@@ -229,18 +229,20 @@ def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready
         pass
 
 
-def test_time_in_which_nobody_moves_the_arm_is_no_gap_between_its_statuses(ready, monkeypatch):
-    """Of the person who reads, and of whatever is made before the first reset."""
+def test_clock_begins_again_before_control_is_taken(ready, monkeypatch):
+    """Time for the question and for building the learner is no gap between statuses."""
     clock, asked, begin = ready
+    commands = []
+    clock.monitor._driver.lcm.Subscribe(IiwaDriver.command_channel, commands.append)
     with begin() as robot:
-        assert (len(asked), robot.env._task_station.driver.num_foreign_commands) == (1, 0)  # nothing was sent yet
+        assert (len(asked), commands) == (1, [])  # nothing was sent yet
         begun, step = [], clock.step
         monkeypatch.setattr(clock, "begin", lambda: begun.append(clock.step))
         robot.env._take_control()
         assert begun == [step]
 
 
-def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
+def test_commands_check_fails_when_another_program_commands(monkeypatch):
     env = make(monkeypatch, START)
 
     def check():
@@ -252,8 +254,8 @@ def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
     assert not check()
 
 
-def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch):
-    """What is judged then is a status of now: not one from before the question, nor that nobody listened meanwhile."""
+def test_resume_works_a_minute_after_the_stop(monkeypatch):
+    """Neither the status from before the question nor the gap since then is a fault."""
     env = make(monkeypatch, START)
     env.clock.clock = 100.0
 
@@ -270,8 +272,8 @@ def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch
     assert env._station.get_arm_state_output_port().Eval(env._context)[0] == ArmState.RUNNING
 
 
-def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypatch):
-    """Not at the greatest speed that its commands may have, and not into what it was pulled out of."""
+def test_arm_moved_by_hand_returns_slowly_to_its_path(monkeypatch):
+    """The speed is that of a slow approach, and not the largest of a command."""
     env = make(monkeypatch, START)
     env.reset()
     env.step(np.zeros(2))
@@ -292,7 +294,7 @@ def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypa
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
-def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought_to_rest(env):
+def test_rest_works_after_an_exception_within_a_step(env):
     def interrupt(context):
         raise KeyboardInterrupt
 
@@ -308,7 +310,7 @@ def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought
     assert np.abs(velocities).max() < 0.01
 
 
-def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):
+def test_fault_truncates_and_the_next_reset_resumes(env):
     env.reset()
     env.step(np.zeros(2))
     step = env.clock.step
@@ -327,14 +329,14 @@ def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(e
     assert row["termination"] == "time_limit"
 
 
-def test_what_stops_a_reset_stops_no_more_than_that(env):
+def test_reset_completes_after_a_stop(env):
     env.clock.happens = {env.clock.step + 20: env.keys.request_stop}
     env.reset()
     assert env.asked == ["stop requested by the user"]
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
-def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, monkeypatch):
+def test_pull_tells_a_locked_workpiece_from_a_loose_one(env, monkeypatch):
     for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
         one._retry_until_ok(one._take_control)
         assert one._resists_pull() == holds
@@ -347,14 +349,14 @@ def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, mon
         ("BncConnector", {"reward": "aligned"}, "needs simulation state"),
     ],
 )
-def test_refuses_what_a_robot_cannot_tell(task, options, words, tmp_path):
+def test_train_raises_when_success_is_not_observable(task, options, words, tmp_path):
     with pytest.raises(InputError, match=words):
         train_on_robot(
             task, tmp_path / "run", RobotConnection(sim=True), environment={"station": "hardware"} | options, given={}
         )
 
 
-def test_refuses_what_nobody_can_show_it(tmp_path):
+def test_train_raises_when_demonstrations_are_requested(tmp_path):
     with pytest.raises(InputError, match="demonstration_episodes"):
         train_on_robot(
             "BncConnector",

@@ -1,0 +1,99 @@
+"""A driver without messages: a robot in the same process that implements `read` and `write` only."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.hardware.clock import WallClock
+from guiderail.diagrams.hardware.driver import DRIVERS, Driver, find_driver, register_driver, safety_limits
+from guiderail.diagrams.hardware.monitor import SafetyMonitor
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.stations.arm import ArmControllerPlant
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import JointStatus
+from guiderail.systems.torque_safety_limiter import ArmState
+
+START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
+
+
+class DirectDriver(Driver):
+    """Joints without gravity and friction that are integrated when a torque is written."""
+
+    name = "direct"
+    torque_reflex_limits = (60.0,) * 7
+    has_command_timeout = True
+
+    def __init__(self, url=""):
+        super().__init__(url)
+        self.model = ArmControllerPlant(BncWorkcell())
+        self.positions = self.model.solve(START, self.model.posture)
+        self.velocities, self.time, self.torques = np.zeros(7), 0.0, []
+
+    def read(self):
+        return JointStatus(self.time, self.positions.copy(), self.velocities.copy(), np.zeros(7))
+
+    def write(self, torque, time):
+        plant = self.model.plant
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, self.positions)
+        M = plant.CalcMassMatrix(context)
+        self.velocities = self.velocities + self.period * np.linalg.solve(M, torque)
+        self.torques.append(torque)
+
+    def elapse(self):
+        self.positions, self.time = self.positions + self.period * self.velocities, self.time + self.period
+
+
+@pytest.fixture
+def registered():
+    register_driver("direct_arm", DirectDriver)
+    yield
+    DRIVERS._entries.pop("direct_arm")
+
+
+def test_station_moves_a_robot_by_read_and_write():
+    driver = DirectDriver()
+    station = HardwareStation(BncWorkcell(), driver)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    goal = START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
+    station.get_desired_pose_input_port().FixValue(context, START)
+    station.start(simulator)
+    for step in range(1, 600):
+        driver.elapse()
+        simulator.AdvancePendingEvents()
+        station.receive(context)
+        simulator.AdvanceTo(step * driver.period)
+        if step == 200:
+            assert station.get_arm_state_output_port().Eval(context)[0] == ArmState.RUNNING
+            station.get_desired_pose_input_port().FixValue(context, goal)
+    np.testing.assert_allclose(station.get_pose_output_port().Eval(context)[:3], goal[:3], atol=5e-4)
+    assert (np.abs(driver.torques) <= station.limits.torque).all()
+
+
+def test_wall_clock_steps_once_per_new_status():
+    driver = DirectDriver()
+    station, clock = HardwareStation(BncWorkcell(), driver), WallClock(driver)
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+    station.start(simulator)
+    clock.begin()
+    driver.elapse()
+    before = driver.num_statuses
+    clock.advance(simulator, station, 3)
+    assert driver.num_statuses == before + 1
+    assert simulator.get_context().get_time() == 3 * driver.period
+
+
+def test_driver_is_found_by_name_when_registered(registered):
+    assert find_driver("direct_arm") is DirectDriver
+    plant = ArmControllerPlant(BncWorkcell()).plant
+    assert (np.array(safety_limits(plant, DirectDriver).torque) <= 0.9 * 60.0).all()
+
+
+def test_safety_monitor_raises_when_commands_are_not_shown():
+    driver = DirectDriver()
+    plant = driver.model.plant
+    with pytest.raises(InputError, match="cannot be watched"):
+        SafetyMonitor(driver, plant, safety_limits(plant, driver))
