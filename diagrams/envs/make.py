@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import defaultdict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
@@ -31,6 +32,8 @@ from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
 
 Built = TypeVar("Built")
+
+logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO, whose messages are for developers of Drake
 
 
 class DiagramPool(Generic[Built]):
@@ -102,7 +105,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.
-        render_mode: None, "human" (browser view) or "rgb_array".
+        render_mode: None, "human" (browser view at `env.unwrapped.task.meshcat.web_url()`) or "rgb_array".
         options: Options of the environment, if `task` is not a configuration; `guiderail list TASK` lists them.
 
     Raises:

@@ -450,7 +450,9 @@ def _best_constant(job: Job) -> np.ndarray:
         rows = []
         for action in itertools.product(grid, repeat=int(np.prod(env.action_space.shape or ()))):
             env.reset(seed=config.seed)
-            found = pd.DataFrame([rollout(env, constant_policy(env, np.array(action))) for _ in range(SELECTION_EPISODES)])
+            found = pd.DataFrame(
+                [rollout(env, constant_policy(env, np.array(action))) for _ in range(SELECTION_EPISODES)]
+            )
             numbers = {f"action_{i}": value for i, value in enumerate(action)}
             rows.append(numbers | summary(found, ("success_rate", "mean_return")))
         env.close()

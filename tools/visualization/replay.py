@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html as markup
 import json
-import logging
 import os
 import re
 from collections.abc import Mapping
@@ -76,7 +75,6 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     if episodes < 1:
         raise InputError(f"a page shows at least one episode, not {episodes}")
     check_page(html)
-    logging.getLogger("drake").setLevel(logging.WARNING)  # where Meshcat listens is of no interest to a page
     env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)
     meshcat = getattr(base.task, "meshcat", None)

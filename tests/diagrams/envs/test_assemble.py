@@ -53,3 +53,8 @@ def test_a_half_turn_is_for_stations_whose_angles_do_not_jump(turn):
         with pytest.raises(InputError, match="jumps by a full turn at 180°"):
             known(turn, station)
         assert known(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
+
+
+def test_making_an_environment_logs_nothing_of_drake(forks, tmp_path):
+    script = "import guiderail\nguiderail.make_env('NarrowPassage', guidance='kgrl', render_mode='human').reset(seed=0)"
+    assert forks.run("-c", script, folder=tmp_path, DRAKE_ALLOW_NETWORK="meshcat").stderr == ""
