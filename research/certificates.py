@@ -106,7 +106,7 @@ def _failure(row: Mapping[Any, Any]) -> str:
     """Return what is wrong with a skill's certificate; an empty string if nothing is."""
     if row["checker"] != "yes":
         return f"{row['skill']}: the certificate is rejected by the checker: {row['checker']}"
-    return f"{row['skill']}: an adversary exceeded {row['bounds_left']} bounds" if row["bounds_left"] else ""
+    return f"{row['skill']}: an adversary exceeded {row['bound_violations']} bounds" if row["bound_violations"] else ""
 
 
 def _certify(skill: CertifiedSkill, folder: Path, attack: int) -> pd.DataFrame:
@@ -119,10 +119,10 @@ def _certify(skill: CertifiedSkill, folder: Path, attack: int) -> pd.DataFrame:
         "checker": result["checker"],
         "checker_seconds": result["checker_seconds"],
         "steps": result["steps"],
-        "steps_constraints_can_touch": result["steps_that_constraints_can_touch"],
+        "constrained_steps": result["constrained_steps"],
         "attack_steps": result["attack_steps"],
         "attack_corrected": result["attack_corrected"],
-        "bounds_left": int(bounds["left"].sum()),
+        "bound_violations": int(bounds["violations"].sum()),
         "budget_spent": result.get("budget_spent"),
         "worst_ratio_free": rated.loc[~active, "ratio"].max(),
         "worst_ratio_active": rated.loc[active, "ratio"].max(),

@@ -1,4 +1,4 @@
-"""`guiderail certify`: what a skill can command at all, whatever its policy does, as a file that anybody can check."""
+"""Certificates of skills: proven bounds on their commands for any policy, written as files and checked."""
 
 from __future__ import annotations
 
@@ -18,157 +18,164 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import QUANTITIES, Adversary
-from guiderail.models.certificate.bounds import Certified, certify
+from guiderail.models.certificate.bounds import CertifiedBounds, certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files
 from guiderail.models.certificate.lagrange_bounds import Budget
-from guiderail.models.certificate.loop import Bounds, SharedControlTemplate
+from guiderail.models.certificate.loop import Bounds, CertifiedLoop
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
 
-CERTIFIED = ("kmp", "kgrl", "skgrl")  # guidance whose law this is
-SEARCH = 100_000  # steps of the adversary whose worst corrections make the budgets
-MARGIN = 1.5  # of the budgets, over what it found
-ALIKE = 1.0 + 1e-6  # rounding, where an adversary reaches a bound that is exact
-LEAST_EXCESS = ((0.01,), (0.1,))  # of them, in actions: at one step, and in all
+GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
+SEARCH_STEPS = 100_000  # steps of the adversary that determines the budgets
+BUDGET_MARGIN = 1.5  # budgets relative to the adversary's worst corrections
+MIN_EXCESS = ((0.01,), (0.1,))  # smallest budgets of excess, in actions: at one step, and in total
+ROUNDING = 1.0 + 1e-6  # an adversary may reach an exact bound up to rounding
 
 
 def certify_skill(
-    of: str,
+    subject: str,
     environment: Mapping[str, Any],
     *,
     out: Path | None = None,
     start_within: float | None = None,
     attack: int = 0,
 ) -> dict[str, Any]:
-    """Writes a certificate and has it checked, in a process of its own.
+    """Write a certificate and check it in a separate process.
 
     Args:
-        of: a run's folder, or the name of a task.
-        environment: arguments of the environment that are other ones than the run's or the task's.
-        out: the folder that is written; `certificate` in the run unless given.
-        start_within: how far beside its start, in any output, the robot may begin, in the outputs' units; what the
-            task declares unless given, and the error of a measured pose, with which a history begins.
-        attack: how many steps an adversary tries to leave the bounds; none for 0. What it found is written beside
-            them, in `attack.csv`.
+        subject: Folder of a run, or name of a task.
+        environment: Options of the environment that differ from those of the run or the task.
+        out: Folder to write; `certificate` in the run's folder by default.
+        start_within: Largest start offset of the robot in any output [unit of the output]; by default the one that
+            the task declares, plus the error of a measured pose.
+        attack: Number of steps in which an adversary tries to leave the bounds; its results are written to
+            `attack.csv`.
 
     Returns:
-        Numbers of the regimes, the files' folder, and the checker's word; of an attack the table's rows, and which
-        part of its budgets corrections spent.
+        Numbers of the regimes, the certificate's path and the checker's verdict; after an attack also the table's rows
+        and the share of the budgets that corrections used.
 
     Raises:
-        InputError: if there is no such run or task, or its guidance follows no law that is certified.
+        InputError: If there is no such run or task, or its guidance cannot be certified.
     """
-    task, arguments, about = _what(of, environment)
+    task, arguments, about = _find_subject(subject, environment)
     options = check_environment(task, arguments)
     guidance = str(options["guidance"])
     if attack < 0:
         raise InputError(f"an attack has a number of steps, not {attack}")
-    if guidance not in CERTIFIED or options.get("adaptive_history") or options.get("history_source") == "measured":
+    if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
         raise InputError(
-            f"guidance={guidance!r} follows no law that is certified: it takes {' or '.join(CERTIFIED)}, with a "
+            f"guidance={guidance!r} follows no law that is certified: it takes {' or '.join(GUIDANCE)}, with a "
             "history of commands and of one length (neither adaptive_history nor history_source=measured)"
         )
     if out is None:
-        if not Path(of).is_dir():
+        if not Path(subject).is_dir():
             raise InputError("say where the certificate of a task goes with --out")
-        out = Path(of) / "certificate"
-    demonstrated = make_prior_knowledge(task, **options).demonstrations
-    assert demonstrated is not None  # both kinds of guidance need them
-    acted = guidance != "kmp"
-    primitive = demonstrated.primitive(history=guidance == "skgrl", constrained=acted)
-    # A reset goes by what was demonstrated, whatever via-points the primitive passes through.
-    start = primitive.constraints.nearest(EnvConfig.resolve(task, options).make_task().reference().means[0])
-    within = _declared_start(task, options, len(start)) if start_within is None else np.full(len(start), start_within)
-    if not (np.isfinite(within).all() and (within >= 0.0).all()):
-        raise InputError(f"the robot begins within a distance that is not negative, not {within.min()}")
-    skill = SharedControlTemplate(
-        primitive,
-        demonstrated.null_space_gains(primitive) if acted else np.zeros(primitive.num_outputs),
-        demonstrated.control_period,
-        start,
-        within,
-    )
+        out = Path(subject) / "certificate"
+    loop = _make_loop(task, options, start_within)
+    primitive = loop.primitive
     budget = None
     if primitive.history:
-        spent = Adversary(skill, np.ones(primitive.num_steps, bool), seed=SEARCH, spends=True).attack(SEARCH)
-        budget = Budget(MARGIN * spent.excess + np.array(LEAST_EXCESS), MARGIN * spent.residue)
-    certified = certify(skill, budget)
-    pushes = Impedance() if primitive.num_outputs == len(Impedance().stiffness) else None
-    stiffness = None if pushes is None else options.get("stiffness_factor", 1.0) * np.array(pushes.stiffness)
-    limits = None if pushes is None else np.array(pushes.limits)
-    for name, content in certificate_files(skill, certified, stiffness, limits, about).items():
+        every_step = np.ones(primitive.num_steps, bool)
+        worst = Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
+        budget = Budget(BUDGET_MARGIN * worst.excess + np.array(MIN_EXCESS), BUDGET_MARGIN * worst.residue)
+    certified = certify(loop, budget)
+    impedance = Impedance() if primitive.num_outputs == len(Impedance().stiffness) else None
+    stiffness = None if impedance is None else options.get("stiffness_factor", 1.0) * np.array(impedance.stiffness)
+    limits = None if impedance is None else np.array(impedance.limits)
+    for name, content in certificate_files(loop, certified, stiffness, limits, about).items():
         write_atomically(out / name, content)
-    begin = time.perf_counter()
-    word = subprocess.run([sys.executable, checker.__file__, str(out)], capture_output=True, text=True)
-    seconds = time.perf_counter() - begin
-    found: dict[str, Any] = {
+    start_time = time.perf_counter()
+    process = subprocess.run([sys.executable, checker.__file__, str(out)], capture_output=True, text=True)
+    seconds = time.perf_counter() - start_time
+    result: dict[str, Any] = {
         "certificate": str(out / CERTIFICATE),
-        "checker": (word.stdout or word.stderr).strip(),
+        "checker": (process.stdout or process.stderr).strip(),
         "checker_seconds": round(seconds, 1),
-        "start_within": within.tolist(),
+        "start_within": loop.start_within.tolist(),
         "steps": primitive.num_steps,
-        "steps_that_constraints_can_touch": int(certified.touched.sum()),
+        "constrained_steps": int(certified.can_be_active.sum()),
     }
     regimes = {"while_free": certified.free, "always": certified.always}
     if certified.budgeted is not None:
         regimes["budgeted"] = certified.budgeted.bounds
     for regime, bounds in regimes.items():
-        found |= {f"{regime}_{name}": value for name, value in _largest(bounds).items()}
+        result |= {f"{regime}_{name}": value for name, value in _extremes(bounds).items()}
     if limits is not None:
-        found["force"] = float(np.linalg.norm(limits[:3]))
+        result["force"] = float(np.linalg.norm(limits[:3]))
     if attack:
-        found |= _attacked(skill, certified, attack, out)
-    return found
+        result |= _attack(loop, certified, attack, out)
+    return result
 
 
-def _attacked(skill: SharedControlTemplate, certified: Certified, steps: int, out: Path) -> dict[str, Any]:
-    """What an adversary came to against each bound, as a table in the folder."""
-    can_be_corrected = corrected_steps(skill, certified)
-    adversary = Adversary(skill, can_be_corrected)
+def _make_loop(task: str, options: Mapping[str, Any], start_within: float | None) -> CertifiedLoop:
+    """Build the primitive of an environment in its loop.
+
+    Raises:
+        InputError: If the start offset is negative or not finite.
+    """
+    demonstrated = make_prior_knowledge(task, **options).demonstrations
+    assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
+    has_actions = options["guidance"] != "kmp"
+    primitive = demonstrated.primitive(history=options["guidance"] == "skgrl", constrained=has_actions)
+    # A reset starts at the demonstrations, not at the via-points that the primitive passes through.
+    start = primitive.constraints.nearest(EnvConfig.resolve(task, options).make_task().reference().means[0])
+    within = _declared_start(task, options, len(start)) if start_within is None else np.full(len(start), start_within)
+    if not (np.isfinite(within).all() and (within >= 0.0).all()):
+        raise InputError(f"the start offset must be finite and not negative, not {within.min()}")
+    gains = demonstrated.null_space_gains(primitive) if has_actions else np.zeros(primitive.num_outputs)
+    return CertifiedLoop(primitive, gains, demonstrated.control_period, start, within)
+
+
+def _attack(loop: CertifiedLoop, certified: CertifiedBounds, steps: int, out: Path) -> dict[str, Any]:
+    """Attack the bounds with an adversary; write and return a table of its worst values."""
+    can_be_corrected = _find_corrected_steps(loop, certified)
+    adversary = Adversary(loop, can_be_corrected)
     worst = adversary.attack(steps)
     bounds = certified.always if certified.budgeted is None else certified.budgeted.bounds
-    claimed = {
+    certified_values = {
         "pose": np.maximum(bounds.upper - adversary.middle, adversary.middle - bounds.lower),
         "speed": bounds.speed,
         "acceleration": bounds.acceleration,
     }
     rows: list[dict[str, Any]] = []
-    for quantity, constrained, output in itertools.product(QUANTITIES, (False, True), range(len(skill.gains))):
-        at = can_be_corrected == constrained
+    for quantity, is_corrected, output in itertools.product(QUANTITIES, (False, True), range(len(loop.gains))):
+        at = can_be_corrected == is_corrected
         if at.any():
-            bound, most = claimed[quantity][at, output].max(), worst.most[quantity][at, output].max()
+            bound, value = certified_values[quantity][at, output], worst.largest[quantity][at, output]
             rows.append(
                 {
                     "quantity": quantity,
                     "output": output,
-                    "constraint": "can be active" if constrained else "never active",
-                    "bound": float(bound),
-                    "worst_found": float(most),
-                    "ratio": float(bound / most) if most > 0.0 else None,
-                    "left": int((worst.most[quantity][at, output] > claimed[quantity][at, output] * ALIKE).sum()),
+                    "constraint": "can be active" if is_corrected else "never active",
+                    "bound": float(bound.max()),
+                    "worst_found": float(value.max()),
+                    "ratio": float(bound.max() / value.max()) if value.max() > 0.0 else None,
+                    "violations": int((value > bound * ROUNDING).sum()),
                 }
             )
     write_table(out / "attack", rows)
-    found = {"attack": rows, "attack_steps": worst.steps, "attack_corrected": worst.corrected}
+    result = {"attack": rows, "attack_steps": worst.steps, "attack_corrected": worst.corrected}
     if certified.budgeted is not None:
         budget = certified.budgeted.budget
-        found["budget_spent"] = float(max(_part(worst.excess, budget.excess), _part(worst.residue, budget.residue)))
-    return found
+        used = max(_used_share(worst.excess, budget.excess), _used_share(worst.residue, budget.residue))
+        result["budget_spent"] = float(used)
+    return result
 
 
-def corrected_steps(skill: SharedControlTemplate, certified: Certified) -> np.ndarray:
-    """(N,), at which steps a command, its speed or its acceleration can depend on a correction."""
-    touched = certified.touched
-    if skill.primitive.history:
-        return np.logical_or.accumulate(touched)
-    return touched | np.append(False, touched[:-1]) | np.append([False, False], touched[:-2])
+def _find_corrected_steps(loop: CertifiedLoop, certified: CertifiedBounds) -> np.ndarray:
+    """Return the mask (N,) of steps whose command, speed or acceleration can depend on a correction."""
+    active = certified.can_be_active
+    if loop.primitive.history:
+        return np.logical_or.accumulate(active)
+    return active | np.append(False, active[:-1]) | np.append([False, False], active[:-2])
 
 
 def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndarray:
-    """(O,), how far beside its start the environment's history may begin: a reset's draw, and a pose's error."""
+    """Return the largest start offset (O,) of the environment's history: that of a reset plus a pose's error."""
     declared = EnvConfig.resolve(task, options).make_task().start_within()
     try:
         within = np.array(np.broadcast_to(declared, size), dtype=float)
@@ -178,22 +185,23 @@ def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndar
     return within
 
 
-def _part(found: np.ndarray, budget: np.ndarray) -> float:
-    return float(np.max(np.divide(found, budget, out=np.zeros_like(found), where=budget > 0.0), initial=0.0))
+def _used_share(spent: np.ndarray, budget: np.ndarray) -> float:
+    return float(np.max(np.divide(spent, budget, out=np.zeros_like(spent), where=budget > 0.0), initial=0.0))
 
 
-def _what(of: str, environment: Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Task, arguments, and what a certificate says that it is of."""
-    if not Path(of).is_dir():
-        return of, dict(environment), {"task": of, "environment": {k: str(v) for k, v in environment.items()}}
-    config = RunFolder(Path(of)).config()
-    content = (Path(of) / "config.yaml").read_bytes()
+def _find_subject(subject: str, environment: Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return the task, the options of its environment, and the description of a certificate's subject."""
+    if not Path(subject).is_dir():
+        about = {"task": subject, "environment": {key: str(value) for key, value in environment.items()}}
+        return subject, dict(environment), about
+    config = RunFolder(Path(subject)).config()
+    content = (Path(subject) / "config.yaml").read_bytes()
     about = {"task": config.task, "config.yaml": hashlib.sha256(content).hexdigest()}
     return config.task, changed_environment(config.task, config.environment, environment), about
 
 
-def _largest(bounds: Bounds) -> dict[str, list[float | None]]:
-    """The least, the greatest, the fastest of each output over all steps; None where nothing is known."""
+def _extremes(bounds: Bounds) -> dict[str, list[float | None]]:
+    """Return the extreme bounds of each output over all steps; None where there is none."""
     extremes = {
         "lower": bounds.lower.min(axis=0),
         "upper": bounds.upper.max(axis=0),

@@ -1,1 +1,1 @@
-"""What a movement primitive can command at all, whatever its policy does: computed, written down, and checked."""
+"""Certificates: proven bounds on the commands of a movement primitive for all policies, with an independent checker."""

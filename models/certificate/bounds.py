@@ -1,22 +1,22 @@
-"""Bounds on what a primitive commands, for all sequences of actions in [−1, 1].
+"""Bounds on the commands of a primitive for all sequences of actions in [−1, 1].
 
-Where no constraint is active the loop history → next command is affine: its reachable set is a zonotope, whose
-generators are the impulse responses, and the largest value along any direction is the sum of their sizes. Three regimes
-are certified.
+Without active constraints the loop history → next command is affine and its reachable set is a zonotope. The generators
+are the impulse responses, and the largest value along a direction is the sum of their absolute values. Three regimes
+are certified:
 
-- *free*: for all sequences, as long as no constraint had to be enforced. Exact.
-- *always*: for all sequences. Up to the first step whose window a constraint can touch it is the free regime. From
-  there on a constrained output is capped by the constraint set. Without a history (KGRL) a command is a function of
-  one action, and the actions are cut into cells. Between a cell's corners the mean v̄ of the corners' corrections v_i
-  is a feasible one, and the least one v of any action is no farther from it than ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², where a
-  corner's multipliers bound ‖v‖ from below (weak duality). So a command is between the corners' by that radius times
-  the output's size. With a history corrections feed back, and an output that no constraint caps, and that is tied to
-  one that is constrained, has no bound in this regime.
-- *budgeted*, with a history: for all sequences in which corrections keep a budget. A correction moves the executed
-  point as another action would, and by a residue in the outputs that no action moves. What such actions exceed ±1 by
-  has a budget, at one step and added up over the sequence, and so has the residue: both are small, as a correction
-  takes back what an action asked for. They are worst where the response to them is largest. That they are kept is
-  assumed, not proved.
+- *free*: all sequences, until a constraint becomes active. Exact.
+- *always*: all sequences. Up to the first step whose window a constraint can touch, the bounds are those of *free*.
+  After it, a constrained output is bounded by the constraints themselves. Without a history (KGRL), a command depends
+  on one action only, and the actions are divided into cells. The mean v̄ of the corrections v_i at a cell's corners is
+  feasible for every action in it, and the least correction v is no farther from it than ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², where
+  the multipliers at a corner bound ‖v‖ from below (weak duality). So a command is within this radius, times the size of
+  the output, of the commands at the corners. With a history, corrections feed back: an output that no constraint
+  bounds, and that is coupled to a constrained one, has no bound in this regime.
+- *budgeted*, with a history: all sequences whose corrections satisfy a budget. A correction moves the executed point as
+  another action would, plus a residue in the outputs that no action moves. The budget limits the amount by which such
+  actions exceed ±1, and the residue, at one step and in total. Both are small, because a correction undoes what an
+  action demanded. The worst corrections are where the response to them is largest. That a sequence satisfies the budget
+  is assumed and not proven.
 """
 
 from __future__ import annotations
@@ -26,177 +26,202 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from guiderail.models.certificate.lagrange_bounds import Budget, Budgeted, budgeted
-from guiderail.models.certificate.loop import Bounds, SharedControlTemplate, caps, reach
+from guiderail.models.certificate.lagrange_bounds import Budget, BudgetedBounds, bound_within_budget
+from guiderail.models.certificate.loop import Bounds, CertifiedLoop, reach, single_output_bounds
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
-CELLS = {1: 16, 2: 24, 3: 3}  # along each action, by how many actions there are; one for more
-MOST_ACTIONS = 6  # of which all corners are looked at
-ROUNDING = 1e-6  # of a squared correction: a radius below its root is none
+CELLS = {1: 16, 2: 24, 3: 3}  # cells along each action by the number of actions; 1 for more actions
+MAX_ACTIONS = 6  # number of actions whose corners are enumerated
+ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
 
 
 @dataclass(frozen=True)
-class Certified:
-    """What holds of a skill.
+class CertifiedBounds:
+    """Certified bounds of a loop.
 
     Attributes:
-        free, always: the two regimes.
-        touched: (N,), whether a constraint can be active in a step's window, whatever the actions before.
-        multipliers: at the steps that are touched, for every corner of a cell of the actions (T, (K+1)^A, H+1, F):
-            what proves how far commands go; empty with a history.
-        budgeted: the third regime; None where there is none.
+        free: Bounds until a constraint becomes active.
+        always: Bounds for all sequences.
+        can_be_active: Mask (N,) of the steps in whose window a constraint can be active for some actions.
+        multipliers: Multipliers that prove `always`: at these T steps, for every corner of the cells of the actions,
+            (T, (K+1)^A, H+1, F); empty with a history.
+        budgeted: Bounds for corrections within a budget, or None.
     """
 
     free: Bounds
     always: Bounds
-    touched: np.ndarray
+    can_be_active: np.ndarray
     multipliers: np.ndarray
-    budgeted: Budgeted | None = None
+    budgeted: BudgetedBounds | None = None
 
 
-def certify(skill: SharedControlTemplate, budget: Budget | None = None) -> Certified:
-    """The bounds of a skill; of the budgeted regime as well, with a budget and where a history feeds corrections back.
+def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBounds:
+    """Compute the bounds of a loop.
+
+    Args:
+        loop: Primitive in its loop.
+        budget: Budget of the third regime, which exists with a history only; without one it is left out.
 
     Raises:
-        InputError: if a primitive without a history has more actions than whose corners can be looked at.
+        InputError: If a primitive without a history has more than `MAX_ACTIONS` actions.
     """
-    primitive = skill.primitive
-    middle, generators = reach(skill)
-    free = _of_zonotope(middle, generators, skill)
-    touched = _touched(skill, middle, generators)
+    primitive = loop.primitive
+    middle, generators = reach(loop)
+    free = _bound_zonotope(middle, generators, loop)
+    can_be_active = _find_active_steps(loop, middle, generators)
     if primitive.history:
-        unknown = np.logical_or.accumulate(touched)[:, None] & _coupled(primitive)
-        corrected = np.where(unknown, np.inf, np.nan) * np.array([-1.0, 1.0])[:, None, None]
-        multipliers = _none(primitive)
+        is_unbounded = np.logical_or.accumulate(can_be_active)[:, None] & _find_coupled(primitive)
+        corrected = np.where(is_unbounded, np.inf, np.nan) * np.array([-1.0, 1.0])[:, None, None]
+        multipliers = _no_multipliers(primitive)
     else:
-        corrected, multipliers = _cellwise(skill, touched)
-    always = _always(skill, free, corrected)
-    if budget is None or not primitive.history or not touched.any():
-        return Certified(free, always, touched, multipliers)
-    first = int(np.argmax(touched))
-    return Certified(free, always, touched, multipliers, budgeted(skill, free, middle, generators, first, budget))
+        corrected, multipliers = _bound_cells(loop, can_be_active)
+    always = _bound_always(loop, free, corrected)
+    if budget is None or not primitive.history or not can_be_active.any():
+        return CertifiedBounds(free, always, can_be_active, multipliers)
+    first = int(np.argmax(can_be_active))
+    budgeted = bound_within_budget(loop, free, middle, generators, first, budget)
+    return CertifiedBounds(free, always, can_be_active, multipliers, budgeted)
 
 
-def nodes(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
-    """The corners (C, O) of all cells of the raw actions, and which of them each cell has.
+def action_cells(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
+    """Divide the actions into cells.
+
+    Args:
+        gains: Null-space units per action (O,).
+
+    Returns:
+        The corners (C, O) of all cells as raw actions, and the indices of the corners of each cell.
 
     Raises:
-        InputError: for too many actions.
+        InputError: If there are more than `MAX_ACTIONS` actions.
     """
     moved = np.flatnonzero(gains)
-    if len(moved) > MOST_ACTIONS:
-        raise InputError(f"the corners of {len(moved)} actions are too many to look at: explore {MOST_ACTIONS} at most")
+    if len(moved) > MAX_ACTIONS:
+        raise InputError(
+            f"the corners of {len(moved)} actions are too many to enumerate: explore {MAX_ACTIONS} at most"
+        )
     along = CELLS.get(len(moved), 1)
     places = list(itertools.product(range(along + 1), repeat=len(moved)))
-    number = {place: i for i, place in enumerate(places)}
+    index = {place: i for i, place in enumerate(places)}
     raw = np.zeros((len(places), len(gains)))
     raw[:, moved] = (2.0 * np.array(places).reshape(len(places), len(moved)) / along - 1.0) * gains[moved]
     cells = [
-        [number[tuple(np.add(first, step))] for step in itertools.product((0, 1), repeat=len(moved))]
+        [index[tuple(np.add(first, step))] for step in itertools.product((0, 1), repeat=len(moved))]
         for first in itertools.product(range(along), repeat=len(moved))
     ]
     return raw, cells
 
 
-def _of_zonotope(middle: np.ndarray, generators: np.ndarray, skill: SharedControlTemplate) -> Bounds:
-    steps = skill.primitive.num_steps
+def _bound_zonotope(middle: np.ndarray, generators: np.ndarray, loop: CertifiedLoop) -> Bounds:
+    steps = loop.primitive.num_steps
     size = np.abs(generators).sum(axis=2)
     changes = []
     for order in (1, 2):
         change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(generators, order, axis=0)).sum(axis=2)
         padded = np.concatenate([np.zeros((order, middle.shape[1])), change])[-steps:]
-        changes.append(padded / skill.period**order)
+        changes.append(padded / loop.period**order)
     return Bounds((middle - size)[-steps:], (middle + size)[-steps:], *changes)
 
 
-def _touched(skill: SharedControlTemplate, middle: np.ndarray, generators: np.ndarray) -> np.ndarray:
-    primitive, past = skill.primitive, skill.primitive.history
-    moved = np.flatnonzero(skill.gains)
-    touched = np.zeros(primitive.num_steps, dtype=bool)
+def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.ndarray) -> np.ndarray:
+    """Return the mask (N,) of the steps at which a constraint can be active."""
+    primitive, past = loop.primitive, loop.primitive.history
+    moved = np.flatnonzero(loop.gains)
+    can_be_active = np.zeros(primitive.num_steps, dtype=bool)
     for n in range(primitive.num_steps):
         rows, lower, upper = primitive.free_constraints(n)
-        of_history, of_action = rows[:, : past * primitive.num_outputs], rows[:, past * primitive.num_outputs :]
-        value = of_history @ middle[n : past + n].ravel()
-        spread = of_history @ generators[n : past + n].reshape(of_history.shape[1], generators.shape[2])
-        spread[:, n * len(moved) : (n + 1) * len(moved)] += of_action[:, moved] * skill.gains[moved]
+        history_map, action_map = rows[:, : past * primitive.num_outputs], rows[:, past * primitive.num_outputs :]
+        value = history_map @ middle[n : past + n].ravel()
+        spread = history_map @ generators[n : past + n].reshape(history_map.shape[1], generators.shape[2])
+        spread[:, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
         size = np.abs(spread).sum(axis=1)
-        touched[n] = bool((value - size < lower).any() or (value + size > upper).any())
-    return touched
+        can_be_active[n] = bool((value - size < lower).any() or (value + size > upper).any())
+    return can_be_active
 
 
-def _cellwise(skill: SharedControlTemplate, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest commands (2, N, O) at touched steps, NaN at others, and the multipliers that prove them."""
-    primitive = skill.primitive
-    reached, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
-    actions, cells = nodes(skill.gains)
-    for n in map(int, np.flatnonzero(touched)):
-        found = [primitive.predict(n, action) for action in actions]
-        multipliers.append([one.multipliers for one in found])
+def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return bounds (2, N, O) of corrected commands, NaN at other steps, and the multipliers that prove them."""
+    primitive = loop.primitive
+    bounds, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
+    actions, cells = action_cells(loop.gains)
+    for n in map(int, np.flatnonzero(can_be_active)):
+        predictions = [primitive.predict(n, action) for action in actions]
+        multipliers.append([prediction.multipliers for prediction in predictions])
         rows, lower, upper = primitive.free_constraints(n)
-        empty = np.zeros(next((len(one.correction) for one in found if one.correction is not None), 0))
-        corrections = np.array([empty if one.correction is None else one.correction for one in found])
-        free, outputs, sizes = actions @ rows.T, np.array([one.output for one in found]), primitive.output_sizes(n)
+        rank = next((len(one.correction) for one in predictions if one.correction is not None), 0)
+        corrections = np.array([np.zeros(rank) if one.correction is None else one.correction for one in predictions])
+        free, outputs, sizes = (
+            actions @ rows.T,
+            np.array([one.output for one in predictions]),
+            primitive.output_sizes(n),
+        )
         ranges = []
         for cell in cells:
-            least = [_least_sizes(found[k].signed_multipliers, free[cell], lower, upper, corrections[k]) for k in cell]
-            radius = sizes * np.sqrt(min(_squared_radius(corrections[cell], one) for one in least))
+            norms = [
+                _min_norms(predictions[k].signed_multipliers, free[cell], lower, upper, corrections[k]) for k in cell
+            ]
+            radius = sizes * np.sqrt(min(_squared_radius(corrections[cell], each) for each in norms))
             ranges.append([outputs[cell].min(axis=0) - radius, outputs[cell].max(axis=0) + radius])
-        reached[0, n], reached[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
-    return reached, np.array(multipliers) if multipliers else _none(primitive)
+        bounds[0, n], bounds[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
+    return bounds, np.array(multipliers) if multipliers else _no_multipliers(primitive)
 
 
-def _least_sizes(
+def _min_norms(
     signed: np.ndarray | None, free: np.ndarray, lower: np.ndarray, upper: np.ndarray, correction: np.ndarray
 ) -> np.ndarray:
-    """What multipliers say of the size of a cell's corners' corrections at least; zeros where that is nothing."""
-    size = np.linalg.norm(correction)
-    if signed is None or not size > 0.0:
+    """Return lower bounds, proven by multipliers, on the norms of the corrections at a cell's corners, or zeros."""
+    norm = np.linalg.norm(correction)
+    if signed is None or not norm > 0.0:
         return np.zeros(len(free))
     at_lower, at_upper = signed < 0.0, signed > 0.0
-    short = (lower - free)[:, at_lower] @ -signed[at_lower] + (free - upper)[:, at_upper] @ signed[at_upper]
-    return short / size if (short >= 0.0).all() else np.zeros(len(free))
+    missing = (lower - free)[:, at_lower] @ -signed[at_lower] + (free - upper)[:, at_upper] @ signed[at_upper]
+    return missing / norm if (missing >= 0.0).all() else np.zeros(len(free))
 
 
-def _squared_radius(corrections: np.ndarray, least: np.ndarray) -> float:
-    """How far the least correction of any action in a cell can be from the mean of the corners' there, squared."""
+def _squared_radius(corrections: np.ndarray, min_norms: np.ndarray) -> float:
+    """Return the largest squared distance of any correction in a cell from the mean of those at its corners."""
     squared = np.sum(corrections**2, axis=1)
-    apart = np.sum((corrections[:, None] - corrections) ** 2, axis=2)
-    between = 0.5 * max(float(np.max((least[:, None] - least) ** 2 - apart)), 0.0)
-    return max(float(np.max(squared - least**2)) + between, ROUNDING * float(squared.max()))
+    distances = np.sum((corrections[:, None] - corrections) ** 2, axis=2)
+    between = 0.5 * max(float(np.max((min_norms[:, None] - min_norms) ** 2 - distances)), 0.0)
+    return max(float(np.max(squared - min_norms**2)) + between, ROUNDING * float(squared.max()))
 
 
-def _none(primitive: LcNsKmp) -> np.ndarray:
+def _no_multipliers(primitive: LcNsKmp) -> np.ndarray:
     return np.zeros((0, 0, primitive.horizon + 1, primitive.constraints.num_constraints))
 
 
-def _coupled(primitive: LcNsKmp) -> np.ndarray:
-    """(O,): whether a correction can move an output: one that is constrained, or tied to such a one by covariance."""
-    tied = (primitive.reference.covariances != 0.0).any(axis=0)
-    reached = (primitive.constraints.G.reshape(-1, primitive.num_outputs) != 0.0).any(axis=0)
+def _find_coupled(primitive: LcNsKmp) -> np.ndarray:
+    """Return the mask (O,) of outputs that are constrained, or coupled to a constrained one by covariance."""
+    coupling = (primitive.reference.covariances != 0.0).any(axis=0)
+    is_coupled = (primitive.constraints.G.reshape(-1, primitive.num_outputs) != 0.0).any(axis=0)
     for _ in range(primitive.num_outputs):
-        reached = reached | (tied & reached).any(axis=1)
-    return reached
+        is_coupled = is_coupled | (coupling & is_coupled).any(axis=1)
+    return is_coupled
 
 
-def _always(skill: SharedControlTemplate, free: Bounds, reached: np.ndarray) -> Bounds:
-    corrected = ~np.isnan(reached[0])
-    least, greatest = caps(skill)
-    lower = np.where(corrected, np.maximum(reached[0], least), free.lower)
-    upper = np.where(corrected, np.minimum(reached[1], greatest), free.upper)
+def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarray) -> Bounds:
+    """Combine the bounds without constraints and those of corrected commands (2, N, O), NaN where there is none."""
+    is_corrected = ~np.isnan(corrected_bounds[0])
+    low, high = single_output_bounds(loop)
+    lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)
+    upper = np.where(is_corrected, np.minimum(corrected_bounds[1], high), free.upper)
     speed, acceleration = free.speed.copy(), free.acceleration.copy()
-    begin = np.broadcast_to([skill.start - skill.start_within, skill.start + skill.start_within], (2, *lower.shape[1:]))
+    start = np.broadcast_to([loop.start - loop.start_within, loop.start + loop.start_within], (2, *lower.shape[1:]))
     for n in range(len(lower)):
-        low, high = _last(lower, n, begin[0]), _last(upper, n, begin[1])
-        if (n >= 1 or skill.primitive.history) and corrected[max(n - 1, 0) : n + 1].any():
-            away = np.maximum(high[0] - low[1], high[1] - low[0]) / skill.period
-            speed[n] = np.where(corrected[max(n - 1, 0) : n + 1].any(axis=0), away, speed[n])
-        if (n >= 2 or skill.primitive.history) and corrected[max(n - 2, 0) : n + 1].any():
-            most = np.maximum(high[0] - 2.0 * low[1] + high[2], 2.0 * high[1] - low[0] - low[2]) / skill.period**2
-            acceleration[n] = np.where(corrected[max(n - 2, 0) : n + 1].any(axis=0), most, acceleration[n])
+        least, greatest = _last_three(lower, n, start[0]), _last_three(upper, n, start[1])
+        recent = is_corrected[max(n - 1, 0) : n + 1]
+        if (n >= 1 or loop.primitive.history) and recent.any():
+            change = np.maximum(greatest[0] - least[1], greatest[1] - least[0]) / loop.period
+            speed[n] = np.where(recent.any(axis=0), change, speed[n])
+        recent = is_corrected[max(n - 2, 0) : n + 1]
+        if (n >= 2 or loop.primitive.history) and recent.any():
+            forward = greatest[0] - 2.0 * least[1] + greatest[2]
+            change = np.maximum(forward, 2.0 * greatest[1] - least[0] - least[2]) / loop.period**2
+            acceleration[n] = np.where(recent.any(axis=0), change, acceleration[n])
     return Bounds(lower, upper, speed, acceleration)
 
 
-def _last(values: np.ndarray, n: int, begin: np.ndarray) -> list[np.ndarray]:
-    """Of step n and the two before it, the newest first; before the first step it is where the robot begins."""
-    return [values[k] if k >= 0 else begin for k in (n, n - 1, n - 2)]
+def _last_three(values: np.ndarray, n: int, start: np.ndarray) -> list[np.ndarray]:
+    """Return the values (O,) of step n and the two before it, the newest first; `start` before the first step."""
+    return [values[k] if k >= 0 else start for k in (n, n - 1, n - 2)]

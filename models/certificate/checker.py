@@ -16,40 +16,40 @@ import numpy as np
 Arrays = dict[str, np.ndarray]
 KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: np.exp(-np.longdouble(0.5 / length**2) * d**2)}
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
-AGREES = 1e-4  # of a quantity's largest value: how well two ways of calculating it agree
-KEEPS = 1e-7  # of a constraint's size: how well a correction that is shown must keep it
-ROUNDING = 1e-6  # of a squared correction: a radius below its root is none
-# Half the SHA-256 of what is assumed: six sentences always, one for a budget, one where the period is not the clock's
-ASSUMES = ["eb2203ae20fb96189d03f46fca57a6d6", "1a96803e4f791a708f417579bd275de4", "21fe78bb562c96c2fb08e079a8058487"]
+AGREEMENT = 1e-4  # largest difference from a claim, relative to the largest value of the quantity
+TOLERANCE = 1e-7  # largest violation by a correction, relative to the size of the constraint
+ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
+# First half of the SHA-256 of the assumptions: six sentences always, one for a budget, one for another period
+ASSUMED = ["e5158d7dbfb9eb94f8416c6dc4d2ff18", "a655ad2b35cbf716049b5b81125193c9", "a36592ef1fbc0ffbb0d3964081e759de"]
 
 
 class Rejected(Exception):
-    """Why a certificate is not accepted."""
+    """Reason why a certificate is rejected."""
 
 
 def require(condition: Any, words: str) -> None:
-    """Rejects the certificate unless a condition holds."""
+    """Reject the certificate unless a condition holds."""
     if not condition:
         raise Rejected(words)
 
 
 def read(folder: Path) -> tuple[Arrays, Arrays, dict[str, Any]]:
-    """The primitive with its constraints, the witness and the claims; every file must be the one that was signed."""
+    """Return primitive and constraints, witness and claims; reject a file that differs from its digest."""
     claims = json.loads((folder / "certificate.json").read_text())
-    told = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
-    require(hashlib.sha256(told.encode()).hexdigest() == claims.get("digest"), "certificate.json was changed")
+    text = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
+    require(hashlib.sha256(text.encode()).hexdigest() == claims.get("digest"), "certificate.json was changed")
     files: dict[str, Arrays] = {}
     for name in ("primitive.npz", "constraints.npz", "witness.npz"):
         content = (folder / name).read_bytes()
         require(hashlib.sha256(content).hexdigest() == claims["digests"].get(name), f"{name} was changed")
         with np.load(folder / name, allow_pickle=False) as arrays:
             files[name] = {key: arrays[key] for key in arrays.files}
-        require(all(np.isfinite(each).all() for each in files[name].values()), f"{name} has what is not finite")
+        require(all(np.isfinite(each).all() for each in files[name].values()), f"{name} has values that are not finite")
     return {**files["primitive.npz"], **files["constraints.npz"]}, files["witness.npz"], claims
 
 
 def solve(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """A⁻¹ B of a positive definite A, in extended precision."""
+    """Compute A⁻¹ B of a positive definite A in extended precision."""
     n, M = len(A), np.hstack([A, B])
     for j, rest in enumerate(~np.eye(n, dtype=bool)):
         M[j] /= M[j, j]
@@ -73,7 +73,7 @@ class Primitive:
         self.known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def features(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """W (H+1, P), and features F of the kernel given the history, F Fᵀ = C."""
+        """Compute W (H+1, P), and features F (H+1, r) of the kernel given the history, F Fᵀ = C."""
         P, t = self.past, self.inputs[n : n + self.past + self.horizon + 1]
         key = np.round((t - t[0]).astype(float), 12).tobytes()
         if key not in self.known:
@@ -85,7 +85,7 @@ class Primitive:
         return self.known[key]
 
     def window(self, n: int) -> tuple[np.ndarray, ...]:
-        """The window's maps from history and action, its offset, L with S = L Lᵀ, and constraints on it, as rows."""
+        """Compute the window's maps of history and action, offset, L with S = L Lᵀ, constraint rows and bounds."""
         W, F = self.features(n)
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         precision, F_bar = np.linalg.inv(self.covariances[at]), np.kron(F, np.eye(outs))
@@ -97,17 +97,17 @@ class Primitive:
         return history, self.beta * L @ L[:outs].T, L @ (weigh.T @ self.means[at].ravel()), L, rows, self.c[at].ravel()
 
     def caps(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the constraints on a single output leave it, (N, outs) each."""
+        """Return lower and upper bounds (N, outs) by the constraints that involve a single output."""
         alone = ((self.G != 0).sum(axis=2) == 1)[..., None]
         cap = self.c[..., None] / np.where(self.G == 0, 1, self.G)
         least = np.where(alone & (self.G > 0), cap, -np.inf).max(axis=1, initial=-np.inf)
         return least, np.where(alone & (self.G < 0), cap, np.inf).min(axis=1, initial=np.inf)
 
     def reach(self, p: Arrays, witness: Arrays) -> tuple[np.ndarray, ...]:
-        """Free motion, generators, what corrected commands reach (2, N, outputs) or NaN, and maps from histories."""
+        """Compute free motion, generators, bounds of corrected commands (2, N, outs) or NaN, and maps of histories."""
         P, N, outs = self.past, self.steps, self.outputs
-        moved, claimed = np.flatnonzero(p["gains"]), witness["touched"].astype(bool)
-        require(claimed.shape == (N,) and (p["start_within"] >= 0).all(), "steps without an entry, or a start below 0")
+        moved, claimed = np.flatnonzero(p["gains"]), witness["active"].astype(bool)
+        require(claimed.shape == (N,) and (p["start_within"] >= 0).all(), "missing steps, or a negative start_within")
         middle, spread = np.zeros((P + N, outs)), np.zeros((P + N, outs, N * (A := len(moved)) + outs))
         middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
         corrected, maps = np.full((2, N, outs), np.nan), np.zeros((N, outs, P * outs))
@@ -117,11 +117,11 @@ class Primitive:
             g = history @ spread[n : P + n].reshape(P * outs, N * A + outs)
             g[:, n * A : (n + 1) * A] += (by := action[:, moved] * p["gains"][moved])
             middle[P + n], spread[P + n] = y[:outs], g[:outs]
-            touches = not (rows @ y - np.abs(rows @ g).sum(axis=1) >= c - KEEPS).all()
+            touches = not (rows @ y - np.abs(rows @ g).sum(axis=1) >= c - TOLERANCE).all()
             require(claimed[n] or not touches, f"step {n}: a constraint can be active there")
             if claimed[n] and P == 0:
-                shown = witness["multipliers"][claimed[:n].sum()]
-                corrected[:, n] = cells(n, y, by, L[:outs], (rows @ L, rows, c), shown)
+                alphas = witness["multipliers"][claimed[:n].sum()]
+                corrected[:, n] = cells(n, y, by, L[:outs], (rows @ L, rows, c), alphas)
         if P:
             tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"].reshape(-1, outs) != 0).any(axis=0)
             reached = np.linalg.matrix_power(tied + np.eye(outs), outs) @ reached > 0
@@ -130,7 +130,7 @@ class Primitive:
         return middle, spread, corrected, maps
 
     def bounds(self, p: Arrays, found: tuple[np.ndarray, ...], period: float) -> dict[str, Arrays]:
-        """The quantities of the first two regimes, each (N, outs)."""
+        """Compute the quantities (N, outs) of the first two regimes."""
         (middle, spread, corrected, _), P, N, outs = found, self.past, self.steps, self.outputs
         size, off, (least, greatest) = np.abs(spread).sum(axis=2), ~np.isnan(corrected[0]), self.caps()
         free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
@@ -151,25 +151,25 @@ class Primitive:
         return {"free": free, "always": always}
 
     def budgeted(self, p: Arrays, w: Arrays, claims: Any, reached: tuple[np.ndarray, ...]) -> Arrays:
-        """The third regime's. Prices of commands at other steps, which keep their constraints, only prove bounds."""
+        """Compute the quantities of the third regime; any multipliers of constraints at other steps prove bounds."""
         (middle, spread, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
-        first, U = int(np.argmax(w["touched"])), np.flatnonzero(p["gains"] == 0)
+        first, U = int(np.argmax(w["active"])), np.flatnonzero(p["gains"] == 0)
         A, late, more = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)))
         budgets = [np.array(claims["budgeted"]["excess"]), np.array(claims["budgeted"]["residue"])[:, U]]
-        at, of, prices, (low, high) = w["at"], w["of"], w["prices"], self.caps()
-        fine = [np.isfinite(prices), at >= 0, of >= 0, budgets[0] >= 0, budgets[1] >= 0, P > 0 and w["touched"].any()]
-        require(all(np.all(each) for each in fine), "budgets and prices are none")
+        (at, of, alphas), (low, high) = (w[f"lagrange_{k}"] for k in ("steps", "outputs", "multipliers")), self.caps()
+        valid = [np.isfinite(alphas), at >= 0, of >= 0, budgets[0] >= 0, budgets[1] >= 0, P > 0 and w["active"].any()]
+        require(all(np.all(each) for each in valid), "invalid budgets or multipliers")
         for n in range(first, N):
             more[P + n] = maps[n] @ more[n : P + n].reshape(P * outs, more.shape[2])
             more[P + n, U, (n - first) * len(U) + np.arange(len(U))] = 1
         spread, most = np.concatenate([spread, more], axis=2), np.zeros((3, 2, N, outs))
         for order, side, n in itertools.product(range(3), range(2), range(first, N)):
-            k, o, price = at[order, side, n], of[order, side, n], prices[order, side, n]
+            k, o, alpha = at[order, side, n], of[order, side, n], alphas[order, side, n]
             sign, row = 1 - 2 * side, slice(P + n - order, P + n + 1)
-            g = sign * np.diff(spread[row], order, axis=0)[0] - np.einsum("or,orc->oc", price, spread[P + k, o])
-            room = np.where(price > 0, high[k, o], low[k, o]) - middle[P + k, o]
+            g = sign * np.diff(spread[row], order, axis=0)[0] - np.einsum("or,orc->oc", alpha, spread[P + k, o])
+            margin = np.where(alpha > 0, high[k, o], low[k, o]) - middle[P + k, o]
             value = sign * np.diff(middle[row], order, axis=0)[0] + np.abs(g[:, : N * A + outs]).sum(axis=1)
-            value += (price * np.where(price == 0, 0, room)).sum(axis=1)
+            value += (alpha * np.where(alpha == 0, 0, margin)).sum(axis=1)
             for part, budget in zip((g[:, first * A : N * A], g[:, N * A + outs :]), budgets, strict=True):
                 spent = np.clip(budget[1] - np.arange(late)[:, None] * budget[0], 0, budget[0])
                 value += (np.sort(np.abs(part).reshape(outs, late, -1), axis=1)[:, ::-1] * spent).sum(axis=(1, 2))
@@ -179,7 +179,7 @@ class Primitive:
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
-    """What step n commands in cells of actions: corners' mean correction is feasible, v within ‖v̄‖² − ‖v‖² of it."""
+    """Bound the commands of step n by cells; v is within ‖v̄‖² − ‖v‖² of the mean v̄ of the corners' corrections."""
     (rows_L, rows, c), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / A)) - 1
     fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
@@ -187,15 +187,15 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
     places = np.array(list(itertools.product(range(along + 1), repeat=A)))
     free = y + (2.0 * places / along - 1.0) @ by.T
     v, short = alphas @ rows_L, c - free @ rows.T
-    slack = v @ rows_L.T - short + KEEPS * (1 + np.abs(c))
-    require((slack >= 0).all(), f"step {n}: the correction that is shown breaks a constraint")
+    slack = v @ rows_L.T - short + TOLERANCE * (1 + np.abs(c))
+    require((slack >= 0).all(), f"step {n}: the correction violates a constraint")
     least, commands, norms = alphas @ short.T, free[:, :outs] + v @ L.T, np.linalg.norm(L, axis=1)
     weights = (along + 1) ** np.arange(A)[::-1]
     near = np.array(list(itertools.product((0, 1), repeat=A))) @ weights
     i = (places[(places < along).all(axis=1)] @ weights)[:, None] + near  # corners of every cell
     squared, apart = (v[i] ** 2).sum(axis=2), ((v[i][:, :, None] - v[i][:, None]) ** 2).sum(axis=3)
-    said = least[i[:, :, None], i[:, None]]
-    d = said * (said >= 0).all(axis=2, keepdims=True) / np.maximum(np.sqrt(squared), 1e-300)[..., None]
+    dual = least[i[:, :, None], i[:, None]]
+    d = dual * (dual >= 0).all(axis=2, keepdims=True) / np.maximum(np.sqrt(squared), 1e-300)[..., None]
     between = ((d[..., None] - d[..., None, :]) ** 2 - apart[:, None]).max(axis=(2, 3))
     radii = (squared[:, None] - d**2).max(axis=2) + np.maximum(between, 0) / 2
     radius = np.sqrt(np.maximum(radii.min(axis=1), ROUNDING * squared.max(axis=1)))[:, None] * norms
@@ -203,31 +203,31 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
 
 
 def compare(claims: dict[str, Any], found: dict[str, Arrays]) -> None:
-    """Rejects a claim that is not what was found; the worst step is named."""
+    """Reject a claim that differs from the computed quantities, and name the worst step."""
     for regime, name in itertools.product(found, QUANTITIES):
-        claimed = np.array(claims[regime][name], dtype=float)  # null is NaN: nothing is known
-        mine = np.where(np.isinf(found[regime][name]), np.nan, found[regime][name])
-        fits = claimed.shape == mine.shape and (np.isnan(claimed) == np.isnan(mine)).all()
-        require(fits, f"{regime} {name} is not known of each step and output of which it is")
-        scale = np.maximum(np.nan_to_num(np.abs(mine)).max(axis=0), 1e-9)
-        wrong = np.nan_to_num(np.abs(claimed - mine), posinf=np.inf) / scale
+        claimed = np.array(claims[regime][name], dtype=float)  # null is NaN: unbounded
+        own = np.where(np.isinf(found[regime][name]), np.nan, found[regime][name])
+        fits = claimed.shape == own.shape and (np.isnan(claimed) == np.isnan(own)).all()
+        require(fits, f"{regime} {name} has other shapes or unbounded entries")
+        scale = np.maximum(np.nan_to_num(np.abs(own)).max(axis=0), 1e-9)
+        wrong = np.nan_to_num(np.abs(claimed - own), posinf=np.inf) / scale
         n, o = np.unravel_index(int(wrong.argmax()), wrong.shape)
-        require(wrong[n, o] <= AGREES, f"step {n}: {regime} {name} of output {o} is {mine[n, o]:.6g}, not as claimed")
+        require(wrong[n, o] <= AGREEMENT, f"step {n}: {regime} {name} of output {o} is {own[n, o]:.6g}, not as claimed")
 
 
 def check(folder: Path) -> None:
-    """Raises `Rejected` unless the certificate in a folder holds."""
+    """Raise `Rejected` unless the certificate in a folder holds."""
     p, witness, claims = read(folder)
     require(claims["format"] == "guiderail certificate 3" and 0 < claims["period"] < np.inf, "wrong format or period")
     require(claims["kernel"] in KERNELS, f"the kernel is {claims['kernel']!r}, not one of {list(KERNELS)}")
     primitive, period = Primitive(p, claims["kernel"]), float(claims["period"])
     given = True, "budgeted" in claims, abs(period / np.diff(p["inputs"]).mean() - 1) > 1e-6
-    told = ["\n".join(claims["assumes"][:6]), *claims["assumes"][6:]]
-    same = [hashlib.sha256(each.encode()).hexdigest()[:32] for each in told] == list(itertools.compress(ASSUMES, given))
-    require(same, "it does not assume what such a certificate must, with this period and these regimes")
+    texts = ["\n".join(claims["assumes"][:6]), *claims["assumes"][6:]]
+    digests = [hashlib.sha256(text.encode()).hexdigest()[:32] for text in texts]
+    require(digests == list(itertools.compress(ASSUMED, given)), "it does not state the required assumptions")
     found = primitive.bounds(p, reached := primitive.reach(p, witness), period)
     if "budgeted" in claims:
-        third, before = primitive.budgeted(p, witness, claims, reached), np.cumsum(witness["touched"])[:, None] == 0
+        third, before = primitive.budgeted(p, witness, claims, reached), np.cumsum(witness["active"])[:, None] == 0
         found["budgeted"] = {name: np.where(before, found["free"][name], third[name]) for name in QUANTITIES}
     compare(claims, found)
     if "limits" in claims:
@@ -237,14 +237,14 @@ def check(folder: Path) -> None:
             ranges = found[regime]["upper"].max(axis=0) - found[regime]["lower"].min(axis=0)
             rest = np.linalg.norm(np.minimum(limits, stiffness * ranges)[:3])
             forces.append((f"{regime} rest_force", rest, claims[regime]["rest_force"]))
-        for name, mine, said in forces:
-            require(abs(said - mine) <= AGREES * mine, f"{name} is {mine:.6g} N, not {said:.6g} N")
+        for name, own, claimed in forces:
+            require(abs(claimed - own) <= AGREEMENT * own, f"{name} is {own:.6g} N, not {claimed:.6g} N")
 
 
 if __name__ == "__main__":
     try:
         check(Path(sys.argv[1]))
         print("yes")
-    except Exception as why:  # files may hold anything
-        print("no:", why if isinstance(why, Rejected) else f"the files make no sense, {why!r}")
-        sys.exit(1 if isinstance(why, Rejected) else 2)
+    except Exception as reason:  # files may hold anything
+        print("no:", reason if isinstance(reason, Rejected) else f"the files make no sense, {reason!r}")
+        sys.exit(1 if isinstance(reason, Rejected) else 2)

@@ -1,9 +1,9 @@
-"""Bounds on commands whose corrections keep a budget, lowered by what the constraints say of other steps.
+"""Bounds on commands whose corrections satisfy a budget, tightened by Lagrange multipliers of the constraints.
 
-The largest value of a direction over a zonotope is the sum of its generators' sizes along it. A command at another step
-is along the way, and within its own constraints: taking a multiple of it, its price, off the direction, and adding the
-price times the room that its constraint leaves, can only leave a smaller bound. Any prices prove one (they are the
-multipliers of a linear program that nobody has to solve); good ones are found greedily.
+The largest value of a direction over a zonotope is the sum of the absolute values of its generators along it. A command
+at another step satisfies its own constraints: subtracting a multiple of it from the direction, the multiplier, and
+adding the multiplier times the margin of its constraint gives another valid bound. Any multipliers prove a bound; they
+are feasible points of the dual of a linear program, which is not solved. Good ones are found by a greedy search.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from guiderail.models.certificate.loop import Bounds, SharedControlTemplate, caps
+from guiderail.models.certificate.loop import Bounds, CertifiedLoop, single_output_bounds
 
-ROUNDS = 4  # commands at other steps that a bound is lowered by
-AWAY, STRIDE = 48, 3  # how far away these are at most, and how many steps apart
-TRIED = 6  # of them, those most along the way
-PARTS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # of the price that takes most off in the sense of least squares
+ROUNDS = 4  # constraints at other steps that tighten one bound
+MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps, and their spacing
+NUM_CANDIDATES = 6  # constraints tried in each round, by their correlation with the direction
+FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares one
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What corrections may be worth: at one step, and added up over a sequence.
+    """Budget of corrections: largest value at one step, and largest sum over a sequence.
 
     Attributes:
-        excess: (2, A), at once and in all, beyond actions of ±1, in actions.
-        residue: (2, O), at once and in all, in outputs that no action moves.
+        excess: (2, A), amount by which corrections exceed actions of ±1, in actions.
+        residue: (2, O), displacement of outputs that no action moves.
     """
 
     excess: np.ndarray
@@ -34,115 +34,149 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Budgeted:
-    """What holds while corrections keep a budget.
+class BudgetedBounds:
+    """Bounds under the assumption that corrections satisfy a budget.
+
+    The last three attributes prove the bounds. They have one entry for each order of the difference, sign, step, output
+    and round, (3, 2, N, O, R).
 
     Attributes:
-        budget: the assumption.
-        bounds: on commands, speeds and accelerations.
-        steps, outputs, prices: of each direction (order of the difference 3, sign 2, N, O, R): at which steps which
-            outputs' constraints lower its bound, at what price; positive of an upper, negative of a lower constraint.
+        budget: Assumed budget.
+        bounds: Bounds on commands, speeds and accelerations.
+        steps: Step of the constraint that tightens a bound.
+        outputs: Output of that constraint.
+        multipliers: Its multiplier, positive for an upper and negative for a lower bound.
     """
 
     budget: Budget
     bounds: Bounds
     steps: np.ndarray
     outputs: np.ndarray
-    prices: np.ndarray
+    multipliers: np.ndarray
 
 
-def budgeted(
-    skill: SharedControlTemplate, free: Bounds, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
-) -> Budgeted:
-    """The bounds while corrections, which there are from a step `first` on, keep a budget."""
-    primitive, past = skill.primitive, skill.primitive.history
-    steps, outputs = primitive.num_steps, primitive.num_outputs
-    generators = np.concatenate([generators, _of_residue(skill, first)], axis=2)
-    market = _Market(skill, middle, generators, first, budget)
-    at, of, prices = (np.zeros((3, 2, steps, outputs, ROUNDS), kind) for kind in (int, int, float))
-    most = np.zeros((3, 2, steps, outputs))
+def bound_within_budget(
+    loop: CertifiedLoop, free: Bounds, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
+) -> BudgetedBounds:
+    """Compute bounds for corrections that satisfy a budget.
+
+    Args:
+        loop: Primitive in its loop, with a history.
+        free: Bounds without active constraints.
+        middle: Motion without actions, as `reach` returns it.
+        generators: Generators, as `reach` returns them.
+        first: First step at which a constraint can be active.
+        budget: Budget of the corrections.
+    """
+    primitive, past = loop.primitive, loop.primitive.history
+    num_steps, num_outputs = primitive.num_steps, primitive.num_outputs
+    generators = np.concatenate([generators, residue_generators(loop, first)], axis=2)
+    search = MultiplierSearch(loop, middle, generators, first, budget)
+    shape = (3, 2, num_steps, num_outputs)
+    steps, outputs, multipliers = (np.zeros((*shape, ROUNDS), kind) for kind in (int, int, float))
+    largest = np.zeros(shape)
     for order in range(3):
-        of_middle, of_generators = np.diff(middle, order, axis=0), np.diff(generators, order, axis=0)
-        for n in range(first, steps):
-            market.open(n)
+        middle_change, generator_changes = np.diff(middle, order, axis=0), np.diff(generators, order, axis=0)
+        for n in range(first, num_steps):
+            search.select_step(n)
             for side, sign in enumerate((1.0, -1.0)):
-                chosen, row = (order, side, n), past + n - order
-                at[chosen], of[chosen], prices[chosen] = market.chosen(sign * of_generators[row])
-                value = market.worst(sign * of_generators[row], at[chosen], of[chosen], prices[chosen])
-                most[chosen] = sign * of_middle[row] + value
-    low, high = caps(skill)
-    found = [values.copy() for values in (free.lower, free.upper, free.speed, free.acceleration)]
-    found[0][first:] = np.maximum(-most[0, 1], low)[first:]
-    found[1][first:] = np.minimum(most[0, 0], high)[first:]
+                at, row = (order, side, n), past + n - order
+                directions = sign * generator_changes[row]
+                steps[at], outputs[at], multipliers[at] = search.find(directions)
+                value = search.bound(directions, steps[at], outputs[at], multipliers[at])
+                largest[at] = sign * middle_change[row] + value
+    low, high = single_output_bounds(loop)
+    values = [array.copy() for array in (free.lower, free.upper, free.speed, free.acceleration)]
+    values[0][first:] = np.maximum(-largest[0, 1], low)[first:]
+    values[1][first:] = np.minimum(largest[0, 0], high)[first:]
     for order in (1, 2):
-        found[order + 1][first:] = most[order].max(axis=0)[first:] / skill.period**order
-    return Budgeted(budget, Bounds(*found), at, of, prices)
+        values[order + 1][first:] = largest[order].max(axis=0)[first:] / loop.period**order
+    return BudgetedBounds(budget, Bounds(*values), steps, outputs, multipliers)
 
 
-def _of_residue(skill: SharedControlTemplate, first: int) -> np.ndarray:
-    """What a residue of one, of every output that no action moves at every step from `first` on, does to commands."""
-    primitive, past = skill.primitive, skill.primitive.history
-    steps, others = primitive.num_steps, np.flatnonzero(skill.gains == 0.0)
-    response = np.zeros((past + steps, primitive.num_outputs, (steps - first) * len(others)))
+def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
+    """Compute the responses (P + N, O, B) to a residue of one in each unmoved output at each step from `first` on."""
+    primitive, past = loop.primitive, loop.primitive.history
+    steps, unmoved = primitive.num_steps, np.flatnonzero(loop.gains == 0.0)
+    response = np.zeros((past + steps, primitive.num_outputs, (steps - first) * len(unmoved)))
     for n in range(first, steps):
-        of_history = primitive.linear_response(n)[0]
-        response[past + n] = of_history @ response[n : past + n].reshape(of_history.shape[1], response.shape[2])
-        response[past + n, others, (n - first) * len(others) + np.arange(len(others))] = 1.0
+        history_map = primitive.linear_response(n)[0]
+        response[past + n] = history_map @ response[n : past + n].reshape(history_map.shape[1], response.shape[2])
+        response[past + n, unmoved, (n - first) * len(unmoved) + np.arange(len(unmoved))] = 1.0
     return response
 
 
-class _Market:
-    """Where prices are found, and what a direction is worth at some."""
+class MultiplierSearch:
+    """Greedy search for Lagrange multipliers that tighten the bound in a direction."""
 
-    def __init__(
-        self, skill: SharedControlTemplate, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
-    ):
-        self._generators, self._first, self._past = generators, first, skill.primitive.history
-        self._steps, outputs = skill.primitive.num_steps, skill.primitive.num_outputs
-        moved = skill.gains != 0.0
+    def __init__(self, loop: CertifiedLoop, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget):
+        """Prepare the search.
+
+        Args:
+            loop: Primitive in its loop.
+            middle: Motion without actions, as `reach` returns it.
+            generators: Generators of `reach`, followed by those of `residue_generators`.
+            first: First step at which a constraint can be active.
+            budget: Budget of the corrections.
+        """
+        self._generators, self._first, self._past = generators, first, loop.primitive.history
+        self._steps, outputs = loop.primitive.num_steps, loop.primitive.num_outputs
+        moved = loop.gains != 0.0
         self._actions = self._steps * int(moved.sum())
-        self._free = self._actions + outputs  # generators that no budget limits: actions, then the start
-        low, high = caps(skill)
-        self._rooms = np.stack([middle[self._past :] - low, high - middle[self._past :]])
-        self._capped = np.flatnonzero(np.isfinite(low).any(axis=0) | np.isfinite(high).any(axis=0))
+        self._free = self._actions + outputs  # generators without a budget: actions, then the start
+        low, high = single_output_bounds(loop)
+        self._margins = np.stack([middle[self._past :] - low, high - middle[self._past :]])
+        self._bounded = np.flatnonzero(np.isfinite(low).any(axis=0) | np.isfinite(high).any(axis=0))
         self._budgets = budget.excess, budget.residue[:, ~moved]
 
-    def open(self, n: int) -> None:
-        """Looks at the commands around a step."""
-        near = np.arange(max(n % STRIDE, n - AWAY // STRIDE * STRIDE), min(n + AWAY, self._steps - 1) + 1, STRIDE)
-        self._at, self._of = (x.ravel() for x in np.meshgrid(near, self._capped))
+    def select_step(self, n: int) -> None:
+        """Select the constraints around step `n` as candidates."""
+        first = max(n % STRIDE, n - MAX_DISTANCE // STRIDE * STRIDE)
+        near = np.arange(first, min(n + MAX_DISTANCE, self._steps - 1) + 1, STRIDE)
+        self._at, self._of = (x.ravel() for x in np.meshgrid(near, self._bounded))
         self._rows = self._generators[self._past + self._at, self._of, : self._free]
         self._sizes = np.maximum((self._rows**2).sum(axis=1), 1e-300)
 
-    def chosen(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Steps, outputs and prices (O, R) that lower what directions (O, ·) are worth."""
-        outputs = len(along)
-        left, everyone = along[:, : self._free].copy(), np.arange(outputs)
-        at, of, prices = np.zeros((outputs, ROUNDS), int), np.zeros((outputs, ROUNDS), int), np.zeros((outputs, ROUNDS))
+    def find(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return steps, outputs and multipliers (O, R) that tighten the bound in directions (O, ·)."""
+        outputs = len(directions)
+        rest, every = directions[:, : self._free].copy(), np.arange(outputs)
+        shape = (outputs, ROUNDS)
+        steps, constrained, multipliers = np.zeros(shape, int), np.zeros(shape, int), np.zeros(shape)
         for r in range(ROUNDS if len(self._at) else 0):
-            products = left @ self._rows.T
-            tried = np.argsort(-np.abs(products) / np.sqrt(self._sizes), axis=1)[:, :TRIED]
-            price = (products / self._sizes)[everyone[:, None], tried][..., None] * PARTS
-            room = self._rooms[(price > 0.0).astype(int), self._at[tried][..., None], self._of[tried][..., None]]
-            paid = np.where(np.isfinite(room), np.abs(price) * np.where(np.isfinite(room), room, 0.0), np.inf)
-            worth = np.abs(left[:, None, None] - price[..., None] * self._rows[tried][:, :, None]).sum(axis=3) + paid
-            best = worth.reshape(outputs, -1).argmin(axis=1)
-            better = worth.reshape(outputs, -1)[everyone, best] < np.abs(left).sum(axis=1)
-            row = tried[everyone, best // len(PARTS)]
-            at[:, r], of[:, r] = self._at[row], self._of[row]
-            prices[:, r] = np.where(better, price.reshape(outputs, -1)[everyone, best], 0.0)
-            left -= prices[:, r, None] * self._rows[row]
-        return at, of, prices
+            products = rest @ self._rows.T
+            tried = np.argsort(-np.abs(products) / np.sqrt(self._sizes), axis=1)[:, :NUM_CANDIDATES]
+            alpha = (products / self._sizes)[every[:, None], tried][..., None] * FACTORS
+            margin = self._margins[(alpha > 0.0).astype(int), self._at[tried][..., None], self._of[tried][..., None]]
+            cost = np.where(np.isfinite(margin), np.abs(alpha) * np.where(np.isfinite(margin), margin, 0.0), np.inf)
+            bounds = np.abs(rest[:, None, None] - alpha[..., None] * self._rows[tried][:, :, None]).sum(axis=3) + cost
+            best = bounds.reshape(outputs, -1).argmin(axis=1)
+            is_better = bounds.reshape(outputs, -1)[every, best] < np.abs(rest).sum(axis=1)
+            row = tried[every, best // len(FACTORS)]
+            steps[:, r], constrained[:, r] = self._at[row], self._of[row]
+            multipliers[:, r] = np.where(is_better, alpha.reshape(outputs, -1)[every, best], 0.0)
+            rest -= multipliers[:, r, None] * self._rows[row]
+        return steps, constrained, multipliers
 
-    def worst(self, along: np.ndarray, at: np.ndarray, of: np.ndarray, prices: np.ndarray) -> np.ndarray:
-        """(O,), how far commands can go along directions at such prices."""
-        left = along - np.einsum("or,orc->oc", prices, self._generators[self._past + at, of])
-        room = np.where(prices == 0.0, 0.0, self._rooms[(prices > 0.0).astype(int), at, of])
-        value = np.abs(left[:, : self._free]).sum(axis=1) + (np.abs(prices) * room).sum(axis=1)
+    def bound(
+        self, directions: np.ndarray, steps: np.ndarray, outputs: np.ndarray, multipliers: np.ndarray
+    ) -> np.ndarray:
+        """Compute the largest displacement (O,) of commands in directions (O, ·), proven by multipliers (O, R).
+
+        Args:
+            directions: Generators along each direction.
+            steps: Step of each constraint (O, R).
+            outputs: Output of each constraint (O, R).
+            multipliers: Multiplier of each constraint (O, R).
+        """
+        rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._past + steps, outputs])
+        margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]
+        margin = np.where(multipliers == 0.0, 0.0, margins)
+        value = np.abs(rest[:, : self._free]).sum(axis=1) + (np.abs(multipliers) * margin).sum(axis=1)
         late = self._steps - self._first
-        excess = left[:, self._actions - late * self._budgets[0].shape[1] : self._actions]
-        for response, (at_once, in_all) in zip((excess, left[:, self._free :]), self._budgets, strict=True):
-            spent = np.clip(in_all - np.arange(late)[:, None] * at_once, 0.0, at_once)
-            sizes = np.sort(np.abs(response).reshape(len(left), late, len(in_all)), axis=1)[:, ::-1]
+        excess = rest[:, self._actions - late * self._budgets[0].shape[1] : self._actions]
+        for response, (per_step, total) in zip((excess, rest[:, self._free :]), self._budgets, strict=True):
+            spent = np.clip(total - np.arange(late)[:, None] * per_step, 0.0, per_step)
+            sizes = np.sort(np.abs(response).reshape(len(rest), late, len(total)), axis=1)[:, ::-1]
             value += (sizes * spent).sum(axis=(1, 2))
         return value

@@ -1,4 +1,4 @@
-"""A primitive in its loop: what is certified, and the motions that its free regime consists of."""
+"""Primitive in its feedback loop, the subject of a certificate, and its reachable motions without constraints."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 
 @dataclass(frozen=True)
-class SharedControlTemplate:
-    """A primitive in its loop.
+class CertifiedLoop:
+    """Primitive in its feedback loop.
 
     Attributes:
-        primitive: of the skill.
-        gains: (O,), what an action of one is worth; zero for outputs that no action moves.
-        period: between two commands [s].
-        start, start_within: (O,) each, where the robot is when it begins, and how far beside.
+        primitive: Movement primitive.
+        gains: Null-space units per action (O,); zero for outputs that no action moves.
+        period: Time between two commands [s].
+        start: Output at which the robot begins (O,).
+        start_within: Largest offset of the robot from `start` (O,).
     """
 
     primitive: LcNsKmp
@@ -30,9 +31,13 @@ class SharedControlTemplate:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Of a regime: lower and upper (N, O) of the command, largest speed and acceleration (N, O) in its units per s, s².
+    """Bounds of one regime at every step; infinite where there is none.
 
-    A speed is that of the step before; infinite where nothing is known. The first commands have none.
+    Attributes:
+        lower: Least command (N, O).
+        upper: Greatest command (N, O).
+        speed: Largest speed (N, O) of the change to a step from the one before [unit of the output/s].
+        acceleration: Largest acceleration (N, O), likewise [unit of the output/s²].
     """
 
     lower: np.ndarray
@@ -41,35 +46,40 @@ class Bounds:
     acceleration: np.ndarray
 
 
-def reach(skill: SharedControlTemplate) -> tuple[np.ndarray, np.ndarray]:
-    """The motion without actions (P + N, O), the start before it, and the generators around it (P + N, O, B)."""
-    primitive, past = skill.primitive, skill.primitive.history
+def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the zonotope of motions without active constraints.
+
+    Returns:
+        The motion without actions (P + N, O), which begins with P copies of the start, and the generators around it
+        (P + N, O, B): one for each action, then one for each output of the start.
+    """
+    primitive, past = loop.primitive, loop.primitive.history
     steps, outputs = primitive.num_steps, primitive.num_outputs
-    moved = np.flatnonzero(skill.gains)
+    moved = np.flatnonzero(loop.gains)
     batch = steps * len(moved) + (outputs if past else 0)
     middle, generators = np.zeros((past + steps, outputs)), np.zeros((past + steps, outputs, batch))
     if past:
-        middle[:past] = skill.start
-        generators[:past, :, batch - outputs :] = np.diag(skill.start_within)
+        middle[:past] = loop.start
+        generators[:past, :, batch - outputs :] = np.diag(loop.start_within)
     for n in range(steps):
-        of_history, of_action, offset = primitive.linear_response(n)
+        history_map, action_map, offset = primitive.linear_response(n)
         middle[past + n] = offset
         if past:
-            middle[past + n] += of_history @ middle[n : past + n].ravel()
-            generators[past + n] = of_history @ generators[n : past + n].reshape(past * outputs, batch)
-        generators[past + n, :, n * len(moved) : (n + 1) * len(moved)] += of_action[:, moved] * skill.gains[moved]
+            middle[past + n] += history_map @ middle[n : past + n].ravel()
+            generators[past + n] = history_map @ generators[n : past + n].reshape(past * outputs, batch)
+        generators[past + n, :, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
     return middle, generators
 
 
-def caps(skill: SharedControlTemplate) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest value (N, O) that the constraints on a single output leave it."""
-    primitive = skill.primitive
+def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
+    """Return lower and upper bounds (N, O) by the constraints that involve a single output."""
+    primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))
     lower, upper = np.full((2, primitive.num_steps, primitive.num_outputs), [[[-np.inf]], [[np.inf]]])
     for n, row in itertools.product(range(primitive.num_steps), range(G.shape[1])):
-        alone = np.flatnonzero(G[n, row])
-        if len(alone) == 1:
-            o, bound = alone[0], c[n, row] / G[n, row, alone[0]]
+        involved = np.flatnonzero(G[n, row])
+        if len(involved) == 1:
+            o, bound = involved[0], c[n, row] / G[n, row, involved[0]]
             if G[n, row, o] > 0.0:
                 lower[n, o] = max(lower[n, o], bound)
             else:

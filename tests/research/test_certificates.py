@@ -18,7 +18,7 @@ def test_certificates_are_reused_if_already_computed(tmp_path, monkeypatch):
     assert rows["skill"].tolist() == ["passage"]
     row = rows.iloc[0]
     assert row["checker"] == "yes"
-    assert row["bounds_left"] == 0
+    assert row["bound_violations"] == 0
     assert row["worst_ratio_free"] >= 1.0 - 1e-6
     assert row["attack_steps"] >= 2000
     monkeypatch.setattr("research.certificates.certify_skill", None)
@@ -49,10 +49,10 @@ def test_declaration_is_refused_when_invalid(text, message, tmp_path):
         load_declaration(tmp_path / "none.yaml")
 
 
-def certified(checker="yes", left=0):
+def certified(checker="yes", violations=0):
     """Result of certifying a skill."""
-    row = {"quantity": "pose", "output": 0, "constraint": "never active", "ratio": 1.0, "left": left}
-    numbers = dict.fromkeys(("checker_seconds", "steps", "steps_that_constraints_can_touch"), 1)
+    row = {"quantity": "pose", "output": 0, "constraint": "never active", "ratio": 1.0, "violations": violations}
+    numbers = dict.fromkeys(("checker_seconds", "steps", "constrained_steps"), 1)
     return {"checker": checker, "attack": [row], "attack_steps": 1, "attack_corrected": 0, **numbers}
 
 
@@ -61,7 +61,7 @@ def certified(checker="yes", left=0):
     [
         (certified(), None),
         (certified(checker="no: step 3: too tight"), "a_skill: the certificate is rejected by the checker: no: step 3"),
-        (certified(left=2), "a_skill: an adversary exceeded 2 bounds"),
+        (certified(violations=2), "a_skill: an adversary exceeded 2 bounds"),
     ],
 )
 def test_program_exits_with_1_when_a_certificate_fails(tmp_path, monkeypatch, capsys, result, sentence):

@@ -15,12 +15,12 @@ def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tigh
     found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=2000)
     assert found["checker"] == "yes"
     assert found["always_upper"][0] <= found["while_free_upper"][0]
-    assert found["steps"] >= found["steps_that_constraints_can_touch"]
+    assert found["steps"] >= found["constrained_steps"]
     assert json.loads((tmp_path / "certificate.json").read_text())["assumes"]
     rows = found["attack"]
     assert found["attack_steps"] >= 2000
     assert {row["quantity"] for row in rows} == {"pose", "speed", "acceleration"}
-    assert all(row["left"] == 0 for row in rows)
+    assert all(row["violations"] == 0 for row in rows)
     assert all(row["ratio"] < 1.2 for row in rows if row["constraint"] == "never active")
     assert (tmp_path / "attack.csv").exists()
 
@@ -28,7 +28,7 @@ def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tigh
 def test_demonstrations_alone_are_certified_too(tmp_path):
     found = certify_skill("NarrowPassage", {"guidance": "kmp"}, out=tmp_path)
     assert found["checker"] == "yes"
-    assert found["steps_that_constraints_can_touch"] == 0
+    assert found["constrained_steps"] == 0
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.certify import _what
+from guiderail.tools.certify import _find_subject
 from guiderail.tools.environments import changed_environment, check_environment, make_environment
 from guiderail.tools.evaluation import evaluate
 from guiderail.tools.evaluation.robustness import robustness
@@ -73,7 +73,7 @@ def test_a_policy_is_shown_and_certified_at_another_difficulty(tmp_path):
     policy(3, 2).save(tmp_path)
     hard = check_environment("NarrowPassage", HARD)
     assert EpisodeSpec.of_run(tmp_path, HARD).environment == hard
-    assert _what(str(tmp_path), HARD)[1] == hard
+    assert _find_subject(str(tmp_path), HARD)[1] == hard
 
 
 def test_policy_is_refused_with_both_shapes_when_they_differ():

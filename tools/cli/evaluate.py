@@ -207,5 +207,5 @@ def certify(
             typer.echo(f"{name.replace('_', ' ')}: {text}")
         if rows:
             typer.echo(Path(result["certificate"]).with_name("attack.md").read_text(encoding="utf-8"))
-    if result["checker"] != "yes" or any(row["left"] for row in rows):
+    if result["checker"] != "yes" or any(row["violations"] for row in rows):
         raise typer.Exit(1)

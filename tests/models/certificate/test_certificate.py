@@ -17,8 +17,8 @@ from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import BUDGET, CERTIFICATE, OTHER_CLOCK, certificate_files, digest
-from guiderail.models.certificate.lagrange_bounds import Budget, _Market, _of_residue
-from guiderail.models.certificate.loop import SharedControlTemplate, reach
+from guiderail.models.certificate.lagrange_bounds import Budget, MultiplierSearch, residue_generators
+from guiderail.models.certificate.loop import CertifiedLoop, reach
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
@@ -40,7 +40,7 @@ def skill(history, bound=None, tied=0.0):
         horizon=10, history=history, history_variance=1e-6, constraints=constraints,
     )  # fmt: skip
     gains = authority_gains(primitive, outputs=np.array([0]))
-    return SharedControlTemplate(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
+    return CertifiedLoop(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
 
 
 CASES = {
@@ -107,7 +107,7 @@ def test_no_adversary_leaves_the_bounds_and_some_reach_them(case):
         reached["position"] = max(reached["position"], np.max(np.abs(y[:, 0] - middle) / room))
         reached["speed"] = max(reached["speed"], speed[:, 0].max() / always.speed[:, 0].max())
     assert reached["position"] > 0.9
-    if not found.touched.any():
+    if not found.can_be_active.any():
         assert reached["speed"] > 0.6
 
 
@@ -141,8 +141,8 @@ def test_an_adversary_leaves_no_bound_where_corrections_keep_their_budget():
     assert (seen.lower >= bounds.lower - 1e-9).all()
     assert (seen.upper <= bounds.upper + 1e-9).all()
     for quantity, claimed in (("speed", bounds.speed), ("acceleration", bounds.acceleration)):
-        assert (seen.most[quantity] <= claimed * (1.0 + 1e-6)).all()
-        assert (claimed.max(axis=0) <= 2.0 * seen.most[quantity].max(axis=0)).all()
+        assert (seen.largest[quantity] <= claimed * (1.0 + 1e-6)).all()
+        assert (claimed.max(axis=0) <= 2.0 * seen.largest[quantity].max(axis=0)).all()
     assert np.isinf(found.always.upper[:, 1]).any()
 
 
@@ -156,7 +156,7 @@ def test_nothing_is_spent_where_there_is_no_constraint():
 def test_an_attack_begins_in_the_corners_of_all_starts_and_between_them():
     made = skill(4)
     adversary = Adversary(made, np.zeros(STEPS, bool))
-    places = (np.array([adversary._start() for _ in range(200)]) - made.start)[:, 0] / made.start_within[0]
+    places = (np.array([adversary._sample_start() for _ in range(200)]) - made.start)[:, 0] / made.start_within[0]
     assert np.abs(places).max() == pytest.approx(1.0)
     assert {-1.0, 1.0} <= set(np.round(places, 9))
     assert 50 < (np.abs(places) < 0.999).sum() < 150
@@ -170,19 +170,21 @@ def test_an_attack_notices_a_start_that_was_not_certified():
     assert (seen.upper <= certify(made).free.upper + 1e-9).all()
 
 
-@pytest.mark.parametrize("price", [0.0, 0.3, -2.0])
-def test_any_price_proves_a_bound(price):
-    """Prices are multipliers of a linear program: bad ones only make a bound wider."""
+@pytest.mark.parametrize("change", [0.0, 0.3, -2.0])
+def test_any_multiplier_proves_a_bound(change):
+    """Bad multipliers only make a bound wider."""
     made, found = constrained()
-    worse = replace(found.budgeted, prices=found.budgeted.prices + price * (found.budgeted.prices != 0.0))
+    worse = replace(
+        found.budgeted, multipliers=found.budgeted.multipliers + change * (found.budgeted.multipliers != 0.0)
+    )
     middle, generators = reach(made)
-    first = int(np.argmax(found.touched))
+    first = int(np.argmax(found.can_be_active))
     seen = Adversary(made, np.ones(STEPS, bool), seed=2).attack(40 * STEPS)
-    generators = np.concatenate([generators, _of_residue(made, first)], axis=2)
-    market = _Market(made, middle, generators, first, worse.budget)
+    generators = np.concatenate([generators, residue_generators(made, first)], axis=2)
+    search = MultiplierSearch(made, middle, generators, first, worse.budget)
     for n in range(first, STEPS):
-        at, of, prices = (a[0, 0, n] for a in (worse.steps, worse.outputs, worse.prices))
-        highest = middle[4 + n] + market.worst(generators[4 + n], at, of, prices)
+        steps, outputs, multipliers = (a[0, 0, n] for a in (worse.steps, worse.outputs, worse.multipliers))
+        highest = middle[4 + n] + search.bound(generators[4 + n], steps, outputs, multipliers)
         assert (seen.upper[n] <= highest + 1e-9).all()
 
 
@@ -255,7 +257,7 @@ def faster(contents, factor, *left_out):
 def constrained_by_nothing(contents):
     """A constraint that is no number, and claims as if there were none."""
     none = altered(contents, "constraints.npz", c=lambda c: np.nan * c)
-    none = altered(none, "witness.npz", touched=np.zeros_like, multipliers=lambda alphas: alphas[:0])
+    none = altered(none, "witness.npz", active=np.zeros_like, multipliers=lambda alphas: alphas[:0])
     claims = json.loads(contents[CERTIFICATE])
     free, stiffness, limits = (claims[name] for name in ("free", "stiffness", "limits"))
     ranges = np.max(free["upper"], axis=0) - np.min(free["lower"], axis=0)
@@ -283,7 +285,7 @@ TAMPERED = {
     "the kernel": lambda c: signed(c, kernel=lambda _: "matern52"),
     "the constraint's bound": lambda c: signed(altered(c, "constraints.npz", c=lambda c: 1.2 * c)),
     "the constraint's matrix": lambda c: signed(altered(c, "constraints.npz", G=lambda G: G[:, ::-1].copy())),
-    "which steps are touched": lambda c: signed(altered(c, "witness.npz", touched=lambda t: np.zeros_like(t))),
+    "which steps are touched": lambda c: signed(altered(c, "witness.npz", active=lambda t: np.zeros_like(t))),
     "a multiplier": lambda c: signed(altered(c, "witness.npz", multipliers=lambda a: 0.5 * a)),
     "a digest": lambda c: {**c, CERTIFICATE: c[CERTIFICATE].replace(b'"digest": "', b'"digest": "0')},
     "a constraint that is no number": constrained_by_nothing,
@@ -331,7 +333,7 @@ BUDGETED = {
     "the excess": lambda c: signed(c, budgeted__excess=lambda rows: [[0.5 * x for x in row] for row in rows]),
     "the residue": lambda c: signed(c, budgeted__residue=lambda rows: [[0.5 * x for x in row] for row in rows]),
     "a budget below zero": lambda c: signed(c, budgeted__residue=lambda rows: [[-x for x in row] for row in rows]),
-    "a price": lambda c: signed(altered(c, "witness.npz", prices=lambda p: 1.1 * p)),
+    "a Lagrange multiplier": lambda c: signed(altered(c, "witness.npz", lagrange_multipliers=lambda p: 1.1 * p)),
     "what it assumes": lambda c: signed(c, assumes=lambda them: [one for one in them if one != BUDGET]),
     "the regime": lambda c: signed(
         c, budgeted=lambda claims: c and json.loads(c[CERTIFICATE])["always"] | claims_of(c)
@@ -356,7 +358,7 @@ def test_another_period_than_the_clocks_is_said_in_words(tmp_path):
     contents = files(made, certify(made))
     assert OTHER_CLOCK in json.loads(contents[CERTIFICATE])["assumes"]
     checker.check(write(tmp_path, contents))
-    with pytest.raises(checker.Rejected, match="does not assume"):
+    with pytest.raises(checker.Rejected, match="does not state"):
         checker.check(write(tmp_path, faster(contents, 1.0, OTHER_CLOCK)))
 
 
