@@ -9,7 +9,9 @@ of the dense step: the tests compare both with extended precision.
 
 import gc
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +37,7 @@ class _Loop:
     primitive: LcNsKmp
     actions: np.ndarray
 
-    def run(self, predict, steps: int) -> tuple[np.ndarray, int, list]:
+    def run(self, predict: Callable[..., Any], steps: int) -> tuple[np.ndarray, int, list[tuple[Any, ...]]]:
         """Return durations [s], (steps,), the number of constrained steps, and every 50th problem with its output."""
         p, seconds, constrained, samples = self.primitive, np.empty(steps), 0, []
         for k in range(steps):
@@ -134,7 +136,7 @@ def _microseconds(seconds: np.ndarray) -> dict[str, float]:
     return {"median_us": median, "p99_us": p99, "p999_us": p999, "worst_us": worst}
 
 
-def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[dict, np.ndarray]:
+def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[dict[str, Any], np.ndarray]:
     """Return the row of one regime, and the durations of its steps [s]."""
     p = _primitive(size, share)
     rng = np.random.default_rng(1)
@@ -165,7 +167,7 @@ def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[
     return row, seconds
 
 
-def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict]:
+def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict[str, Any]]:
     """Return a row for each regime and one for all of them together."""
     rows, seconds = {}, []
     for regime, share in REGIMES.items():
@@ -178,7 +180,7 @@ def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict]:
     return rows
 
 
-def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict]:
+def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict[str, Any]]:
     """Return for each solver the median duration of the same constrained steps, and the difference to DAQP."""
     first = _primitive(size, REGIMES["active"])
     actions = authority_gains(first) * np.random.default_rng(2).uniform(-1, 1, (997, first.num_outputs))
@@ -236,7 +238,7 @@ def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
     return {"first_ms": 1e3 * first, "step_ms": 1e3 * seconds / p.num_steps, "step_kB": total / p.num_steps / 1e3}
 
 
-def measure(steps: int = STEPS) -> dict:
+def measure(steps: int = STEPS) -> dict[str, Any]:
     """Run the benchmark; return the results by size."""
     report = {}
     for size in with_progress(SIZES, "primitive, O F H P"):
@@ -250,7 +252,7 @@ def measure(steps: int = STEPS) -> dict:
     return report
 
 
-def show(report: dict) -> None:
+def show(report: dict[str, Any]) -> None:
     """Print the tables."""
     from rich.console import Console
     from rich.table import Table

@@ -83,8 +83,8 @@ def timed_callbacks() -> Iterator[Callable[[], float]]:
     spent = [0.0]
     depth = [0]
 
-    def timed(method):
-        def call(*arguments):
+    def timed(method: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
             depth[0] += 1
             start = time.process_time()
             try:
@@ -146,7 +146,7 @@ def env_seconds(guidance: str = "kgrl") -> float:
     best = np.inf
     for episode in range(1 + REPEATS):
         env.reset(seed=episode)
-        start, finished, info = time.process_time(), False, {}
+        start, finished = time.process_time(), False
         while not finished:
             _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
             finished = terminated or truncated

@@ -20,6 +20,7 @@ from typing import Any
 
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import InputPort, OutputPort
+from stable_baselines3.common.buffers import NStepReplayBuffer
 
 import guiderail.systems
 from guiderail.diagrams.envs.env import GuidedEnv
@@ -46,7 +47,7 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (off_policy.OffPolicyLearner, "act", "acting"),
     (off_policy.OffPolicyLearner, "store", "replay buffer"),
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
-    (off_policy.NStepReplayBuffer, "sample", "replay"),
+    (NStepReplayBuffer, "sample", "replay"),
     (training_step.FastTrainingStep, "train", "gradient step"),
     (batched_mlp.BatchedMLP, "forward", "forward"),
     (batched_mlp.BatchedMLP, "backward", "backward"),

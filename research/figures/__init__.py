@@ -24,7 +24,9 @@ FIGURES = {
 }
 
 
-def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: Path = Path("reproductions")) -> dict:
+def reproduce(
+    figure: str, *, seeds: int = 3, episodes: int | None = None, out: Path = Path("reproductions")
+) -> dict[str, Any]:
     """Reproduce one figure or table.
 
     Args:

@@ -125,7 +125,7 @@ def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], presets:
 
 def numbers_of_seeds(
     rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], names: Mapping[str, str] | None = None
-) -> dict:
+) -> dict[str, str]:
     """Return the numbers of each seed as text, by method and column.
 
     Args:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -308,7 +309,7 @@ def _span(seeds: pd.Series) -> str:
     return ", ".join(map(str, numbers))
 
 
-def _interval(row: dict) -> str:
+def _interval(row: Mapping[Any, Any]) -> str:
     """Return a success rate with its Wilson interval and its number of episodes."""
     rate, low, high = (100 * row[name] for name in ("success_rate", "success_low", "success_high"))
     return f"{rate:.3g} ({low:.1f}–{high:.1f}) of {row['episodes']:.0f}"
