@@ -1,8 +1,9 @@
-"""The package as it is installed elsewhere: nothing forgotten."""
+"""The sdist and the wheel: complete, and importable without the repository."""
 
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -12,44 +13,49 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("models", "systems", "diagrams", "tools")
 
 
+def tracked_files():
+    """Return the names of the files of the repository."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    return sorted(name for name in names if name and (ROOT / name).exists())
+
+
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """The tracked sources, and the content of the wheel made of them, both away from the repository."""
-    build = tmp_path_factory.mktemp("wheel")
-    source = tmp_path_factory.mktemp("source")
-    tracked = subprocess.run(
-        ["git", "ls-files", "-z", "--", *FOLDERS, "src", "pyproject.toml", "README.md", "LICENSE"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    ).stdout.split("\0")  # fmt: skip
-    for name in filter(None, tracked):
+    """Return the extracted sdist of the tracked files, and the content of the wheel built from it."""
+    source, build = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("build")
+    for name in tracked_files():
         target = source / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, target, follow_symlinks=False)
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--no-deps",
-        "--no-build-isolation",
-        "--quiet",
-        "-w",
-        build,
-        source,
-    ]
-    subprocess.run(command, check=True)
+    code = f"from setuptools import build_meta; build_meta.build_sdist({str(build)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True)
+    (archive,) = build.glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        file.extractall(build, filter="data")
+    (unpacked,) = (path for path in build.iterdir() if path.is_dir())
+    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", build, unpacked]
+    subprocess.run(pip, check=True)
     (wheel,) = build.glob("*.whl")
-    target = tmp_path_factory.mktemp("installed")
-    zipfile.ZipFile(wheel).extractall(target)
-    return source, target
+    installed = tmp_path_factory.mktemp("installed")
+    zipfile.ZipFile(wheel).extractall(installed)
+    return unpacked, installed
 
 
-def test_every_file_is_in_the_wheel(packages):
-    source, installed = packages
-    for folder in FOLDERS:
-        for path in (source / folder).rglob("*.*"):
-            assert (installed / "guiderail" / path.relative_to(source)).is_file(), path.relative_to(source)
-    assert all(path.name in ("guiderail",) or path.suffix == ".dist-info" for path in installed.iterdir())
+def test_sdist_has_every_tracked_file(packages):
+    unpacked, _ = packages
+    links = {f"src/guiderail/{folder}" for folder in FOLDERS}
+    missing = [name for name in tracked_files() if name not in links and not (unpacked / name).is_file()]
+    assert not missing
+
+
+def test_wheel_has_every_file_of_the_four_folders_and_nothing_else(packages):
+    _, installed = packages
+    for name in tracked_files():
+        if name.split("/")[0] in FOLDERS and "." in Path(name).name:
+            assert (installed / "guiderail" / name).is_file(), name
+    assert all(path.name == "guiderail" or path.suffix == ".dist-info" for path in installed.iterdir())
+    assert {path.name for path in (installed / "guiderail").iterdir() if path.is_dir()} == set(FOLDERS)
 
 
 def test_every_module_imports_from_the_wheel(packages, forks):

@@ -1,0 +1,1 @@
+"""Gymnasium environments built from task, guidance and station."""

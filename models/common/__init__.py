@@ -1,0 +1,1 @@
+"""Errors, files, YAML, units, poses and registries that all parts use."""

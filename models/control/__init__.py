@@ -1,0 +1,1 @@
+"""Control laws without Drake systems: impedance, wrenches, joint faults."""

@@ -1,0 +1,1 @@
+"""Demonstration files: formats, conversion, validation and bounds."""

@@ -1,0 +1,1 @@
+"""Evaluation of policies: rollouts, metrics, baselines and robustness."""

@@ -1,0 +1,1 @@
+"""Studies: methods × seeds, run in parallel and evaluated on held-out episodes."""

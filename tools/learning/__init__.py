@@ -1,0 +1,1 @@
+"""Training of policies: learners, configurations, run folders and checkpoints."""

@@ -1,0 +1,1 @@
+"""Tasks made from the meshes of two parts."""

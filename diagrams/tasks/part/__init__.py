@@ -1,0 +1,1 @@
+"""Insertion tasks made from the meshes of two parts."""

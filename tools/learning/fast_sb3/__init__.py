@@ -1,0 +1,1 @@
+"""Learners of Stable-Baselines3 with batched networks and hand-written gradients."""
