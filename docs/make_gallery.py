@@ -30,7 +30,7 @@ from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.learning.train import start_or_resume
 from guiderail.tools.parts.create_task import create_task
 from guiderail.tools.visualization.camera import path_in_picture
-from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.curves import draw_passage
 
 HERE = Path(__file__).parent
 FOLDER = HERE / "pictures"
@@ -108,7 +108,7 @@ def _plane(size: tuple[int, int]) -> tuple[Image.Image, Callable[[np.ndarray], n
     figure = Figure(figsize=(SCALE * size[0] / dpi, SCALE * size[1] / dpi), dpi=dpi)
     canvas = FigureCanvasAgg(figure)
     axis = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    draw_world(axis)
+    draw_passage(axis)
     axis.set_axis_off()
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())

@@ -42,7 +42,7 @@ def read_table(path: Path) -> pd.DataFrame:
         columns = zip(*rows, strict=True) if rows else ([] for _ in header)
         return pd.DataFrame({name: _column(cells) for name, cells in zip(header, columns, strict=True)})
     except (ValueError, csv.Error) as error:
-        raise InputError(f"{path} is not a table of episodes: restore it, or train anew") from error
+        raise InputError(f"{path} is not a table of episodes: restore it, or train again") from error
 
 
 def _column(cells: Sequence[str]) -> pd.Series:

@@ -15,7 +15,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.experiments.study import run_study
-from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.curves import draw_passage
 from guiderail.tools.visualization.style import colour, label, new_figure
 from research.figures.runs import figure_study, learning_curves, numbers_of_seeds, save_results, settings_table
 from research.figures.thesis import TABLE_4_1
@@ -121,7 +121,7 @@ def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
 def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
     """Draw walls, zone, obstacle, goal and demonstrations of the narrow passage."""
     figure, ((axis,),) = new_figure(1, 1, (4.6, 6.0))
-    draw_world(axis)
+    draw_passage(axis)
     geometry = PassageGeometry()
     for text, point in {
         "restricted\nzone": (geometry.zone_x + 0.02, 0.1),
@@ -161,7 +161,7 @@ def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
     figure, (axes,) = new_figure(1, 3, (11, 5.2))
     rows: list[dict[str, Any]] = []
     for axis, kind in zip(axes, METHODS, strict=True):
-        draw_world(axis)
+        draw_passage(axis)
         axis.set_title(label(kind))
         for action_repeat in (ACTION_REPEAT, 1):
             env: Any = make_environment(TASK, {"guidance": kind, "action_repeat": action_repeat})

@@ -24,7 +24,7 @@ from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.experiments.declaration import LearnerChoice
 from guiderail.tools.experiments.study import each, run_study
 from guiderail.tools.visualization.camera import draw_frames, record_frames
-from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.curves import draw_passage
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.style import colour, label, new_figure
 from research.figures.chapter_4 import ACTION_REPEAT, CONNECTOR, FORCE, LEARNED, TASK, figure_4_3, random_episodes
@@ -60,7 +60,7 @@ def figure_5_2(out: Path) -> dict[str, Any]:
     for axis, kind in zip(axes, ("kgrl", "skgrl"), strict=True):
         primitive = primitive_of(kind)
         steps, windows, executed = _explore(primitive, rms_gains(primitive), seed=0)
-        draw_world(axis, demonstrations=False)
+        draw_passage(axis, demonstrations=False)
         _draw_spread(axis, primitive)
         for n in range(60, 200, 12):
             reference = primitive.reference.means[np.minimum(n + np.arange(primitive.horizon + 1), len(steps) - 1)]
@@ -133,7 +133,7 @@ def figure_5_4(out: Path) -> dict[str, Any]:
     )
     nominal, _, _ = _run(env, None)
     figure, ((plane, time),) = new_figure(1, 2, (11, 5.6))
-    draw_world(plane)
+    draw_passage(plane)
     plane.plot(*nominal.T, color="black", linewidth=1.4, label="no push")
     period = env.unwrapped.trace.period
     time.plot(period * np.arange(len(nominal)), nominal[:, 0], color="black")
@@ -237,7 +237,7 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
                 row[f"times_below_kgrl_{column}"] = rough[f"jerk_{column}"] / row[f"jerk_{column}"]
             rows.append(row)
     for axis, kind, count, words in ((axes[0], "kgrl", 1, "one motion"), (axes[1], "skgrl", 5, "five motions")):
-        draw_world(axis)
+        draw_passage(axis)
         for row in _explore_in_simulation(kind, THESIS_VARIANCE, ACTION_REPEATS[0], range(1), count):
             axis.plot(*row["commanded"].T, linewidth=1, color=colour(kind) if count == 1 else None)
         axis.set_title(f"{label(kind)}, {words}")

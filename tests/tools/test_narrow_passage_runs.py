@@ -83,7 +83,7 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained):
     page = (trained.path / "replay.html").read_text()
     assert "the constraint" in page
     assert "demonstrations" in page
-    assert "see through</button>" in page
+    assert "transparent</button>" in page
     assert "<script src=" not in page
     assert "https://" not in page.partition("<body>")[0]
 

@@ -18,7 +18,7 @@ from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume
-from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.curves import draw_passage
 from guiderail.tools.visualization.style import colour, new_figure, save_figure
 
 HELD_OUT = 10  # number of held-out episodes
@@ -117,7 +117,7 @@ def _outcome(rows: pd.DataFrame) -> str:
 def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
     """Draw the paths before and after learning, and the return over the episodes."""
     figure, ((plane, curve),) = new_figure(1, 2, (11, 5.2))
-    draw_world(plane, named=True)
+    draw_passage(plane, named=True)
     for index, path in enumerate(after["measured"]):
         plane.plot(*path.T, color=colour("skgrl"), linewidth=1.2, label="" if index else "after learning")
     plane.plot(*before["measured"][0].T, color="black", linewidth=1.2, label="before learning")

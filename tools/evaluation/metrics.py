@@ -175,14 +175,15 @@ def _squared_force(e: Episode) -> float:
     return float(np.mean(np.asarray(e.trace.force) ** 2)) if len(e.trace) else 0.0
 
 
-STEPS, SLACK = "control steps", "the constraint's, negative is slack"
+STEPS, VIOLATION = "control steps", "m or rad"
 ENDINGS = "success, collision, spill, blocked, violation, time_limit or simulation_failure"
+COLLISION = "contact force, or the task's own collision signal, above its limit"
 
 COLUMNS = (
     Metric("episode", "", "number of the episode, from 0", lambda e: e.index),
     Metric("return", "reward", "sum of all rewards, undiscounted", lambda e: e.total),
     Metric("success", "", "1 if the task was done", lambda e: int(bool(e.info["is_success"]))),
-    Metric("termination", "", f"reason of the end: {ENDINGS}", lambda e: e.termination),
+    Metric("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})", lambda e: e.termination),
     Metric("steps", STEPS, "length", lambda e: len(e.trace)),
     Metric("peak_force", "N", "largest contact force of any control step", _statistic("peak_force")),
     Metric("mean_force", "N", "contact force, mean over control steps", _statistic("mean_force")),
@@ -194,14 +195,17 @@ COLUMNS = (
     ),
     Metric(
         "max_commanded_violation",
-        SLACK,
-        "largest violation of any commanded pose",
+        VIOLATION,
+        "largest constraint violation of any commanded pose; negative is slack",
         _statistic("max_commanded_violation"),
     ),
     Metric(
-        "max_measured_violation", SLACK, "largest violation of any measured pose", _statistic("max_measured_violation")
+        "max_measured_violation",
+        VIOLATION,
+        "largest constraint violation of any measured pose; negative is slack",
+        _statistic("max_measured_violation"),
     ),
-    Metric("collisions", "", "collisions that began, of any duration", _count("collisions")),
+    Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
     Metric("saturated_steps", STEPS, "control steps with an actuator at its limit", _count("saturated_steps")),
     Metric("fallback_steps", STEPS, "control steps that repeated the last safe command", _count("fallback_steps")),
@@ -312,12 +316,15 @@ _STATISTICS = (
     Metric(SINCE, "N²", "mean squared force of the episodes after convergence", _force_since_convergence),
     Metric(
         "max_commanded_violation",
-        SLACK,
-        "largest violation of any commanded pose",
+        VIOLATION,
+        "largest constraint violation of any commanded pose; negative is slack",
         _largest("max_commanded_violation"),
     ),
     Metric(
-        "max_measured_violation", SLACK, "largest violation of any measured pose", _largest("max_measured_violation")
+        "max_measured_violation",
+        VIOLATION,
+        "largest constraint violation of any measured pose; negative is slack",
+        _largest("max_measured_violation"),
     ),
     Metric("violating_episodes", "", "episodes with a command outside", _violating("max_commanded_violation")),
     Metric(
@@ -334,7 +341,7 @@ _STATISTICS = (
     Metric("wall_time", "s", "duration of acting and learning", lambda rows: float(rows["wall_time"].sum())),
 )
 STATISTICS = {metric.name: metric for metric in _STATISTICS}
-SYMBOLS = ("N", "N²", "s", *JERKS.values())
+SYMBOLS = ("N", "N²", "s", VIOLATION, *JERKS.values())
 """Units that are symbols, not words: a table has room for them."""
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
 
 WINDOW = 10  # training episodes that success and return are averaged over
 INTERVAL = 10.0  # time between lines where standard error is not a terminal [s]
@@ -70,9 +70,9 @@ class EpisodeProgress:
             self._console.print(text, soft_wrap=True)
 
     def status(self) -> str:
-        """Return success and return of the last episodes, and the largest constraint violation of all [m]."""
+        """Return success and return of the last episodes, and the largest constraint violation of all."""
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
-        violation = "none" if self._max_violation <= TOLERANCE else f"{self._max_violation:.1e} m"
+        violation = "none" if self._max_violation <= TOLERANCE else f"{self._max_violation:.1e} {VIOLATION}"
         prefix = "" if self._window is None else f"last {len(self._recent)}: "
         return f"{prefix}success {success:.0%}  return {returns:.1f}  largest violation {violation}"
 

@@ -1,50 +1,68 @@
-"""An episode that is shown: whose actions, in which environment, under which held-out conditions."""
+"""Specification of an episode that is shown: policy, environment and held-out conditions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
-from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, check_seed
+from guiderail.tools.evaluation.baselines import MakePolicy
+from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, check_guidance_change
+from guiderail.tools.evaluation.metrics import COLLISION
+from guiderail.tools.evaluation.rollout import check_compatible, check_seed
 from guiderail.tools.learning.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """An episode that is shown, on held-out initial conditions."""
+    """Held-out episode that is shown.
+
+    Attributes:
+        task: Name of the task.
+        environment: Options of the environment.
+        policy: Makes the policy for an environment.
+        acting: Label of the policy.
+        title: Text next to task and guidance in a heading.
+        run_seed: Seed of the run, which decides what is hidden and constant in it.
+        seed: Seed of the episode.
+        run: Folder of the run, or None.
+    """
 
     task: str
-    environment: Mapping[str, Any]  # its arguments
-    policy: Callable[[gymnasium.Env], PolicyFn]  # what acts, for an environment
-    acting: str  # whose actions they are, in a few words
-    title: str  # what to say beside task and guidance
-    run_seed: int = 0  # decides what is hidden and constant in a run
-    seed: int = HELD_OUT_SEED  # of the episode
-    run: Path | None = None  # the folder that it is from
+    environment: Mapping[str, Any]
+    policy: MakePolicy
+    acting: str
+    title: str
+    run_seed: int = 0
+    seed: int = HELD_OUT_SEED
+    run: Path | None = None
 
     @classmethod
     def of_run(cls, run: Path, environment: Mapping[str, Any] | None = None, seed: int = HELD_OUT_SEED) -> EpisodeSpec:
-        """The deterministic policy of a run, where it learned or with other arguments of the environment.
+        """Return an episode of the deterministic policy of a run.
+
+        Args:
+            run: Folder of the run.
+            environment: Options of the environment that differ from the run's.
+            seed: Seed of the episode.
 
         Raises:
-            InputError: if there is no trained run.
+            InputError: If there is no trained run, or its actions mean something else with another guidance.
         """
         folder = RunFolder(run)
         config, policy = folder.config(), Policy.load(folder.path)
+        changed = changed_environment(config.task, config.environment, environment or {})
+        remark = check_guidance_change(config.environment, changed)
         return cls(
             task=config.task,
-            environment=changed_environment(config.task, config.environment, environment or {}),
+            environment=changed,
             policy=partial(check_compatible, policy, learned_in=config.environment),
             acting="after learning",
-            title=config.learner.algorithm.upper(),
+            title=config.learner.algorithm.upper() + (f", {remark}" if remark else ""),
             run_seed=config.seed,
             seed=seed,
             run=folder.path,
@@ -55,11 +73,13 @@ class EpisodeSpec:
 
     @property
     def heading(self) -> str:
-        """One line that says what it is."""
+        """Heading of the episode in one line."""
         parts = (self.task, self.environment.get("guidance"), self.title, self.environment.get("station"))
         return " · ".join(str(part) for part in parts if part)
 
 
 def outcome(row: Mapping[str, Any]) -> str:
-    """How an episode ended, from its row."""
-    return f"{row['termination'] or 'running'} after {row['steps']} control steps, peak force {row['peak_force']:.1f} N"
+    """Return how an episode ended, from its row."""
+    reason = row["termination"] or "running"
+    meaning = f" ({COLLISION})" if reason == "collision" else ""
+    return f"{reason} after {row['steps']} control steps, peak force {row['peak_force']:.1f} N{meaning}"

@@ -1,4 +1,4 @@
-"""Episodes as one self-contained page: before beside after, moving together, with what was measured, in any browser."""
+"""Page of episodes before and after learning: animation and plots on one time axis, self-contained, in any browser."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ TEMPLATE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=T
     Path(__file__).with_name("replay.html").read_text(encoding="utf-8")
 )
 
-SEEN_THROUGH = 0.35  # opacity of everything but paths, for who asks for it
-EPISODES = 4  # held-out episodes to pick from
+TRANSPARENCY = 0.35  # opacity of bodies when the page shows them transparent
+EPISODES = 4  # number of held-out episodes
 
 GREY, BLACK, GREEN, RED = (
     (0.55, 0.55, 0.6, 0.8),
@@ -39,37 +39,37 @@ GREY, BLACK, GREEN, RED = (
     (0.1, 0.65, 0.25, 1.0),
     (0.85, 0.1, 0.1, 1.0),
 )
-PALE = 0.3  # opacity of the paths of episodes that aren't picked
+PALE = 0.3  # opacity of the paths of episodes that are not selected
 
 
 @dataclass(frozen=True)
 class Side:
-    """One half of the page: who acts, and how its paths are drawn."""
+    """Half of the page: a policy, and the color of its paths."""
 
     name: str
-    words: str
+    label: str
     colour: tuple[float, ...]
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
-    """Where the page of a run goes, with other arguments of its environment; of no run, the current folder."""
+    """Return the default page of a run, named after a changed station; in the current folder if `run` is no folder."""
     name = f"replay-{environment['station']}.html" if "station" in environment else "replay.html"
     return run / name if run.is_dir() else Path(name)
 
 
 def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None) -> dict[str, Any]:
-    """Runs episodes and writes them as a page; returns the row of the first.
+    """Run episodes and write them as a page; return the row of the first.
 
-    Each of them is run twice, from the same conditions: by who is shown, and beside it without having learned. That is
-    the demonstration alone (an action of zero) where guidance has one, and uniform random actions where it has none.
+    Each episode is run twice from the same conditions: by the policy shown, and without learning. The latter is the
+    demonstration alone (an action of zero) where the guidance has one, and uniform random actions otherwise.
 
     Args:
-        html: the page, .html.
-        episode: the first; the seeds that follow its own are the others.
-        episodes: how many to pick from, `EPISODES` unless given.
+        html: Page, .html.
+        episode: First episode; the others have the following seeds.
+        episodes: Number of episodes; `EPISODES` by default.
 
     Raises:
-        InputError: if the task cannot be shown, there is no episode to show, or `html` is no page.
+        InputError: If the task has no animation, there is no episode, or `html` is not a page.
     """
     episodes = EPISODES if episodes is None else episodes
     if episodes < 1:
@@ -79,48 +79,49 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     base = cast(Any, env.unwrapped)
     meshcat = getattr(base.task, "meshcat", None)
     if meshcat is None:
-        raise InputError(f"{episode.task} has nothing to show: guiderail plot draws its learning curve")
+        raise InputError(f"{episode.task} has no animation: give --image or --video, if its environment renders images")
     base.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=episode.run_seed)
 
     task = base.task.declaration
     scene = Scene(to_world=in_plane) if task is None else task.scene()
-    demonstrated = is_demonstrated(episode.environment.get("guidance"))
-    before: PolicyFn = zero_policy(env) if demonstrated else BaselinePolicy(uniform_random, env, episode.seed)
+    constraints = None if task is None else task.constraints()
+    is_demonstration = is_demonstrated(episode.environment.get("guidance"))
+    before: PolicyFn = zero_policy(env) if is_demonstration else BaselinePolicy(uniform_random, env, episode.seed)
     sides = {
-        Side("before", "before: the demonstration alone" if demonstrated else "before: random actions", BLACK): before,
+        Side("before", "before: demonstration alone" if is_demonstration else "before: random actions", BLACK): before,
         Side("after", episode.acting, GREEN): episode.policy(env),
     }
     motion = Motion(env)
-    rows, shown = [], []
+    rows, recorded = [], []
     for side, act in sides.items():
-        told = []
+        of_side = []
         for index in range(episodes):
             row = rollout(env, act, motion, seed=episode.seed + index, held_out=True)
             rows.append(row)
-            told.append(motion.shown() | {"outcome": outcome(row), "numbers": _numbers(row)})
+            unit, scale = violation_unit(constraints, base.trace.measured.shape[1])
+            of_side.append(motion.data() | {"outcome": outcome(row), "numbers": _format_numbers(row, unit, scale)})
             path = scene.to_world(base.trace.measured.copy())
             _draw(meshcat, f"/guiderail/{side.name}/{index}", path, 2.0 * scene.line_radius, side.colour)
-        shown.append({"name": side.name, "colour": _css(side.colour), "rgba": side.colour, "episodes": told})
+        recorded.append({"name": side.name, "colour": _css(side.colour), "rgba": side.colour, "episodes": of_side})
     for name, lines, radius, colour in (
         ("demonstrations", [scene.to_world(d) for d in scene.demonstrations], scene.line_radius, GREY),
         ("constraint", scene.constraint, 2.0 * scene.line_radius, RED),
     ):
         for index, points in enumerate(lines):
             _draw(meshcat, f"/guiderail/{name}/{index}", points, radius, colour)
-    for ornament in ("/Grid", "/Axes"):
-        meshcat.SetProperty(ornament, "visible", False)
+    for item in ("/Grid", "/Axes"):
+        meshcat.SetProperty(item, "visible", False)
     views = dict(scene.arm_views) if episode.environment.get("station") == "arm" else {}
     camera = next(iter(views.values()), scene.viewpoint)
     if camera is not None:
         meshcat.SetCameraPose(*(np.array(point) for point in camera))
-    unit, scale = violation_unit(None if task is None else task.constraints(), base.trace.measured.shape[1])
     data = {
-        "sides": shown,
+        "sides": recorded,
         "violation": {"unit": unit, "scale": scale},
         "states": [] if task is None else list(state_names(task)),
         "pale": PALE,
-        "seen_through": SEEN_THROUGH,
+        "transparency": TRANSPARENCY,
     }
     page = meshcat.StaticHtml()
     env.close()
@@ -132,30 +133,31 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         css=_css,
         legend=legend,
         seeds=[episode.seed + index for index in range(episodes)],
-        report=report_beside(html, episode.run),
+        report=find_report(html, episode.run),
         run=episode.run,
-        # Meshcat's own camera lives in a frame whose y is up.
+        # The frame of Meshcat's camera has y up.
         views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
-        # Nothing in it ends a script, whatever a body is called.
+        # The name of a body cannot end the script.
         data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
     )
-    write_atomically(html, _whole(page, episode.heading, caption).encode())
+    write_atomically(html, _insert(page, episode.heading, caption).encode())
     return rows[episodes]
 
 
-def report_beside(html: Path, run: Path | None) -> str | None:
-    """The way from the page to the report of its run, or of the study that the run is from, if somebody wrote one."""
+def find_report(html: Path, run: Path | None) -> str | None:
+    """Return the relative path from the page to the report of its run, or of the run's study; None without a report."""
     folders = [html.parent, *([] if run is None else [run, run.parent])]
     found = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)
     return None if found is None else Path(os.path.relpath(found, html.parent)).as_posix()
 
 
-def _numbers(row: Mapping[str, Any]) -> str:
+def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:
+    """Return the return and the largest constraint violations of a row, in a unit of `scale` per m or rad."""
     violations = (
-        f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
+        f"{name} {'none' if row[key] <= TOLERANCE else f'{scale * row[key]:.2g} {unit}'}"
         for name, key in (("commanded", "max_commanded_violation"), ("measured", "max_measured_violation"))
     )
-    return f"return {row['return']:.1f}; violations: {', '.join(violations)}"
+    return f"return {row['return']:.1f}; largest constraint violation: {', '.join(violations)}"
 
 
 def _css(colour: tuple[float, ...]) -> str:
@@ -163,13 +165,15 @@ def _css(colour: tuple[float, ...]) -> str:
 
 
 def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, colour: tuple[float, ...]) -> None:
-    """A path as a tube: browsers draw lines one pixel wide, whatever they are asked for."""
+    """Draw a path as a tube, because browsers draw all lines one pixel wide; a single point is not drawn."""
+    if len(points) < 2:
+        return
     vertices, faces = tube(points, radius)
     meshcat.SetTriangleMesh(name, vertices.T, faces.T, Rgba(*colour))
 
 
 def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n·sides, 3) and triangles (m, 3) of a tube along points (n, 3), every third of which is enough."""
+    """Return the vertices (n·sides, 3) and triangles (m, 3) of a tube along every third of the points."""
     points = np.vstack([points[:-1:3], points[-1:]])
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
@@ -183,8 +187,8 @@ def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray,
     return (points[:, None] + radius * ring).reshape(-1, 3), faces
 
 
-def _whole(page: str, title: str, caption: str) -> str:
-    """Meshcat's page with ours around it: fit for a phone, and with its name."""
+def _insert(page: str, title: str, caption: str) -> str:
+    """Return Meshcat's page with a title, a viewport for phones, and the caption in its body."""
     head = '<meta name="viewport" content="width=device-width, initial-scale=1">'
     page = re.sub(r"<title>.*?</title>", lambda _: f"{head}\n<title>{markup.escape(title)}</title>", page, count=1)
     start, body, tail = page.rpartition("</body>")

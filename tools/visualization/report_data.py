@@ -1,4 +1,4 @@
-"""What runs and studies left, read for a report."""
+"""Data of a report: runs and studies, read from their folders."""
 
 from __future__ import annotations
 
@@ -27,19 +27,31 @@ from guiderail.tools.visualization.style import colour, is_demonstrated, label
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # evaluated together with a run's policy
 STUDY_COLUMNS = {"method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"}
-NEEDED = (
+REQUIRED_COLUMNS = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
     "fallback_steps",
 )  # fmt: skip
 PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
 STEP_LOG_COLUMNS = (
-    "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "command_timed_out", "fallback",
+    "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "command_timed_out",
+    "fallback",
 )  # fmt: skip
+
+
+def _count_violations(values: pd.Series) -> int:
+    return int((~(values <= TOLERANCE)).sum())  # NaN counts as a violation
 
 
 @dataclass
 class Run:
-    """A run and its episodes."""
+    """Run with its episodes.
+
+    Attributes:
+        path: Folder of the run.
+        config: Configuration.
+        episodes: Table of the training episodes.
+        method: Name of its method in the report.
+    """
 
     path: Path
     config: RunConfig
@@ -48,70 +60,70 @@ class Run:
 
     @property
     def safety(self) -> dict[str, Any]:
-        """Counts and worst values of its control steps: from the step log, and without one from the episodes' table."""
+        """Safety statistics: of every control step with a step log, otherwise of the table of episodes."""
         rows = self.episodes
-        found: dict[str, Any] = {
+        of_episodes: dict[str, Any] = {
             "source": "table",
             "episodes": len(rows),
             "steps": int(rows["steps"].sum()),
-            "commands_outside": int((~(rows["max_commanded_violation"] <= TOLERANCE)).sum()),
-            "worst_command": float(rows["max_commanded_violation"].max(skipna=False)),
-            "poses_outside": int((~(rows["max_measured_violation"] <= TOLERANCE)).sum()),
-            "worst_pose": float(rows["max_measured_violation"].max(skipna=False)),
+            "commanded_violations": _count_violations(rows["max_commanded_violation"]),
+            "max_commanded_violation": float(rows["max_commanded_violation"].max(skipna=False)),
+            "measured_violations": _count_violations(rows["max_measured_violation"]),
+            "max_measured_violation": float(rows["max_measured_violation"].max(skipna=False)),
             "peak_force": float(rows["peak_force"].max(skipna=False)),
             "collisions": int(rows["collisions"].sum()),
             "collision_steps": int(rows["collision_steps"].sum()) if "collision_steps" in rows else None,
-            "saturated": int(rows["saturated_steps"].sum()) if "saturated_steps" in rows else None,
-            "held": None,
+            "saturated_steps": int(rows["saturated_steps"].sum()) if "saturated_steps" in rows else None,
+            "timed_out_steps": None,
             "fallback_steps": int(rows["fallback_steps"].sum()),
         }
         folder = RunFolder(self.path).steps
         if not folder.is_dir():
-            return found
+            return of_episodes
         steps = read_step_log(folder)
-        steps = steps[steps["episode"] < len(rows)]  # what a killed run wrote beyond its table is not in it
+        steps = steps[steps["episode"] < len(rows)]  # a killed run may have logged more episodes than its table has
         if steps["episode"].nunique() != len(rows) or not set(STEP_LOG_COLUMNS) <= set(steps.columns):
-            return found
-        return found | {
+            return of_episodes
+        return of_episodes | {
             "source": "step_log",
             "steps": len(steps),
-            "commands_outside": int((~(steps["commanded_violation"] <= TOLERANCE)).sum()),
-            "worst_command": float(steps["commanded_violation"].max(skipna=False)),
-            "poses_outside": int((~(steps["measured_violation"] <= TOLERANCE)).sum()),
-            "worst_pose": float(steps["measured_violation"].max(skipna=False)),
+            "commanded_violations": _count_violations(steps["commanded_violation"]),
+            "max_commanded_violation": float(steps["commanded_violation"].max(skipna=False)),
+            "measured_violations": _count_violations(steps["measured_violation"]),
+            "max_measured_violation": float(steps["measured_violation"].max(skipna=False)),
             "peak_force": float(steps["contact_force"].max(skipna=False)),
             "collision_steps": int(steps["collision"].sum()),
-            "saturated": int((steps["saturation"] > 0).sum()),
-            "held": int(steps["command_timed_out"].sum()),
+            "saturated_steps": int((steps["saturation"] > 0).sum()),
+            "timed_out_steps": int(steps["command_timed_out"].sum()),
             "fallback_steps": int(steps["fallback"].sum()),
         }
 
 
 @dataclass
 class Gathered:
-    """All that a report is of.
+    """Contents of a report.
 
     Attributes:
-        name: what it is called.
-        runs: those with at least an episode, by task and method.
-        held_out: a row for every policy, seed, mark and what it was judged on, with the counts.
-        study: whether it is a study's folder, and not runs by themselves.
-        called: a name for each run's folder, no two alike.
+        name: Title.
+        runs: Runs with at least one episode.
+        held_out: Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
+        is_study: Whether the folder is that of a study.
+        folder_names: Unique name of each run's folder.
     """
 
     name: str
     runs: list[Run] = field(default_factory=list)
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    study: bool = False
-    called: list[str] = field(default_factory=list)
+    is_study: bool = False
+    folder_names: list[str] = field(default_factory=list)
 
     @property
     def tasks(self) -> list[str]:
-        """The tasks of its runs."""
+        """Tasks of the runs."""
         return list(dict.fromkeys(run.config.task for run in self.runs))
 
     def methods(self, task: str) -> dict[str, list[Run]]:
-        """The runs of a task by method."""
+        """Return the runs of a task by method."""
         found: dict[str, list[Run]] = {}
         for run in self.runs:
             if run.config.task == task:
@@ -127,19 +139,19 @@ class Gathered:
 
 
 def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
-    """Reads runs and folders of studies.
+    """Read runs and studies from their folders.
 
     Args:
-        paths: folders of runs, or such that hold runs.
-        episodes: held-out episodes to judge each run of `paths` on, beside null policies; what was judged before is
-            used again, and none are run for 0.
+        paths: Folders of runs, or folders that contain runs.
+        episodes: Held-out episodes to evaluate each run of `paths` on, together with baseline policies; stored episodes
+            are used again.
 
     Raises:
-        InputError: if a folder holds no run, or a file of it is damaged.
+        InputError: If a folder contains no run, or a file is damaged.
     """
     folders: list[Path] = []
-    alone: list[Path] = []  # runs that are no part of a study
-    held_out, tables = [], False
+    alone: list[Path] = []  # runs that are not part of a study
+    held_out, has_tables = [], False
     for path in paths:
         if (path / "config.yaml").is_file():
             folders.append(path)
@@ -152,7 +164,7 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
         folders += inside
         alone += [] if studied else [folder.resolve() for folder in inside]
         held_out += studied
-        tables = tables or bool(studied)
+        has_tables = has_tables or bool(studied)
     read = {folder.resolve(): RunFolder(folder) for folder in folders}
     runs = [Run(one.path, one.config(), _episodes(one)) for one in read.values()]
     runs = [run for run in runs if len(run.episodes)]
@@ -161,35 +173,35 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
     _name_methods(runs)
     held_out += [_evaluated(run, episodes) for run in runs if run.path.resolve() in alone]
     name = paths[0].resolve().name if len(paths) == 1 else ", ".join(dict.fromkeys(run.config.task for run in runs))
-    tables_of_rows = [table for table in held_out if len(table)]
-    judged = pd.concat(tables_of_rows, ignore_index=True) if tables_of_rows else pd.DataFrame()
-    return Gathered(name, runs, judged, study=tables, called=_names(runs))
+    tables = [table for table in held_out if len(table)]
+    counts = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+    return Gathered(name, runs, counts, is_study=has_tables, folder_names=_folder_names(runs))
 
 
-def _names(runs: Sequence[Run]) -> list[str]:
-    """The runs' folders' names, numbered where several have the same."""
+def _folder_names(runs: Sequence[Run]) -> list[str]:
+    """Return the names of the runs' folders, numbered if several are the same."""
     names = [run.path.resolve().name for run in runs]
     return [name if names.count(name) == 1 else f"{name}-{1 + names[:i].count(name)}" for i, name in enumerate(names)]
 
 
 def _episodes(folder: RunFolder) -> pd.DataFrame:
     rows = folder.episodes() if (folder.path / "episodes.csv").is_file() else pd.DataFrame()
-    if len(rows) and (missing := [name for name in NEEDED if name not in rows]):
-        raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train anew")
+    if len(rows) and (missing := [name for name in REQUIRED_COLUMNS if name not in rows]):
+        raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train again")
     return rows
 
 
 def _study_tables(folder: Path) -> list[pd.DataFrame]:
-    """What a study left: tables with a row for each method, seed, mark and what is judged on.
+    """Return the tables of a study, with a row for each method, seed, checkpoint and evaluation set.
 
-    Rows of a study's part that are in its whole table too are left out.
+    Rows of a partial table that are in the whole table too are left out.
     """
     found: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
         table = read_table(file)
         if not set(table.columns) >= STUDY_COLUMNS:
             continue
-        rows = _counted(table[(table["eval_set"] != "") & table["success_rate"].notna()].assign(study=file.stem))
+        rows = _success_counts(table[(table["eval_set"] != "") & table["success_rate"].notna()].assign(study=file.stem))
         for name, whole in found.items():
             if file.stem.startswith(f"{name}-"):
                 same = list(whole.columns.drop("study"))
@@ -198,7 +210,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
     return [rows for rows in found.values() if len(rows)]
 
 
-def _counted(rows: pd.DataFrame) -> pd.DataFrame:
+def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows[["study", "method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"]].copy()
     rows["successes"] = (rows["success_rate"] * rows["episodes"]).round().astype(int)
     rows["episodes"] = rows["episodes"].astype(int)
@@ -235,34 +247,34 @@ def _evaluate(run: Run, episodes: int) -> None:
 
 
 def _name_methods(runs: list[Run]) -> None:
-    """Names each run's method by what it differs in from the other runs of its task, but for the seed."""
+    """Name each run's method after the settings in which it differs from the other runs of its task."""
     for task in {run.config.task for run in runs}:
         own = [run for run in runs if run.config.task == task]
         settings = [flat(run.config) for run in own]
         keys = list(dict.fromkeys(key for one in settings for key in one))
         differing = [key for key in keys if len({repr(one.get(key)) for one in settings}) > 1]
-        # Options that come with a guidance or an algorithm say nothing that its name doesn't.
+        # Options that come with a guidance or an algorithm are implied by its name.
         by_name = [key for key in ("guidance", "algorithm") if key in differing]
-        named = {tuple(one.get(key) for key in by_name) for one in settings}
-        all_of_them = {tuple(repr(one.get(key)) for key in differing) for one in settings}
-        told = by_name if len(named) == len(all_of_them) else differing
+        names = {tuple(one.get(key) for key in by_name) for one in settings}
+        methods = {tuple(repr(one.get(key)) for key in differing) for one in settings}
+        chosen = by_name if len(names) == len(methods) else differing
         for run, one in zip(own, settings, strict=True):
             kind = str(one.get("guidance", ""))
-            words = [label(kind) if key == "guidance" else _told(key, one.get(key)) for key in told]
+            words = [label(kind) if key == "guidance" else _format_setting(key, one.get(key)) for key in chosen]
             run.method = ", ".join(words) or (label(kind) if kind else run.config.task)
 
 
-def _told(key: str, value: Any) -> str:
+def _format_setting(key: str, value: Any) -> str:
     return str(value).upper() if key == "algorithm" else f"{key.replace('_', ' ')} {value}"
 
 
 def flat(config: RunConfig) -> dict[str, Any]:
-    """The settings of a run by name, but for what says only how long and which one it is."""
+    """Return the settings of a run by name, without its length and seed."""
     return {**config.environment, **asdict(config.learner)}
 
 
 def command(config: RunConfig, out: str) -> str:
-    """What a person types to train the same run again."""
+    """Return the command that trains the same run again into the folder `out`."""
     words = ["guiderail", "train", config.task]
     environment = dict(config.environment)
     if config.task in known_tasks():
@@ -288,6 +300,6 @@ def command(config: RunConfig, out: str) -> str:
     return shlex.join([*words, "--out", out])
 
 
-def finite(value: float | None) -> bool:
-    """Whether there is a number to print."""
+def is_finite(value: float | None) -> bool:
+    """Return True for a finite number."""
     return value is not None and bool(np.isfinite(value))

@@ -1,4 +1,4 @@
-"""The figures of a report, as SVG that stands in the page itself."""
+"""Figures of a report, as SVG elements of the page."""
 
 from __future__ import annotations
 
@@ -8,41 +8,35 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 
 from guiderail.tools.evaluation.metrics import bootstrap_band, episodes_to_convergence, survival, wilson
 from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run
-from guiderail.tools.visualization.style import new_figure, rolling
+from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above, new_figure
 
-SIZE = (4.6, 3.0)  # in; two stand side by side, and one alone on a phone
+SIZE = (4.6, 3.0)  # [in]; two side by side, or one below the other on a phone
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 9.0}
-DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # curves may lie on each other
-WINDOW = 10  # episodes of a moving mean
+DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that equal curves are told apart
 
 
-def curve(gathered: Gathered, task: str, column: str, words: str) -> str:
-    """A column of the training episodes: the mean over seeds of a moving mean, and its bootstrap band."""
+def curve(gathered: Gathered, task: str, column: str, label: str) -> str:
+    """Return the curve of a column over the training episodes: the mean over seeds and its bootstrap band."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
         colours = gathered.colours(task)
         for (name, runs), dash in zip(gathered.methods(task).items(), cycle(DASHES), strict=False):
-            length = min(len(run.episodes) for run in runs)
-            smooth = np.stack([rolling(run.episodes[column].to_numpy(float), WINDOW)[:length] for run in runs])
-            episodes = np.arange(1, length + 1)
-            if len(runs) > 1:
-                low, high = bootstrap_band(smooth)
-                axis.fill_between(episodes, low, high, color=colours[name], alpha=0.18, linewidth=0)
-            axis.plot(episodes, smooth.mean(axis=0), color=colours[name], linestyle=dash, label=_label(name, runs))
-        axis.set(xlabel="training episode", ylabel=f"{words}, mean of {WINDOW}")
+            values = [run.episodes[column].to_numpy(float) for run in runs]
+            shade, text = colours[name], _label(name, runs)
+            draw_runs(axis, values, colour=shade, label=text, band=bootstrap_band, linestyle=dash)
+        axis.set(xlabel="training episode", ylabel=f"{label}, mean of {WINDOW}")
         if column == "success":
             axis.set_ylim(-0.04, 1.04)
-        _legend(axis)
-        return _svg(figure, f"{words} over the training episodes of {task}")
+        legend_above(axis, columns=2)
+        return _svg(figure, f"{label} over the training episodes of {task}")
 
 
 def survival_curve(gathered: Gathered, task: str) -> str:
-    """Which part of the runs has not converged yet."""
+    """Return the fraction of runs that have not converged over the training episodes (Kaplan and Meier)."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
@@ -57,24 +51,22 @@ def survival_curve(gathered: Gathered, task: str) -> str:
             axis.step(steps, left, where="post", color=colours[name], linestyle=dash, label=_label(name, runs))
             if None in after:
                 axis.plot(steps[-1], left[-1], "|", color=colours[name], markersize=9)
-        axis.set(xlabel="training episodes", ylabel="part not converged yet", ylim=(-0.04, 1.04))
+        axis.set(xlabel="training episodes", ylabel="fraction not converged", ylim=(-0.04, 1.04))
         axis.set_xlim(left=0)
-        _legend(axis)
-        return _svg(figure, f"part of the runs of {task} that have not converged after so many episodes")
+        legend_above(axis, columns=2)
+        return _svg(figure, f"fraction of the runs of {task} that have not converged, over the training episodes")
 
 
 def held_out(gathered: Gathered) -> str:
-    """The success of each seed on held-out episodes, with its Wilson interval; what learned nothing is grey."""
-    judged, keys = gathered.held_out, ["study", "method", "policy", "seed", "eval_set"]
-    rows = judged[
-        judged["after_episodes"] == judged.groupby(keys)["after_episodes"].transform("max")
-    ]  # after the last training episode
+    """Return the held-out success of each seed with its Wilson interval; baseline policies are gray."""
+    rows, keys = gathered.held_out, ["study", "method", "policy", "seed", "eval_set"]
+    rows = rows[rows["after_episodes"] == rows.groupby(keys)["after_episodes"].transform("max")]
     groups = list(rows.groupby(["study", "method", "policy", "eval_set"], sort=False))
+    has_studies, has_eval_sets = rows["study"].nunique() > 1, rows["eval_set"].nunique() > 1
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, (1.35 * SIZE[0], 0.6 + 0.13 * len(rows) + 0.2 * len(groups)))
         axis, place, ticks = axes[0, 0], 0.0, []
-        several = rows["study"].nunique() > 1, rows["eval_set"].nunique() > 1
-        for (study, method, policy, judged), group in groups:
+        for (study, method, policy, eval_set), group in groups:
             first = place
             for row in group.itertuples():
                 low, high = wilson(row.successes, row.episodes)
@@ -82,11 +74,11 @@ def held_out(gathered: Gathered) -> str:
                 axis.plot([low, high], [place, place], color=shade, linewidth=2, alpha=0.55, solid_capstyle="butt")
                 axis.plot(row.successes / row.episodes, place, "o", color=shade, markersize=4)
                 place -= 1.0
-            words = [str(method), *([] if policy == LEARNED else [str(policy)])]
-            words += [str(study)] * several[0] + [str(judged)] * several[1]
-            ticks.append((0.5 * (first + place + 1.0), ", ".join(dict.fromkeys(words))))
+            parts = [str(method), *([] if policy == LEARNED else [str(policy)])]
+            parts += [str(study)] * has_studies + [str(eval_set)] * has_eval_sets
+            ticks.append((0.5 * (first + place + 1.0), ", ".join(dict.fromkeys(parts))))
             place -= 1.5
-        axis.set_yticks([at for at, _ in ticks], [words for _, words in ticks])
+        axis.set_yticks([at for at, _ in ticks], [text for _, text in ticks])
         axis.set(
             xlim=(-0.02, 1.02),
             ylim=(place + 1.5, 1.0),
@@ -101,14 +93,10 @@ def _label(name: str, runs: list[Run]) -> str:
     return f"{name} ({len(runs)} seed{'s' if len(runs) > 1 else ''})"
 
 
-def _legend(axis: Axes) -> None:
-    axis.legend(frameon=False, fontsize=8, loc="best")
-
-
-def _svg(figure: Any, words: str) -> str:
-    """The figure's own element, which fits the width that it gets."""
+def _svg(figure: Any, description: str) -> str:
+    """Return the SVG element of a figure, which scales with its width."""
     content = io.StringIO()
     figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     text = content.getvalue()
     text = text[text.index("<svg") :]
-    return text.replace("<svg ", f'<svg role="img" aria-label="{words}" ', 1)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{description}" ', 1)

@@ -1,7 +1,7 @@
-"""How every picture of guiderail looks: the same colour for the same method, and a file that is complete."""
+"""Style of all pictures: one color for each guidance, figures without a window, files written whole."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,26 +16,27 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.tools.files import check_picture, write_atomically
 
 
-def is_demonstrated(kind: str | None) -> bool:
-    """Whether an action of zero is the demonstration, so that its success can be stated."""
-    return kind in GUIDANCE.names() and GUIDANCE.get(str(kind)).demonstrates
+def is_demonstrated(guidance: str | None) -> bool:
+    """Return True if an action of zero is the demonstration, so that the success without learning can be stated."""
+    return guidance in GUIDANCE.names() and GUIDANCE.get(str(guidance)).demonstrates
 
 
-def label(kind: str) -> str:
-    """What a picture calls a kind of guidance."""
-    return GUIDANCE.get(kind).label if kind in GUIDANCE.names() else kind
+def label(guidance: str) -> str:
+    """Return the label of a guidance in a legend."""
+    return GUIDANCE.get(guidance).label if guidance in GUIDANCE.names() else guidance
 
 
-def colour(kind: str) -> str:
-    """Its colour in every picture."""
-    return GUIDANCE.get(kind).colour if kind in GUIDANCE.names() else "#8c564b"
+def colour(guidance: str) -> str:
+    """Return the color of a guidance."""
+    return GUIDANCE.get(guidance).colour if guidance in GUIDANCE.names() else "#8c564b"
 
 
-LAYOUT: str | None = "constrained"  # labels get the room that they need
+LAYOUT: str | None = "constrained"  # layout engine of Matplotlib that makes room for labels
+WINDOW = 10  # episodes of a moving mean
 
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
-    """A figure without a window, whatever the machine has; axes (rows, columns)."""
+    """Return a figure without a window, and its axes (rows, columns)."""
     figure = Figure(figsize=size, layout=cast(Any, LAYOUT))
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -45,7 +46,7 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """Writes a picture, whole, in the format that its ending says; the same figure is the same SVG."""
+    """Write a picture in the format of its ending; the SVG of the same figure is the same file."""
     check_picture(path)
     content, kind = io.BytesIO(), path.suffix[1:].lower()
     with matplotlib.rc_context({"svg.hashsalt": "guiderail", "svg.fonttype": "none"}):
@@ -54,21 +55,53 @@ def save_figure(figure: Figure, path: Path, dpi: int = 130) -> Path:
     return path
 
 
-def rolling(values: Sequence[float] | np.ndarray, window: int = 10) -> np.ndarray:
-    """The mean of the last `window` values, of fewer at the start."""
+def rolling(values: Sequence[float] | np.ndarray, window: int = WINDOW) -> np.ndarray:
+    """Return the moving mean of the last `window` values, of fewer at the start."""
     return pd.Series(np.asarray(values, float)).rolling(window, min_periods=1).mean().to_numpy()
 
 
-def draw_runs(axis: Axes, runs: Sequence[Sequence[float]], *, colour: str, label: str, window: int = 10) -> None:
-    """Several runs of one method: the mean over runs as a line, their range as a band, each smoothed by `window`."""
+def range_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the minimum and maximum over the first axis of (runs, n)."""
+    return values.min(axis=0), values.max(axis=0)
+
+
+def draw_runs(
+    axis: Axes,
+    runs: Sequence[Sequence[float] | np.ndarray],
+    *,
+    colour: str,
+    label: str,
+    window: int = WINDOW,
+    band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = range_band,
+    **line: Any,
+) -> None:
+    """Draw the learning curve of a method: the mean over runs of a moving mean, and a band.
+
+    Args:
+        axis: Axes.
+        runs: Values over the episodes of each run; longer runs are cut to the shortest.
+        colour: Color of line and band.
+        label: Label for a legend.
+        window: Episodes of the moving mean.
+        band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each.
+        line: Further arguments of the line.
+    """
     length = min(len(run) for run in runs)
     smooth = np.stack([rolling(run, window)[:length] for run in runs])
     episodes = np.arange(1, length + 1)
-    axis.fill_between(episodes, smooth.min(0), smooth.max(0), color=colour, alpha=0.15, linewidth=0)
-    axis.plot(episodes, smooth.mean(0), color=colour, label=label)
+    if len(runs) > 1:
+        axis.fill_between(episodes, *band(smooth), color=colour, alpha=0.15, linewidth=0)
+    axis.plot(episodes, smooth.mean(axis=0), color=colour, label=label, **line)
 
 
 def legend(figure: Figure, axis: Axes) -> None:
-    """One legend above all axes, where it covers no curve."""
+    """Draw one legend above all axes, where it covers no data."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+
+
+def legend_above(axis: Axes, columns: int = 3) -> None:
+    """Draw a legend above one of several axes, where it covers no data."""
+    if axis.get_legend_handles_labels()[1]:
+        place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
+        axis.legend(frameon=False, fontsize=8, ncols=columns, **place)

@@ -1,4 +1,4 @@
-"""The page says what happened: its numbers are those of the episodes, and both sides met the same conditions."""
+"""Tests of the page of episodes: its numbers are those of the episodes, from the same conditions on both sides."""
 
 import base64
 import json
@@ -15,7 +15,7 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.visualization import motion
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.motion import DRAWN, Motion, violation_unit
-from guiderail.tools.visualization.replay import report_beside, write_page
+from guiderail.tools.visualization.replay import find_report, write_page
 
 ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
 BALL = f"{DRAWN}/robot/ball"
@@ -42,10 +42,10 @@ def page(tmp_path_factory):
 
 
 def data(text):
-    return json.loads(re.search(r"const shown = (\{.*\});\n", text).group(1))
+    return json.loads(re.search(r"const data = (\{.*\});\n", text).group(1))
 
 
-def test_both_sides_are_there_with_every_episode_and_every_signal_has_the_same_clock(page):
+def test_page_has_all_signals_of_both_sides_on_one_time_axis(page):
     before, after = data(page[0])["sides"]
     for episode in (*before["episodes"], *after["episodes"]):
         n = len(episode["times"])
@@ -55,7 +55,7 @@ def test_both_sides_are_there_with_every_episode_and_every_signal_has_the_same_c
     assert len(before["episodes"]) == len(after["episodes"]) == 2
 
 
-def test_before_is_the_demonstration_alone_from_the_same_start(page):
+def test_before_is_the_demonstration_from_the_same_start(page):
     before, after = data(page[0])["sides"]
     for one, other in zip(before["episodes"], after["episodes"], strict=True):
         np.testing.assert_array_equal(poses(one["frames"][BALL])[0], poses(other["frames"][BALL])[0])
@@ -65,7 +65,7 @@ def test_before_is_the_demonstration_alone_from_the_same_start(page):
     assert not np.array_equal(first, second)
 
 
-def test_who_pushes_at_the_constraint_is_seen_to_reach_it_and_no_more(page):
+def test_page_has_the_largest_violation_and_force(page):
     text, row = page
     (episode, _) = data(text)["sides"][1]["episodes"]
     assert max(episode["commanded"]) == pytest.approx(row["max_commanded_violation"], abs=1e-9)
@@ -73,7 +73,7 @@ def test_who_pushes_at_the_constraint_is_seen_to_reach_it_and_no_more(page):
     assert data(text)["violation"] == {"unit": "mm", "scale": 1000.0}
 
 
-def test_a_page_fits_a_phone_has_its_name_and_needs_nothing_else(page):
+def test_page_is_self_contained_and_fits_a_phone(page):
     text = page[0]
     assert '<meta name="viewport" content="width=device-width' in text
     assert "<title>NarrowPassage · kgrl · constant" in text
@@ -82,30 +82,55 @@ def test_a_page_fits_a_phone_has_its_name_and_needs_nothing_else(page):
     assert "<link" not in text
 
 
-def test_a_report_is_linked_where_there_is_one(page, tmp_path):
+def test_page_links_an_existing_report(page, tmp_path):
     assert '<a href="../report.html">' in page[0]
     run = tmp_path / "run"
     run.mkdir()
-    assert report_beside(run / "replay.html", run) is None
+    assert find_report(run / "replay.html", run) is None
     (run / "report.html").write_text("")
-    assert report_beside(run / "replay.html", run) == "report.html"
-    assert report_beside(tmp_path / "replay.html", run) == "run/report.html"
+    assert find_report(run / "replay.html", run) == "report.html"
+    assert find_report(tmp_path / "replay.html", run) == "run/report.html"
 
 
-def test_no_peak_of_force_is_lost_where_an_episode_is_longer_than_a_page_is_wide(monkeypatch):
+def test_motion_keeps_the_peak_force_when_it_is_resampled(monkeypatch):
     monkeypatch.setattr(motion, "POINTS", 7)
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 10}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
     watching = Motion(env)
     row = rollout(env, constant_policy(env, np.array([1.0, 0.0])), watching, seed=1_000_000, held_out=True)
-    shown, trace = watching.shown(), env.unwrapped.trace
-    assert len(shown["times"]) <= 8
-    assert shown["times"][-1] == pytest.approx(len(trace) * trace.period)
-    assert max(shown["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
-    assert max(shown["commanded"]) == pytest.approx(row["max_commanded_violation"], rel=1e-4)
-    np.testing.assert_allclose(poses(shown["frames"][BALL])[-1, :2], trace.measured[-1], atol=1e-6)
+    recorded, trace = watching.data(), env.unwrapped.trace
+    assert len(recorded["times"]) <= 8
+    assert recorded["times"][-1] == pytest.approx(len(trace) * trace.period)
+    assert max(recorded["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
+    assert max(recorded["commanded"]) == pytest.approx(row["max_commanded_violation"], rel=1e-4)
+    np.testing.assert_allclose(poses(recorded["frames"][BALL])[-1, :2], trace.measured[-1], atol=1e-6)
     env.close()
+
+
+def test_motion_has_one_sample_when_no_control_step_was_done(tmp_path):
+    env = make_environment("NarrowPassage", {"guidance": "kgrl"}, render_mode="human")
+    env.unwrapped.simulator.set_target_realtime_rate(0.0)
+    env.reset(seed=0)
+    motion = Motion(env)
+    env.reset(seed=1)
+    motion.on_episode_start()
+    recorded = motion.data()
+    assert recorded["times"] == [0.0]
+    assert poses(recorded["frames"][BALL]).shape == (1, 7)
+    assert recorded["force"] is None
+    env.close()
+
+
+def test_page_names_the_report_command_with_the_folder_of_the_run(tmp_path):
+    run = tmp_path / "runs" / "passage"
+    run.mkdir(parents=True)
+    arguments = check_environment("NarrowPassage", ENVIRONMENT)
+    spec = EpisodeSpec("NarrowPassage", arguments, _to_the_right, "to the right", "constant", run=run)
+    write_page(run / "replay.html", spec, episodes=1)
+    page = (run / "replay.html").read_text(encoding="utf-8")
+    assert f"guiderail report {run} --out {run}/report.html" in page
+    assert "largest constraint violation: commanded" in page
 
 
 @pytest.mark.parametrize(
@@ -117,11 +142,11 @@ def test_no_peak_of_force_is_lost_where_an_episode_is_longer_than_a_page_is_wide
         (None, 6, "m or rad"),
     ],
 )
-def test_a_violation_has_the_unit_of_what_is_bounded(constraints, outputs, unit):
+def test_violation_unit_is_that_of_the_bounded_outputs(constraints, outputs, unit):
     assert violation_unit(constraints, outputs)[0] == unit
 
 
-def test_a_page_without_an_episode_is_refused(tmp_path):
+def test_write_page_refuses_zero_episodes(tmp_path):
     shown = EpisodeSpec(
         "NarrowPassage", {}, lambda env: BaselinePolicy(uniform_random, env), "uniform_random", "uniform_random"
     )
@@ -130,9 +155,11 @@ def test_a_page_without_an_episode_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "."])
-def test_a_page_that_would_replace_what_is_none_is_refused_before_an_episode_is_run(name, tmp_path):
+def test_write_page_refuses_another_ending_before_it_runs(name, tmp_path):
     (tmp_path / "policy.safetensors").write_text("weights")
-    shown = EpisodeSpec("NarrowPassage", {}, lambda env: pytest.fail("it goes on"), "uniform_random", "uniform_random")
+    shown = EpisodeSpec(
+        "NarrowPassage", {}, lambda env: pytest.fail("an episode is run"), "uniform_random", "uniform_random"
+    )
     with pytest.raises(InputError, match="a page is"):
         write_page(tmp_path / name, shown)
     assert (tmp_path / "policy.safetensors").read_text() == "weights"

@@ -45,7 +45,7 @@ def text_of(page):
     return " ".join(re.sub(r"<[^>]+>", " ", re.sub(r"<(svg|style).*?</\1>", " ", page, flags=re.S)).split())
 
 
-def test_a_study_is_one_page_that_needs_nothing_else(studied, tmp_path):
+def test_report_of_a_study_is_one_self_contained_page(studied, tmp_path):
     page = write_report([studied], tmp_path / "report.html").read_text()
     assert page.count("<svg") >= 4
     assert write_report([studied], tmp_path / "again.html").read_text() == page
@@ -58,22 +58,29 @@ def test_a_study_is_one_page_that_needs_nothing_else(studied, tmp_path):
     assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "and of each"
     assert "58.4%" not in text, "of all together there is no interval: their episodes are not independent"
     assert "nothing: zero" in text
-    assert "Differs from the thesis in it has no task Bead" in text
-    assert "guiderail study beads --out studies" in text
+    assert "Differs from the thesis in" not in text
+    assert "guiderail study beads.yaml --out studies" in text
     assert RunFolder(studied / "kmp-1").config().versions["drake"] in text
 
 
-def test_runs_are_named_by_what_they_differ_in(studied):
+def test_report_states_differences_when_asked(studied, tmp_path):
+    page = tmp_path / "report.html"
+    write_report([studied], page, describe_differences=lambda config: ["the task", config.environment["guidance"]])
+    assert "Differs from the thesis in the task" in text_of(page.read_text())
+    assert "demonstration alone also in kmp" in text_of(page.read_text())
+
+
+def test_methods_are_named_after_differing_settings(studied):
     gathered = gather([studied / "skgrl-1", studied / "kmp-1"])
     assert [run.method for run in gathered.runs] == ["sKGRL", "demonstration alone"]
-    assert not gathered.study
+    assert not gathered.is_study
     assert len(gathered.held_out) == 0
     again = gather([studied / "skgrl-1", studied / "skgrl-2"])
     assert {run.method for run in again.runs} == {"sKGRL"}
     assert [len(runs) for runs in again.methods("Bead").values()] == [2]
 
 
-def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
+def test_report_evaluates_a_run_and_baselines_once(studied):
     run = studied / "skgrl-1"
     judged = gather([run], episodes=2).held_out
     assert set(judged["policy"]) == {"learned", "demonstration", "uniform_random", "constant"}
@@ -83,7 +90,7 @@ def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}
 
 
-def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_path):
+def test_report_uses_episodes_of_the_runs_own_environment(studied, tmp_path):
     run = shutil.copytree(studied / "skgrl-2", tmp_path / "run")
     others = {"uniform_random": partial(BaselinePolicy, uniform_random)}
     evaluate(run, episodes=4, environment={"wall": -0.5}, baselines=others)
@@ -98,7 +105,7 @@ def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_
     ]
 
 
-def test_rows_of_a_part_of_a_study_are_counted_once_and_its_command_says_so(studied, tmp_path):
+def test_rows_of_a_partial_study_are_counted_once(studied, tmp_path):
     folder = tmp_path / "tables"
     folder.mkdir()
     shutil.copy(studied / "beads.csv", folder)
@@ -110,14 +117,14 @@ def test_rows_of_a_part_of_a_study_are_counted_once_and_its_command_says_so(stud
     text = text_of(page)
     assert "beads: learner 3 held out 16/20" in text
     assert "beads-learner-1-5: learner 3 held out 2/10" in text
-    assert "guiderail study beads --methods learner --seeds 5 --out studies" in text
-    assert "Policies that learned nothing" not in text
+    assert "guiderail study beads.yaml --methods learner --seeds 5 --out studies" in text
+    assert "Baseline policies." not in text
     (folder / "beads.csv").unlink()
     text = text_of(write_report([folder], tmp_path / "page.html").read_text())
-    assert "guiderail study beads --methods learner --seeds 1,5 --out studies" in text
+    assert "guiderail study beads.yaml --methods learner --seeds 1,5 --out studies" in text
 
 
-def test_runs_in_folders_of_one_name_go_into_different_ones(studied, tmp_path):
+def test_runs_with_one_folder_name_get_different_ones(studied, tmp_path):
     for name in ("a", "b"):
         shutil.copytree(studied / "skgrl-1", tmp_path / name / "same")
     text = text_of(write_report([tmp_path / "a/same", tmp_path / "b/same"], tmp_path / "page.html").read_text())
@@ -125,7 +132,7 @@ def test_runs_in_folders_of_one_name_go_into_different_ones(studied, tmp_path):
     assert "--out runs/same-2" in text
 
 
-def test_a_page_that_cannot_be_written_is_refused_before_anything_is_run(studied, tmp_path):
+def test_report_checks_its_page_before_it_evaluates(studied, tmp_path):
     (tmp_path / "file").touch()
     before = sorted(studied.rglob("*"))
     with pytest.raises(InputError, match="cannot be written"):
@@ -133,15 +140,15 @@ def test_a_page_that_cannot_be_written_is_refused_before_anything_is_run(studied
     assert sorted(studied.rglob("*")) == before
 
 
-def test_a_run_without_a_column_has_no_figure_of_it(studied, tmp_path):
+def test_report_leaves_out_the_figure_of_a_missing_column(studied, tmp_path):
     run = shutil.copytree(studied / "skgrl-1", tmp_path / "run")
     table = pd.read_csv(run / "episodes.csv")
     table.drop(columns="mean_squared_force").to_csv(run / "episodes.csv", index=False)
     assert "success rate over" in write_report([run], tmp_path / "page.html").read_text()
     table.drop(columns="max_commanded_violation").to_csv(run / "episodes.csv", index=False)
-    with pytest.raises(InputError, match="no max_commanded_violation; train anew"):
+    with pytest.raises(InputError, match="no max_commanded_violation; train again"):
         write_report([run], tmp_path / "page.html")
-    with pytest.raises(InputError, match="no max_commanded_violation; train anew"):
+    with pytest.raises(InputError, match="no max_commanded_violation; train again"):
         plot_run(run)
     table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # a column of words, as a robot's run has
     assert plot_run(run).is_file()
@@ -158,15 +165,15 @@ def test_safety_is_counted_in_control_steps_with_a_step_log(tmp_path):
     assert run.safety["source"] == "step_log"
     assert run.safety["steps"] == len(step_log) == row["steps"]
     assert run.safety["collision_steps"] > 0
-    assert run.safety["poses_outside"] == (step_log["measured_violation"] > 1e-9).sum()
-    assert run.safety["worst_command"] == row["max_commanded_violation"]
+    assert run.safety["measured_violations"] == (step_log["measured_violation"] > 1e-9).sum()
+    assert run.safety["max_commanded_violation"] == row["max_commanded_violation"]
     assert run.safety["collision_steps"] == row["collision_steps"]
     (tmp_path / "run" / "steps" / "episode-000000.parquet").unlink()
     with pytest.raises(InputError, match="holds no step log"):
         _ = run.safety
 
 
-def test_the_command_of_a_run_makes_the_same_run(bead_config):
+def test_command_of_a_run_reproduces_its_configuration(bead_config):
     config = replace(bead_config, step_log=False)
     words = shlex.split(command(config, "runs/bead"))
     assert words[:3] == ["guiderail", "train", "Bead"]
@@ -181,17 +188,17 @@ def test_the_command_of_a_run_makes_the_same_run(bead_config):
 
 
 @pytest.mark.parametrize("name", ["report.pdf", "report"])
-def test_what_is_no_page_is_refused_before_anything_is_read(name, tmp_path):
+def test_report_refuses_another_ending_before_it_reads(name, tmp_path):
     with pytest.raises(InputError, match=r"a page is .html"):
         write_report([tmp_path / "missing"], tmp_path / name)
 
 
-def test_a_folder_without_runs_is_refused(tmp_path):
+def test_report_refuses_a_folder_without_runs(tmp_path):
     with pytest.raises(InputError, match="holds no run"):
         write_report([tmp_path], tmp_path / "report.html")
 
 
-def test_a_run_that_lies_beside_a_study_is_judged_too(studied, tmp_path):
+def test_report_evaluates_a_run_next_to_a_study(studied, tmp_path):
     run = tmp_path / "alone"
     run_training(RunFolder(run), configure("Bead", {}, settings=SETTINGS, episodes=2, seed=9))
     judged = gather([run, studied], episodes=2).held_out
