@@ -15,7 +15,8 @@ from guiderail.diagrams.tasks.pouring.rewards import APPROACH, NEAR, NEAR_BONUS,
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.templates.drawing import draw, state_lines
 from guiderail.tools.environments import make_environment
-from guiderail.tools.experiments.study import Job, ratio, run_study
+from guiderail.tools.experiments.job import Job
+from guiderail.tools.experiments.study import ratio, run_study
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import draw_runs, legend, new_figure
 from research.figures.runs import (

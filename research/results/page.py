@@ -14,8 +14,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.experiments.declaration import LEARNED, Study, load_study
-from guiderail.tools.experiments.study import Job, each
-from guiderail.tools.experiments.sweep import BREAKS, break_words, curve, draw_sweeps
+from guiderail.tools.experiments.job import Job
+from guiderail.tools.experiments.study import each
+from guiderail.tools.experiments.sweep import BREAKING_SUCCESS, curve, draw_sweeps, format_breaking_point
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import cell, read_table, table_text
 from research.figures import FIGURES, figure_command
@@ -208,7 +209,7 @@ def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
         return []
     lines = ["", f"![Success of every method over difficulty]({study.name}.svg)"]
     for sweep in study.sweeps:
-        columns = [sweep.quantity, *(f"{value:g}" for value in sweep.at), f"below {BREAKS:.0%} at"]
+        columns = [sweep.quantity, *(f"{value:g}" for value in sweep.at), f"below {BREAKING_SUCCESS:.0%} at"]
         lines += ["", f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
         for method in study.methods:
             of_method = rows[rows["method"] == method]
@@ -219,7 +220,7 @@ def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
                 each(of_method[of_method["eval_set"] == sweep.eval_set(value).name], "success_rate", "{:.0%}")
                 for value in sweep.at
             )
-            cells = [method, *rates, break_words(values, points)]
+            cells = [method, *rates, format_breaking_point(values, points)]
             lines.append(f"| {' | '.join(one or '–' for one in cells)} |")
     return lines
 

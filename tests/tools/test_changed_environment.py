@@ -11,7 +11,7 @@ from guiderail.tools.evaluation import evaluate
 from guiderail.tools.evaluation.robustness import robustness
 from guiderail.tools.evaluation.rollout import check_compatible
 from guiderail.tools.experiments.declaration import Study
-from guiderail.tools.experiments.study import Job, run_job
+from guiderail.tools.experiments.job import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.visualization.episode_spec import EpisodeSpec

@@ -6,7 +6,7 @@ from typing import Annotated
 from guiderail.models.common.errors import RunsFailedError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option
-from guiderail.tools.cli.output import print_lines, print_result
+from guiderail.tools.cli.output import print_result
 
 
 @cli.command("study study.yaml --out studies --methods skgrl,kgrl --seeds 30,31")
@@ -37,12 +37,9 @@ def study(
     from guiderail.tools.experiments.study import study_command
 
     declared = declaration.load_study(file)
-    chosen = declared.only(None if methods is None else methods.split(","), cli.parse_integers(seeds, "--seeds"))
+    chosen = declared.subset(None if methods is None else methods.split(","), cli.parse_integers(seeds, "--seeds"))
     running = make_engine(engine or "process", processes, address)
-    result = study_command(chosen, out, running, declared.part_name(chosen))
-    differences = {} if as_json else result.pop("differs_from_thesis", {})
+    result = study_command(chosen, out, running, declared.subset_name(chosen))
     print_result(result, as_json)
-    for method, lines in differences.items():
-        print_lines(f"differs from the thesis in ({method})", lines)
     if "failed" in result:
         raise RunsFailedError(result["failed"], None)

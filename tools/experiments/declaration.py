@@ -1,4 +1,4 @@
-"""What a study's YAML file may say, and one sentence where it says something else."""
+"""Declaration of a study: the content of its YAML file, and one sentence for a wrong one."""
 
 from __future__ import annotations
 
@@ -24,112 +24,110 @@ from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import statistics_of
 
-Whole = Annotated[int, Field(strict=True)]  # YAML's `true` would be 1 otherwise
+Integer = Annotated[int, Field(strict=True)]  # without `strict`, YAML's `true` would be 1
 FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
 LEARNED = "learned"
 
 
-def _filled_in(**words: Any) -> AfterValidator:
-    """A name whose words in braces are some of these, each with something that could stand there."""
+def _with_placeholders(**examples: Any) -> AfterValidator:
+    """Return a validator of file names with placeholders in braces, each given by an example of its value."""
 
-    def checked(name: str) -> str:
+    def check(name: str) -> str:
         try:
-            name.format(**words)
+            name.format(**examples)
         except (LookupError, ValueError, TypeError, AttributeError):
-            known = ", ".join(f"{{{word}}}" for word in words)
-            raise ValueError(f"{name!r} has braces that nothing fills: it may have {known}") from None
+            known = ", ".join(f"{{{word}}}" for word in examples)
+            raise ValueError(f"{name!r} has an unknown placeholder: it may have {known}") from None
         return name
 
-    return AfterValidator(checked)
+    return AfterValidator(check)
 
 
-RunName = Annotated[str, _filled_in(method="skgrl", seed=0, episodes=60, algorithm="tqc")]
-EvaluatedFile = Annotated[str, _filled_in(name="held_out", after_episodes=60, episodes=100, digest="0a")]
+RunName = Annotated[str, _with_placeholders(method="skgrl", seed=0, episodes=60, algorithm="tqc")]
+EvaluatedFile = Annotated[str, _with_placeholders(name="held_out", after_episodes=60, episodes=100, digest="0a")]
 
 
 class _Strict(BaseModel):
-    """Base of the declarations: unknown keys are refused."""
+    """Base class of the declarations: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class LearnerChoice(_Strict):
-    """How it is learned; what is left out is the task's own."""
+    """Learner of a method; the task's own is the default."""
 
-    algorithm: str | None = None  # a learner's name
-    preset: str | None = None  # of the learner's settings
-    settings: dict[str, Any] = {}  # in place of the preset's
-    episodes: Whole | None = Field(default=None, ge=1)  # of training; the last mark unless given
+    algorithm: str | None = None  # registered name of the learner
+    preset: str | None = None  # preset of the learner's settings
+    settings: dict[str, Any] = {}  # settings in place of the preset's
+    episodes: Integer | None = Field(default=None, ge=1)  # training episodes; default: the last of after_episodes
 
 
 class Method(_Strict):
-    """Who acts, through what."""
+    """Environment and policy that a study compares with others."""
 
-    env: dict[str, Any] = {}  # in place of the study's, or besides
+    env: dict[str, Any] = {}  # options of the environment, in addition to the study's
     learner: LearnerChoice = LearnerChoice()  # in place of the study's
-    policy: str = LEARNED  # or a null policy, best_constant, rule, or a rule's name
-    grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # of each number of an action, for best_constant
-    seeds: tuple[Whole, ...] | None = None  # the study's unless given: what doesn't depend on them needs one
+    policy: str = LEARNED  # or the name of a baseline policy, best_constant, or a scripted policy
+    grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each component of an action, for best_constant
+    seeds: tuple[Integer, ...] | None = None  # default: the study's; one is enough for a policy without learning
 
 
 class EvalSet(_Strict):
-    """Held-out episodes that a policy is judged on."""
+    """Held-out episodes on which a policy is evaluated."""
 
-    name: str = "held out"  # in the table
-    env: dict[str, Any] = {}  # other arguments than where it learned
-    sampled: dict[str, tuple[float, float]] = {}  # arguments that are uniform in a range, anew every few episodes
-    every: Whole = Field(default=4, ge=1)
-    options: dict[str, Any] = {}  # of each reset
-    episodes: Whole = Field(default=100, ge=1)  # how many
-    first_seed: Whole = Field(default=HELD_OUT_SEED, ge=0)  # of the first episode; each has the next
-    file: EvaluatedFile = "{name}-{after_episodes}-{digest}.csv"  # in the run's folder: what was evaluated already
+    name: str = "held out"  # name in the table
+    env: dict[str, Any] = {}  # options of the environment that differ from training
+    sampled: dict[str, tuple[float, float]] = {}  # options that are resampled uniformly from a range
+    every: Integer = Field(default=4, ge=1)  # episodes between two samples
+    options: dict[str, Any] = {}  # options of each reset
+    episodes: Integer = Field(default=100, ge=1)  # number of episodes
+    first_seed: Integer = Field(default=HELD_OUT_SEED, ge=0)  # seed of the first episode; each has the next
+    file: EvaluatedFile = "{name}-{after_episodes}-{digest}.csv"  # file of the episodes in the run's folder
 
 
 class Sweep(_Strict):
-    """One number of the environment made harder and harder: judged at each of its values, and drawn."""
+    """Quantity of the environment whose difficulty increases: evaluated at each value and drawn."""
 
-    quantity: str  # what is varied, with its unit, under the picture
-    at: dict[float, dict[str, Any]] = Field(min_length=1)  # the environment's arguments by its value, the easiest first
-    options: dict[str, Any] = {}  # of each reset
-    episodes: Whole = Field(default=40, ge=1)  # at each value
+    quantity: str  # name and unit, the label of the axis
+    at: dict[float, dict[str, Any]] = Field(min_length=1)  # options of the environment by value, the easiest first
+    options: dict[str, Any] = {}  # options of each reset
+    episodes: Integer = Field(default=40, ge=1)  # number of episodes at each value
 
     def eval_set(self, value: float) -> EvalSet:
-        """What is judged at one of its values."""
+        """Return the evaluation set of one value."""
         name = f"{self.quantity} {value:g}"
         file = re.sub(r"\W+", "_", self.quantity).strip("_") + f"-{value:g}-{{after_episodes}}-{{digest}}.csv"
         return EvalSet(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
 
 
 class Ratio(_Strict):
-    """A column of one method as a part of another's."""
+    """Ratio of a column between two methods."""
 
-    of: str  # the column
-    method: str  # whose part is stated
-    against: str  # of whose
+    of: str  # name of the column
+    method: str  # method of the numerator
+    against: str  # method of the denominator
 
 
 class Study(_Strict):
-    """Methods × seeds × marks × what is judged on."""
+    """Methods × seeds × numbers of training episodes × evaluation sets."""
 
-    name: FolderName  # of the tables
-    task: str  # of every method
-    env: dict[str, Any] = {}  # options of the environment, of every method
-    learner: LearnerChoice = LearnerChoice()  # of every method that learns
-    methods: dict[FolderName, Method] = Field(min_length=1)  # by name, of a folder and a legend
-    seeds: tuple[Whole, ...] = Field(min_length=1)  # of training
-    after_episodes: tuple[
-        Annotated[Whole, Field(ge=1)], ...
-    ] = ()  # training episodes after which a policy is judged; all of them unless given
-    eval_set: tuple[EvalSet, ...] = (EvalSet(),)  # each of them, after every mark
-    sweeps: tuple[Sweep, ...] = ()  # of which each value is judged on, too
-    statistics: tuple[str, ...] = ()  # of training, besides the usual ones
-    ratios: tuple[Ratio, ...] = ()  # what is said beside the table
-    folder: RunName = "{method}-{seed}"  # of a run
-    imports: tuple[str, ...] = ()  # modules or files (.py) that register what is not installed
+    name: FolderName  # name of the tables
+    task: str  # task of every method
+    env: dict[str, Any] = {}  # options of the environment of every method
+    learner: LearnerChoice = LearnerChoice()  # learner of every method that learns
+    methods: dict[FolderName, Method] = Field(min_length=1)  # by the name of folder and legend
+    seeds: tuple[Integer, ...] = Field(min_length=1)  # seeds of training
+    after_episodes: tuple[Annotated[Integer, Field(ge=1)], ...] = ()  # when policies are evaluated; default: at the end
+    eval_set: tuple[EvalSet, ...] = (EvalSet(),)  # evaluation sets
+    sweeps: tuple[Sweep, ...] = ()  # quantities whose values are evaluation sets too
+    statistics: tuple[str, ...] = ()  # statistics of training in addition to the usual ones
+    ratios: tuple[Ratio, ...] = ()  # ratios reported next to the table
+    folder: RunName = "{method}-{seed}"  # folder of a run
+    imports: tuple[str, ...] = ()  # modules or files (.py) that register the task, the learner, …
 
     @field_validator("statistics")
     @classmethod
-    def _known(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+    def _check_statistics(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         known = statistics_of(info.data.get("task", ""))
         for name in names:
             if name not in known:
@@ -137,45 +135,43 @@ class Study(_Strict):
         return names
 
     @property
-    def judgements(self) -> tuple[EvalSet, ...]:
-        """All that is judged on, sweeps included."""
+    def eval_sets(self) -> tuple[EvalSet, ...]:
+        """All evaluation sets, those of the sweeps included."""
         return (*self.eval_set, *(sweep.eval_set(value) for sweep in self.sweeps for value in sweep.at))
 
     @model_validator(mode="after")
-    def _is_told_apart(self) -> Study:
-        names = [judged.name for judged in self.judgements]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(f"two things that are judged on are called {twice!r}: give each a name of its own")
+    def _check_names(self) -> Study:
+        names = [eval_set.name for eval_set in self.eval_sets]
+        if repeated := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"two evaluation sets are called {repeated!r}: give each a name of its own")
         for ratio in self.ratios:
             for method in (ratio.method, ratio.against):
                 if method not in self.methods:
-                    raise ValueError(f"a ratio is of no method {method!r}: {did_you_mean(method, self.methods)}")
+                    raise ValueError(f"a ratio names no method {method!r}: {did_you_mean(method, self.methods)}")
         return self
 
     @model_validator(mode="after")
-    def _reaches_its_marks(self) -> Study:
-        learning = [method.learner for method in self.methods.values() if method.policy == LEARNED]
-        lasting = [
-            learner.episodes or self.learner.episodes or max(self.after_episodes, default=0) for learner in learning
-        ]
-        if beyond := [mark for mark in self.after_episodes if lasting and mark > max(lasting)]:
+    def _check_after_episodes(self) -> Study:
+        learners = [method.learner for method in self.methods.values() if method.policy == LEARNED]
+        episodes = [one.episodes or self.learner.episodes or max(self.after_episodes, default=0) for one in learners]
+        if unreached := [number for number in self.after_episodes if episodes and number > max(episodes)]:
             raise ValueError(
-                f"no method learns as long as the mark {beyond[0]}: leave it out, or give more than {max(lasting)} "
-                "learner episodes"
+                f"no method trains for {unreached[0]} episodes: leave that out of after_episodes, or give the learner "
+                f"more than {max(episodes)} episodes"
             )
         return self
 
-    def part_name(self, chosen: Study) -> str | None:
-        """What the table of a part of this study is called; None for all of it, which has the study's own name."""
-        methods = [] if chosen.methods.keys() == self.methods.keys() else list(chosen.methods)
-        seeds = [] if chosen.seeds == self.seeds else [str(seed) for seed in chosen.seeds]
+    def subset_name(self, subset: Study) -> str | None:
+        """Return the table's name of a subset of this study; None for all of it, which has the study's name."""
+        methods = [] if subset.methods.keys() == self.methods.keys() else list(subset.methods)
+        seeds = [] if subset.seeds == self.seeds else [str(seed) for seed in subset.seeds]
         return "-".join([self.name, *methods, *seeds]) if methods or seeds else None
 
-    def only(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
-        """The same study with some of its methods, or with other seeds.
+    def subset(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
+        """Return the study with some of its methods, or with other seeds.
 
         Raises:
-            InputError: for a method that it doesn't have.
+            InputError: If the study has no such method.
         """
         chosen = self.methods if methods is None else {}
         for name in methods or ():
@@ -207,13 +203,13 @@ def load_study(file: Path | str) -> Study:
 
 
 def _sentence(error: ValidationError) -> str:
-    """What is wrong first, where, and what it may be."""
+    """Return the first error as a sentence: where it is and what is allowed."""
     first = error.errors()[0]
     where = ", ".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         kinds = (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio)
         known = {name for kind in kinds for name in kind.model_fields}
-        return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"
+        return f"a study has no key {where}: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
     return f"{where}: {first['msg'][:1].lower()}{first['msg'][1:]}, not {first['input']!r}"[:300]

@@ -8,7 +8,7 @@ import pytest
 from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.experiments.declaration import load_study
-from guiderail.tools.experiments.study import JUDGED, TRAINING, Job
+from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job
 from guiderail.tools.tables import read_table
 from research.figures import FIGURES, find_figure, reproduce
 from research.figures.chapter_3 import METHODS
@@ -114,5 +114,5 @@ def test_grid_clamp_figure_has_the_force_of_each_seed(tmp_path):
         finished(tmp_path, study, method, 0, "t" + "s" * 11)
     result = reproduce("3.11", seeds=1, episodes=12, out=tmp_path)
     assert result["with the cost of force, return of the last ten episodes, each seed"] == "0.5"
-    assert not set(JUDGED) & set(read_table(tmp_path / "figure_3_11.csv").columns)
+    assert not set(EVALUATED) & set(read_table(tmp_path / "figure_3_11.csv").columns)
     assert {f"training_{name}" for name in TRAINING} <= set(read_table(tmp_path / "figure_3_11.csv").columns)

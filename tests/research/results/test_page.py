@@ -63,7 +63,7 @@ def test_sweep_has_a_picture_and_the_breaking_point_of_each_method(tmp_path):
          "success_rate": rate, "training_episodes": 100 if learned else None, "training_episodes_to_convergence": None,
          "training_max_commanded_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0}
         for method, learned in (("rl_sct", True), ("uniform_random", False))
-        for one, rate in zip(load_study(study_path("pouring_sweep")).judgements, rates[method], strict=True)
+        for one, rate in zip(load_study(study_path("pouring_sweep")).eval_sets, rates[method], strict=True)
     ]  # fmt: skip
     write_table(tmp_path / "study" / "pouring_sweep", pd.DataFrame(rows))
     page, picture = write_results([tmp_path / "study"], tmp_path / "results"), tmp_path / "results/pouring_sweep.svg"

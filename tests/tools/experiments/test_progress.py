@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from rich.console import Console
 
 from guiderail.tools.experiments.engines.engine import Outcome
-from guiderail.tools.experiments.progress import Board
+from guiderail.tools.experiments.progress import StudyProgress
 
 
 def job(folder: Path, seed: int):
@@ -25,7 +25,7 @@ def test_it_shows_what_runs_how_far_it_is_and_what_has_ended(tmp_path):
     jobs = {n: job(tmp_path, n) for n in range(5)}
     begin(jobs[4], 4)  # in an earlier study: it waits
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    board = Board(jobs, 6, console)
+    board = StudyProgress(jobs, 6, console)
     with board:
         begin(jobs[0], 3)
         begin(jobs[1], 4, workers=2)
@@ -39,13 +39,13 @@ def test_it_shows_what_runs_how_far_it_is_and_what_has_ended(tmp_path):
     assert [line.split() for line in shown.splitlines() if "episodes" in line] == [
         ["kgrl,", "seed", "0", "3/4", "episodes"]
     ]
-    assert "judged, by worker 2" in shown
-    assert "2 of 6 ended, 1 failed, 2 wait" in shown
+    assert "evaluated, by worker 2" in shown
+    assert "2 of 6 ended, 1 failed, 2 waiting" in shown
 
 
 def test_a_log_file_gets_a_line_for_each_that_ends(tmp_path):
     one, console = job(tmp_path, 0), Console(file=io.StringIO())
-    with Board({0: one}, 1, console) as board:
+    with StudyProgress({0: one}, 1, console) as board:
         begin(one, 4, workers=2)
         board.end(0, one, Outcome(({"eval_set": "held out", "success_rate": 0.5},)))
     assert console.file.getvalue() == "1/1 kgrl, seed 0: held out 50% (by worker 2, those before it were lost)\n"

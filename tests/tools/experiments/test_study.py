@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,11 +14,9 @@ from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import statistics_of
 from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study
 from guiderail.tools.experiments.engines.engine import make_engine
+from guiderail.tools.experiments.job import Job, check_job
 from guiderail.tools.experiments.study import (
-    Job,
-    _check,
-    differences_of,
-    differing,
+    differences_by_method,
     each,
     ratio,
     run_study,
@@ -27,6 +26,7 @@ from guiderail.tools.experiments.sweep import AT_ONCE, NEVER, breaking_point
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
 from research.studies import study_names, study_path
+from research.thesis import describe_differences
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
@@ -138,7 +138,7 @@ def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
         for file in mark.iterdir():
             file.unlink()
         mark.rmdir()
-    with pytest.raises(InputError, match="its policy of then is gone"):
+    with pytest.raises(InputError, match="is lost"):
         run(study(**{"eval_set": [{"episodes": 4}]}), tmp_path)
 
 
@@ -176,17 +176,20 @@ def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
     assert written(out) == before
 
 
-def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
-    study = load_study(study_path("connector_hard")).only(["kgrl", "skgrl", "uniform_random", "scripted"])
-    told = differing(study)
-    assert "reward aligned (thesis: sparse)" in told["all methods"]
-    assert any(words.startswith("difficulty 'hard', which is ours") for words in told["all methods"])
-    assert any("checkpoint selection" in words for words in told["kgrl"])
-    assert any("ρ" in words for words in told["skgrl"])
-    assert not any("checkpoint selection" in words for words in differences_of(study, "uniform_random"))
-    for method in study.methods:
-        own = [one for methods, words in told.items() if method in methods.split(", ") for one in words]
-        assert sorted([*told["all methods"], *own]) == sorted(differences_of(study, method))
+def test_differences_are_grouped_by_method():
+    study = load_study(study_path("connector_hard")).subset(["kgrl", "skgrl", "uniform_random", "scripted"])
+    groups = differences_by_method(study, describe_differences)
+    assert "reward aligned (thesis: sparse)" in groups["all methods"]
+    assert any(sentence.startswith("difficulty 'hard', added here") for sentence in groups["all methods"])
+    assert any("checkpoint selection" in sentence for sentence in groups["kgrl"])
+    assert any("ρ" in sentence for sentence in groups["skgrl"])
+    for method, one in study.methods.items():
+        own = [one for methods, sentences in groups.items() if method in methods.split(", ") for one in sentences]
+        config = Job(study, method, study.seeds[0], Path()).config(60)
+        learns = one.policy == "learned"
+        expected = describe_differences(config, learns=learns)
+        assert sorted([*groups["all methods"], *own]) == sorted(expected)
+        assert any("checkpoint selection" in sentence for sentence in expected) == learns
 
 
 def test_where_a_method_breaks_lies_on_a_line_between_two_values():
@@ -246,12 +249,14 @@ def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
 def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
     one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], after_episodes=[2])
     result = study_command(one, tmp_path, make_engine(processes=1))
+    described = study_command(one, tmp_path, describe_differences=lambda config, *, learns=True: [config.task])
+    assert described["differences"] == {"all methods": ["Bead"]}
     rows = read_table(tmp_path / "beads.csv")
     assert len(rows) == 2
     said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
     assert result["learner after 2 episodes, held out, success of each seed"] == said
     assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
-    assert result["differs_from_thesis"] == {"all methods": ["it has no task Bead"]}
+    assert "differences" not in result
     err = capsys.readouterr().err
     assert "1/2 learner, seed 5: held out" in err
     assert "2/2 learner, seed 6: held out" in err
@@ -276,28 +281,28 @@ WRONG = [
     ({"methods": {"learner": {"seeds": [True]}}}, "input should be a valid integer, not True"),
     ({"after_episodes": [0]}, "greater than or equal to 1"),
     ({"after_episodes": [True]}, "input should be a valid integer, not True"),
-    ({"after_episodes": [5], "learner": {"episodes": 1}}, "no method learns as long as the mark 5"),
+    ({"after_episodes": [5], "learner": {"episodes": 1}}, "no method trains for 5 episodes"),
     (
         {"after_episodes": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}},
-        "no method learns as long as the mark 5",
+        "no method trains for 5 episodes",
     ),
     ({"task": "NarrowPassage", "eval_set": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
     ({"task": "NarrowPassage", "eval_set": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
-    ({"after_episodes": [], "learner": {}}, "how long does learner learn"),
+    ({"after_episodes": [], "learner": {}}, "learner needs a number of training episodes"),
     ({"task": "Beat"}, "did you mean Bead"),
     ({"tsak": "Bead"}, "did you mean task"),
     ({"methods": {"learner": {"enf": {}}}}, "did you mean env"),
     ({"methods": {"../up": {}}}, "should match pattern"),
     ({"methods": {"one": {"policy": "magic"}}}, "no policy 'magic'"),
     ({"methods": {"one": {"env": {"guidanse": "kmp"}}}}, "did you mean guidance"),
-    ({"learner": {"preset": "robst"}}, "did you mean robust"),
+    ({"learner": {"preset": "tqc_contct"}}, "did you mean tqc_contact"),
     ({"learner": {"algorithm": "ppo"}}, "sac, tqc"),
     ({"learner": {"settings": {"batchsize": 3}}}, "batch_size"),
     ({"eval_set": [{"episodes": 0}]}, "eval_set"),
     ({"eval_set": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
     ({"eval_set": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
     ({"folder": "{guidance}-{seed}"}, "it may have {method}, {seed}, {episodes}, {algorithm}"),
-    ({"folder": "{method}-{seed"}, "has braces that nothing fills"),
+    ({"folder": "{method}-{seed"}, "has an unknown placeholder"),
     (
         {"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]},
         "it may have {name}, {after_episodes}, {episodes}, {digest}",
@@ -339,10 +344,10 @@ def test_load_study_refuses_a_missing_file(tmp_path):
         study_path("conector")
     with pytest.raises(InputError, match="there is no file"):
         load_study(tmp_path / "none.yaml")
-    chosen = load_study(study_path("connector")).only(["kgrl"], [1, 2])
+    chosen = load_study(study_path("connector")).subset(["kgrl"], [1, 2])
     assert (list(chosen.methods), chosen.seeds) == (["kgrl"], (1, 2))
     with pytest.raises(InputError, match="did you mean kgrl"):
-        chosen.only(["kgrll"])
+        chosen.subset(["kgrll"])
 
 
 @pytest.mark.parametrize("name", study_names())
@@ -351,14 +356,14 @@ def test_every_study_that_comes_along_makes_sense(name, tmp_path):
     assert declared.name == name
     import_modules(declared.imports)
     for method in declared.methods:
-        _check(Job(declared, method, declared.seeds[0], tmp_path))
+        check_job(Job(declared, method, declared.seeds[0], tmp_path))
     for wanted in declared.ratios:
         assert wanted.of.removeprefix("training_") in statistics_of(declared.task)
         assert {wanted.method, wanted.against} <= declared.methods.keys()
 
 
 def test_a_person_pours_and_the_constraints_are_why(tmp_path):
-    declared = load_study(study_path("pouring_mugs")).only(["person", "person_unconstrained"])
+    declared = load_study(study_path("pouring_mugs")).subset(["scripted_pour", "person_unconstrained"])
     declared = declared.model_copy(update={"eval_set": (EvalSet(episodes=1),)})
     bound, free = run(declared, tmp_path).to_dict("records")
     assert (bound["success_rate"], free["success_rate"]) == (1.0, 0.0)

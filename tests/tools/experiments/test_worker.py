@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.worker import Attempt, attempts
+from guiderail.tools.experiments.worker import Attempt, count_attempts
 from guiderail.tools.learning.run_folder import installed_versions
 
 
@@ -22,13 +22,13 @@ def work(job):
 
 def test_who_took_a_job_and_what_became_of_it_is_in_its_log(tmp_path):
     job, attempt = Job(tmp_path / "log.txt"), Attempt(work, installed_versions())
-    assert attempts(job.log) == 0
+    assert count_attempts(job.log) == 0
     assert attempt(job).rows == ({"success_rate": 1.0},)
     known = job.log.stat().st_size
-    assert (attempts(job.log), attempts(job.log, known)) == (1, 0)
+    assert (count_attempts(job.log), count_attempts(job.log, known)) == (1, 0)
     assert "is done" in job.log.read_text()
     attempt(job)
-    assert attempts(job.log, known) == 1
+    assert count_attempts(job.log, known) == 1
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_whatever_happens_is_one_sentence(error, sentence, traced, tmp_path):
 def test_a_worker_with_other_versions_does_nothing(tmp_path):
     job = Job(tmp_path / "log.txt")
     failure = Attempt(work, installed_versions() | {"numpy": "0.9"})(job).failure
-    assert "and 0.9 is wanted: install the same versions" in failure
+    assert "instead of 0.9: install the same versions" in failure
     assert not job.log.exists()
 
 

@@ -14,7 +14,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import import_modules, task_content
 from guiderail.tools.evaluation.cache import episodes_file
 from guiderail.tools.experiments.declaration import Study
-from guiderail.tools.experiments.study import Job, _digest
+from guiderail.tools.experiments.job import Job, digest
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, start_or_resume
 
@@ -76,7 +76,7 @@ def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_p
 
     def files():
         kept = episodes_file(tmp_path, "uniform_random", config, config.environment, episodes=2)
-        return kept, _digest(job), _digest(job, job.study.judgements[0])
+        return kept, digest(job), digest(job, job.study.eval_sets[0])
 
     before = files()
     (folder / "task.yaml").write_text(yaml.safe_dump(TASK | {"measured": {"clearance": 1}}))

@@ -1,1 +1,1 @@
-"""What runs the jobs of a study, one file each."""
+"""Engines that run the jobs of a study, one module each."""

@@ -1,4 +1,4 @@
-"""What a study needs of whatever runs its jobs, and the engines by name."""
+"""Interface of the engines that run the jobs of a study, and the registry of engines."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ from typing import Any, TypeAlias
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 
-ATTEMPTS = 3  # workers that a job may cost before it is given up: a job that kills its worker would go on for ever
-GIVEN_UP = f"{ATTEMPTS} workers were lost with it, one after the other"
+MAX_ATTEMPTS = 3  # workers that a job may lose before it is given up, because it may be the job that kills them
+GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job: its rows, or one sentence why there are none."""
+    """Result of a job.
+
+    Attributes:
+        rows: Rows of its table.
+        failure: One sentence why there are none; empty if the job succeeded.
+    """
 
     rows: tuple[dict[str, Any], ...] = ()
     failure: str = ""
@@ -27,28 +32,28 @@ Work: TypeAlias = Callable[[Any], Outcome]
 
 
 class Engine(AbstractContextManager[Any]):
-    """Runs jobs on workers: one at a time on each, with one thread.
+    """Engine that runs jobs on workers, one at a time per worker and with one thread.
 
-    A context: entering it finds or readies the workers, and leaving it leaves none behind that it started, whatever
-    happened. A job goes on from what is in its folder, so a job whose worker is lost is simply given to another.
+    Use it as a context: entering it finds or prepares the workers, and leaving it ends all that it started, also after an
+    error. A job resumes from its folder, so the job of a lost worker is given to another one.
 
     Attributes:
-        processes: how many jobs go side by side; None where that is not the engine's to say.
+        processes: Number of jobs that run at once; None if the engine does not decide it.
     """
 
     processes: int | None = None
 
     @abstractmethod
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
-        """The jobs' keys and outcomes as they are done, in any order.
+        """Yield keys and outcomes of the jobs as they finish, in any order.
 
         Args:
-            work: what a worker does with a job; it can be pickled and raises nothing.
-            jobs: what can be pickled.
+            work: Function of a job; it can be pickled and raises nothing.
+            jobs: Jobs by key; they can be pickled.
         """
 
 
-# An entry is called with `processes` and `address`, None where nobody gave them.
+# An entry is called with `processes` and `address`, which are None by default.
 ENGINES: Registry[Callable[..., Engine]] = Registry(
     "engine",
     package="guiderail.tools.experiments.engines",
@@ -59,10 +64,15 @@ register_engine = ENGINES.register
 
 
 def make_engine(name: str = "process", processes: int | None = None, address: str | None = None) -> Engine:
-    """An engine by its name.
+    """Return an engine by name.
+
+    Args:
+        name: Registered name.
+        processes: Number of jobs that run at once.
+        address: Address of a cluster.
 
     Raises:
-        InputError: for an unknown name, a number out of range, or what the engine has no use for.
+        InputError: If the name is unknown, or an argument is out of range or not supported by the engine.
     """
     if processes is not None and processes < 1:
         raise InputError(f"a study needs at least one process, not {processes}")

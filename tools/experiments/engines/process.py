@@ -1,4 +1,4 @@
-"""Jobs on processes of this machine."""
+"""Engine that runs jobs in processes of this machine."""
 
 from __future__ import annotations
 
@@ -12,37 +12,38 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.engines.engine import ATTEMPTS, GIVEN_UP, Engine, Outcome, Work, register_engine
+from guiderail.tools.experiments.engines.engine import GIVEN_UP, MAX_ATTEMPTS, Engine, Outcome, Work, register_engine
 
-PROCESSES = 2
+DEFAULT_PROCESSES = 2
 
 
 @register_engine("process")
 class ProcessEngine(Engine):
-    """Processes of this machine; one alone is this one."""
+    """Processes of this machine; a single one is the current process."""
 
     def __init__(self, processes: int | None = None, address: str | None = None):
-        """
+        """Construct the engine.
+
         Args:
-            processes: side by side.
-            address: refused.
+            processes: Number of processes; 2 by default.
+            address: Must be None.
 
         Raises:
-            InputError: if an address is given.
+            InputError: If an address is given.
         """
         if address is not None:
-            raise InputError("--address is of a Ray cluster: give --engine ray too, or leave it out")
-        self.processes = PROCESSES if processes is None else processes
+            raise InputError("--address is that of a Ray cluster: give --engine ray too, or leave it out")
+        self.processes = DEFAULT_PROCESSES if processes is None else processes
         self._workers: list[_Worker] = []
 
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
-        """The jobs' keys and outcomes as they are done."""
+        """Yield keys and outcomes of the jobs as they finish."""
         if self.processes == 1:
             yield from ((key, work(job)) for key, job in jobs.items())
             return
-        waiting, lost = deque(jobs), Counter[int]()
+        waiting, num_lost = deque(jobs), Counter[int]()
         while waiting or any(worker.key is not None for worker in self._workers):
-            self._hand_out(waiting, work, jobs)
+            self._assign(waiting, work, jobs)
             busy = {worker.connection: worker for worker in self._workers if worker.key is not None}
             for connection in wait(list(busy)):
                 worker = busy[cast(Connection, connection)]
@@ -51,14 +52,14 @@ class ProcessEngine(Engine):
                     yield key, outcome
                     continue
                 self._workers.remove(worker)
-                lost[key] += 1
-                if lost[key] == ATTEMPTS:
+                num_lost[key] += 1
+                if num_lost[key] == MAX_ATTEMPTS:
                     yield key, Outcome(failure=f"{GIVEN_UP}, the last by {worker.end()}")
                 else:
                     waiting.append(key)
 
-    def _hand_out(self, waiting: deque[int], work: Work, jobs: Mapping[int, Any]) -> None:
-        """Gives each worker that is free the next job, and starts workers as long as there are too few."""
+    def _assign(self, waiting: deque[int], work: Work, jobs: Mapping[int, Any]) -> None:
+        """Give waiting jobs to free workers, and start workers up to the number of processes."""
         while waiting:
             worker = next((one for one in self._workers if one.key is None), None)
             if worker is None:
@@ -68,7 +69,7 @@ class ProcessEngine(Engine):
                 self._workers.append(worker)
             if worker.begin(waiting[0], jobs[waiting[0]]):
                 waiting.popleft()
-            else:  # it died while it had nothing to do
+            else:  # it died while idle
                 self._workers.remove(worker)
 
     def __exit__(self, *error: object) -> None:
@@ -78,19 +79,19 @@ class ProcessEngine(Engine):
 
 
 class _Worker:
-    """A process, and the job that it has."""
+    """Worker process with its current job."""
 
     def __init__(self, work: Work):
-        # Fresh processes: a forked one would inherit the threads and random generators of this one.
+        # A forked process would inherit the threads and random generators of this one.
         context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
+        self.connection, child_connection = context.Pipe()
         self.key: int | None = None
-        self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
+        self._process = context.Process(target=_serve, args=(child_connection, work), daemon=True)
         self._process.start()
-        theirs.close()  # so that the end of the process is the end of the connection
+        child_connection.close()  # the connection then ends with the process
 
     def begin(self, key: int, job: Any) -> bool:
-        """Gives it a job; False if there is nobody left to take it."""
+        """Send a job; return False if the process has ended."""
         try:
             self.connection.send(job)
         except OSError:
@@ -99,7 +100,7 @@ class _Worker:
         return True
 
     def finish(self) -> tuple[int, Outcome | None]:
-        """The job that it had, and what became of it: None if the process ended instead of saying so."""
+        """Return the key of the job and its outcome; None if the process ended before it answered."""
         assert self.key is not None
         key, self.key = self.key, None
         try:
@@ -109,20 +110,20 @@ class _Worker:
             return key, None
 
     def end(self) -> str:
-        """How the process ended."""
+        """Return the signal or exit code that the process ended with."""
         code = self._process.exitcode or 0
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
     def stop(self) -> None:
-        """Ends the process at once: what it has done is on the disk or handed over, and the rest nobody waits for."""
+        """Kill the process: its results are on disk or received already."""
         self._process.kill()
         self._process.join()
         self.connection.close()
 
 
 def _serve(connection: Connection, work: Work) -> None:
-    """What a worker does: one job after another, until nobody is left who gives it any."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a terminal's processes; one of them decides
+    """Run the jobs that arrive until the connection is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent decides
     os.environ["OMP_NUM_THREADS"] = "1"
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
@@ -134,7 +135,7 @@ def _serve(connection: Connection, work: Work) -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this process when the one that started it is gone, however it went, and whatever is going on here."""
+    """End this process when its parent has ended, even if the parent was killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

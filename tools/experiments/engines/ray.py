@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster, or on a Ray of this machine alone."""
+"""Engine that runs jobs on a Ray cluster, or on a local Ray of this machine."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.engines.engine import ATTEMPTS, GIVEN_UP, Engine, Outcome, Work, register_engine
-from guiderail.tools.experiments.engines.process import PROCESSES
+from guiderail.tools.experiments.engines.engine import GIVEN_UP, MAX_ATTEMPTS, Engine, Outcome, Work, register_engine
+from guiderail.tools.experiments.engines.process import DEFAULT_PROCESSES
 
 LOCAL = "local"
-REACHED = 5.0  # s, within which a cluster answers; Ray itself asks for minutes
+CONNECT_TIMEOUT = 5.0  # time within which a cluster must answer [s]; Ray itself tries for minutes
 
 
 @register_engine("ray")
 class RayEngine(Engine):
-    """As many jobs side by side as a cluster has cores, on whatever machine they are.
+    """Ray cluster that runs as many jobs at once as it has cores.
 
-    The study's folder must be on a path that all machines share; there a job goes on whose worker or machine is lost.
+    The study's folder must be on a path that all machines share; there the job of a lost worker or machine resumes.
     """
 
     def __init__(self, processes: int | None = None, address: str | None = None):
-        """
+        """Construct the engine.
+
         Args:
-            processes: side by side, without a cluster.
-            address: of a cluster, as `ray.init` takes it; that of the variable RAY_ADDRESS unless given, and without
-                either a Ray of this machine alone is started.
+            processes: Number of jobs that run at once without a cluster; 2 by default.
+            address: Address of a cluster, as `ray.init` takes it; the variable RAY_ADDRESS by default. Without either, a
+                local Ray is started.
 
         Raises:
-            InputError: if Ray is not installed, or both are given.
+            InputError: If Ray is not installed, or both arguments are given.
         """
         try:
             import ray
@@ -40,26 +41,26 @@ class RayEngine(Engine):
         self._ray: Any = ray
         self._address = address or os.environ.get("RAY_ADDRESS") or LOCAL
         if self._address != LOCAL and processes is not None:
-            raise InputError("a Ray cluster runs as many jobs side by side as it has cores: leave --processes out")
+            raise InputError("a Ray cluster runs as many jobs at once as it has cores: leave --processes out")
         if self._address == LOCAL:
-            self.processes = PROCESSES if processes is None else processes
+            self.processes = DEFAULT_PROCESSES if processes is None else processes
 
     def __enter__(self) -> Self:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         quiet = {"log_to_driver": False, "configure_logging": True, "logging_level": logging.CRITICAL}
-        alone = {"num_cpus": self.processes, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+        local = {"num_cpus": self.processes, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
         try:
             _reach(self._address)
-            self._ray.init(self._address, **quiet, **(alone if self._address == LOCAL else {}))
-        except Exception as error:  # its errors have no common type
-            words = next(iter(str(error).splitlines()), type(error).__name__)
-            raise InputError(f"there is no Ray at {self._address} ({words}): start one, or give --address") from error
+            self._ray.init(self._address, **quiet, **(local if self._address == LOCAL else {}))
+        except Exception as error:  # Ray's errors have no common type
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise InputError(f"there is no Ray at {self._address} ({reason}): start one, or give --address") from error
         return self
 
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
-        """The jobs' keys and outcomes as they are done."""
-        # Ray gives a job of a lost worker to another by itself.
-        remote = self._ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(work_on)
+        """Yield keys and outcomes of the jobs as they finish."""
+        # Ray itself gives the job of a lost worker to another one.
+        remote = self._ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(work_on)
         shared = self._ray.put(work)
         waiting = {remote.remote(shared, job): key for key, job in jobs.items()}
         while waiting:
@@ -72,16 +73,16 @@ class RayEngine(Engine):
             yield key, outcome
 
     def __exit__(self, *error: object) -> None:
-        self._ray.shutdown()  # what a cluster still does for this process ends with it
+        self._ray.shutdown()  # ends the tasks that the cluster still runs for this process
 
 
 def _reach(address: str) -> None:
-    """Raises an OSError if nothing listens at an address with a host and a port."""
+    """Raise an OSError if nothing listens at an address with a host and a port."""
     host, _, port = address.rpartition("//")[2].rpartition(":")
     if host and port.isdigit():
-        socket.create_connection((host.strip("[]"), int(port)), REACHED).close()
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
 
 
 def work_on(work: Work, job: Any) -> Outcome:
-    """Ray names a worker by the function that it runs."""
+    """Run `work` on a job; Ray names its workers after this function."""
     return work(job)

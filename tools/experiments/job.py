@@ -1,0 +1,316 @@
+"""Job of a study: one method with one seed, trained and evaluated in a folder of its own.
+
+A job depends on nothing but its folder: interrupted, it resumes there, and finished, it only reads its tables.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas as pd
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import (
+    changed_environment,
+    check_reset,
+    import_modules,
+    make_environment,
+    task_content,
+)
+from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
+from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.evaluate import evaluate_run
+from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollout
+from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Study
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments
+from guiderail.tools.learning.train import configure, with_defaults
+
+BEST_CONSTANT = "best_constant"
+SELECTION_EPISODES = 10  # training episodes of each constant action, of which the best one is evaluated
+
+TRAINING = (
+    "episodes", "success_rate", "success_rate_last_10", "episodes_to_convergence", "mean_return_last_10", "mean_force",
+    "mean_squared_force", "mean_squared_force_since_converged", "peak_force", "max_commanded_violation",
+    "max_measured_violation", "violating_episodes", "measured_violating_episodes", "collisions",
+    "ended_in_success", "ended_in_collision", "ended_in_spill", "fallback_steps", "jerk_commanded_linear_first_10",
+    "jerk_commanded_angular_first_10", "jerk_measured_linear_first_10", "total_steps", "wall_time",
+)  # fmt: skip
+EVALUATED = (
+    "episodes", "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "mean_force",
+    "mean_squared_force", "peak_force", "max_commanded_violation", "violating_episodes", "collisions",
+    "ended_in_collision", "ended_in_spill",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method of a study with one seed.
+
+    Attributes:
+        study: The study.
+        method: Name of the method.
+        seed: Seed of training.
+        out: Folder of the study.
+    """
+
+    study: Study
+    method: str
+    seed: int
+    out: Path
+
+    @property
+    def learns(self) -> bool:
+        """True if the job trains a policy; baseline policies do not."""
+        return self.study.methods[self.method].policy == LEARNED
+
+    @property
+    def after_episodes(self) -> list[int]:
+        """Numbers of training episodes after which the policy is evaluated; [0] without training.
+
+        Raises:
+            InputError: If the study does not tell the number of training episodes.
+        """
+        if not self.learns:
+            return [0]
+        own, common = self.study.methods[self.method].learner.episodes, self.study.learner.episodes
+        episodes = own or common or max(self.study.after_episodes, default=0)
+        if not episodes:
+            raise InputError(
+                f"{self.method} needs a number of training episodes: give after_episodes or learner episodes"
+            )
+        return sorted({number for number in self.study.after_episodes if number < episodes} | {episodes})
+
+    def config(self, episodes: int) -> RunConfig:
+        """Return the configuration of the run with a number of episodes.
+
+        Raises:
+            InputError: If a name is unknown or a value is out of range.
+        """
+        study, method = self.study, self.study.methods[self.method]
+        choices = [study.learner, method.learner]
+        given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
+        given["settings"] = {**study.learner.settings, **method.learner.settings}
+        environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
+        given |= {"imports": study.imports, "seed": self.seed}
+        return configure(study.task, environment, episodes=max(episodes, 1), **given)
+
+    @cached_property
+    def folder(self) -> RunFolder:
+        """Folder of the run and of its evaluated episodes."""
+        config = self.config(self.after_episodes[-1])
+        values = {"method": self.method, "seed": self.seed, "episodes": config.episodes}
+        return RunFolder(self.out / self.study.folder.format(**values, algorithm=config.learner.algorithm))
+
+    @property
+    def log(self) -> Path:
+        """Log of the workers that ran the job."""
+        return self.out / "logs" / f"{self.study.name}-{self.method}-{self.seed}.txt"
+
+    def policy_folder(self, episodes: int) -> Path:
+        """Return the folder with a copy of the policy after a number of episodes."""
+        return self.folder.path / "after_episodes" / str(episodes)
+
+
+def check_job(job: Job) -> None:
+    """Check a job before anything runs.
+
+    Raises:
+        InputError: If the declaration makes no sense for the task, or the folder holds another run.
+    """
+    config, policy = job.config(job.after_episodes[-1]), job.study.methods[job.method].policy
+    if policy not in (LEARNED, BEST_CONSTANT):
+        make_baseline(job.study.task, policy)
+    for eval_set in job.study.eval_sets:
+        sampled = {name: low for name, (low, _) in eval_set.sampled.items()}
+        environment = changed_environment(config.task, config.environment, eval_set.env)
+        configure(job.study.task, environment | sampled, episodes=1)
+        check_reset(job.study.task, eval_set.options)
+    for episodes, eval_set in itertools.product(job.after_episodes, job.study.eval_sets):
+        _refuse_other_rows(job, episodes, eval_set)
+    if (job.folder.path / "config.yaml").exists():
+        job.folder.refuse_another(config)
+        for episodes in job.after_episodes:
+            if not all(_evaluated_file(job, episodes, eval_set).exists() for eval_set in job.study.eval_sets):
+                _refuse_lost_policy(job, episodes)
+    elif job.learns:
+        job.folder.refuse_existing()
+
+
+def is_done(job: Job) -> bool:
+    """Return True if the rows of a job only have to be read."""
+    pairs = itertools.product(job.after_episodes, job.study.eval_sets)
+    is_evaluated = all(_evaluated_file(job, *pair).exists() for pair in pairs)
+    return is_evaluated and not any(_needs_training(job, episodes) for episodes in job.after_episodes)
+
+
+def run_job(job: Job) -> list[dict[str, Any]]:
+    """Train and evaluate a job as far as that is not done, and return its rows."""
+    import_modules(job.study.imports)
+    rows = []
+    for episodes in job.after_episodes:
+        trained = _train(job, episodes).iloc[:episodes]
+        row = {
+            "method": job.method,
+            "policy": job.study.methods[job.method].policy,
+            "algorithm": job.config(episodes).learner.algorithm if job.learns else "",
+            "seed": job.seed,
+            "after_episodes": episodes,
+        }
+        training = summary(trained, (*TRAINING, *job.study.statistics), "training_", job.study.task)
+        training["folder"] = str(job.folder.path)
+        for eval_set in job.study.eval_sets:
+            evaluated = summary(_load_or_evaluate(job, episodes, eval_set), EVALUATED)
+            rows.append(row | {"eval_set": eval_set.name} | evaluated | training)
+        if not job.study.eval_sets:
+            rows.append(row | {"eval_set": ""} | training)
+    return rows
+
+
+def _needs_training(job: Job, episodes: int) -> bool:
+    """Return True if the run has not reached a number of episodes."""
+    folder = job.folder
+    if not job.learns or (job.policy_folder(episodes) / "policy.json").exists():
+        return False
+    done = len(folder.episodes()) if (folder.path / "episodes.csv").exists() else 0
+    if done != episodes:
+        return done < episodes
+    return folder.config().episodes != done or not (folder.path / "policy.json").exists()
+
+
+def _train(job: Job, episodes: int) -> pd.DataFrame:
+    """Train the run to at least a number of episodes, copy its policy, and return its episodes."""
+    if not job.learns:
+        return pd.DataFrame()
+    folder, copy = job.folder, job.policy_folder(episodes)
+    if _needs_training(job, episodes):
+        from guiderail.tools.learning.trainer import run_training
+
+        config = job.config(episodes)
+        demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
+        run_training(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=demonstrator)
+    rows = folder.episodes()
+    if len(rows) == episodes and not (copy / "policy.json").exists():
+        for name in ("policy.safetensors", "policy.json"):
+            write_atomically(copy / name, (folder.path / name).read_bytes())
+    return rows
+
+
+def _refuse_lost_policy(job: Job, episodes: int) -> None:
+    """Raise an InputError if the run was trained beyond a number of episodes without a copy of its policy."""
+    table = job.folder.path / "episodes.csv"
+    if table.exists() and len(job.folder.episodes()) > episodes and not job.policy_folder(episodes).exists():
+        raise InputError(
+            f"the run in {job.folder.path} was trained for more than {episodes} episodes, and its policy after {episodes} "
+            f"is lost: leave {episodes} out of after_episodes, or train again in another folder"
+        )
+
+
+def digest(job: Job, eval_set: EvalSet | None = None, episodes: int = 0) -> str:
+    """Return the digest of everything that decides evaluated episodes, for the name of their file.
+
+    The environment counts as resolved, because the options that a difficulty stands for may change.
+    """
+    method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
+    evaluation = "" if eval_set is None else eval_set.model_dump_json(exclude={"name", "file"})
+    environment = job.config(1).environment
+    if eval_set is not None and "difficulty" in eval_set.env:
+        environment = changed_environment(job.study.task, environment, eval_set.env)
+    content = task_content(job.study.task, environment, job.study.imports)
+    text = evaluation + method + json.dumps(environment, sort_keys=True, default=str) + content + job.study.task
+    if eval_set is not None and episodes and "{after_episodes}" not in eval_set.file:
+        text += f"after_episodes {episodes}"
+    if "{seed}" not in job.study.folder:
+        text += f"seed {job.seed}"
+    return hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
+
+
+def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
+    """Return the rows of held-out episodes from their file, or evaluate and write them."""
+    file = _evaluated_file(job, episodes, eval_set)
+    _refuse_other_rows(job, episodes, eval_set)
+
+    def evaluate() -> pd.DataFrame:
+        rows = _evaluate(job, episodes, eval_set)
+        if "{digest}" not in eval_set.file:
+            write_atomically(_digest_file(file), digest(job, eval_set, episodes).encode())
+        return rows
+
+    return load_or_compute(file, evaluate)
+
+
+def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> Path:
+    values = {"name": eval_set.name.replace(" ", "_"), "after_episodes": episodes, "episodes": eval_set.episodes}
+    return job.folder.path / eval_set.file.format(**values, digest=digest(job, eval_set, episodes))
+
+
+def _digest_file(file: Path) -> Path:
+    """Return the hidden file with the digest of a table whose name does not contain it."""
+    return file.with_name(f".{file.name}.digest")
+
+
+def _refuse_other_rows(job: Job, episodes: int, eval_set: EvalSet) -> None:
+    """Raise an InputError if the file of evaluated episodes belongs to another study."""
+    file = _evaluated_file(job, episodes, eval_set)
+    stored = _digest_file(file)
+    if "{digest}" not in eval_set.file and stored.exists() and stored.read_text() != digest(job, eval_set, episodes):
+        raise InputError(
+            f"{file} holds episodes of another study, of other settings or after other training: name another folder "
+            "with --out, or write {after_episodes} and {digest} into the file's name"
+        )
+
+
+def _evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
+    config, policy = job.config(episodes), _policy(job, episodes)
+    environment = as_arguments(changed_environment(config.task, config.environment, eval_set.env))
+    every, tables = eval_set.every if eval_set.sampled else eval_set.episodes, []
+    for done in range(0, eval_set.episodes, every):
+        rng, number = np.random.default_rng([eval_set.first_seed, done]), min(every, eval_set.episodes - done)
+        sampled = {name: float(rng.uniform(low, high)) for name, (low, high) in eval_set.sampled.items()}
+        seed = eval_set.first_seed + done
+        rows = evaluate_run(config, policy, environment | sampled, episodes=number, seed=seed, options=eval_set.options)
+        tables.append(rows.assign(episode=rows["episode"] + done, **sampled))
+    return pd.concat(tables, ignore_index=True)
+
+
+def _policy(job: Job, episodes: int) -> Callable[[gymnasium.Env], PolicyFn]:
+    """Return a function from the environment to the policy."""
+    name = job.study.methods[job.method].policy
+    if name == LEARNED:
+        _refuse_lost_policy(job, episodes)
+        return partial(check_compatible, Policy.load(job.policy_folder(episodes)))
+    if name == BEST_CONSTANT:
+        best = _best_constant(job)
+        return lambda env: constant_policy(env, best)
+    return make_baseline(job.study.task, name, job.seed)
+
+
+def _best_constant(job: Job) -> np.ndarray:
+    """Return the constant action (A,) with the most successes, then the highest return, in training episodes."""
+    file = job.folder.path / f"best_constant-{digest(job)}.csv"
+
+    def compare() -> pd.DataFrame:
+        config, grid = job.config(1), job.study.methods[job.method].grid
+        env = make_environment(config.task, config.environment)
+        rows = []
+        for action in itertools.product(grid, repeat=int(np.prod(env.action_space.shape or ()))):
+            env.reset(seed=config.seed)
+            policy = constant_policy(env, np.array(action))
+            episodes = pd.DataFrame([rollout(env, policy) for _ in range(SELECTION_EPISODES)])
+            components = {f"action_{i}": value for i, value in enumerate(action)}
+            rows.append(components | summary(episodes, ("success_rate", "mean_return")))
+        env.close()
+        return pd.DataFrame(rows).sort_values(["success_rate", "mean_return"], ascending=False, kind="stable")
+
+    return load_or_compute(file, compare).iloc[0].filter(like="action_").to_numpy(float)
