@@ -1,4 +1,4 @@
-"""Checks every link of the built pages that leads to another page or file, and to a place on it."""
+"""Check of the local links in the built pages, including anchors."""
 
 import sys
 from html.parser import HTMLParser
@@ -10,20 +10,20 @@ class _Page(HTMLParser):
     def __init__(self, text: str):
         super().__init__()
         self.links: list[str] = []
-        self.places: set[str] = set()
+        self.anchors: set[str] = set()
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Collects what it leads to, and what leads to it."""
+        """Collect links and anchors."""
         for name, value in attrs:
             if name in ("href", "src") and value:
                 self.links.append(value)
             elif name in ("id", "name") and value:
-                self.places.add(value)
+                self.anchors.add(value)
 
 
 def broken(folder: Path) -> list[str]:
-    """One sentence for each link that leads nowhere, or fetches from elsewhere."""
+    """Return a sentence for each link without a target."""
     pages = {path.resolve(): _Page(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html")}
     found = []
     for path, page in pages.items():
@@ -33,9 +33,9 @@ def broken(folder: Path) -> list[str]:
                 continue
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             if not target.is_file():
-                found.append(f"{path.relative_to(folder.resolve())}: {link} leads nowhere")
-            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].places:
-                found.append(f"{path.relative_to(folder.resolve())}: there is no place {link}")
+                found.append(f"{path.relative_to(folder.resolve())}: {link} has no target file")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
+                found.append(f"{path.relative_to(folder.resolve())}: {link} has no anchor")
     return found
 
 

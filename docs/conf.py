@@ -1,4 +1,4 @@
-"""How the pages are built: `make docs`. The reference is made from the code first, and the code in pages is run."""
+"""Configuration of the documentation, `make docs`. The reference is generated first, and code in pages is run."""
 
 import logging
 import os
@@ -23,15 +23,15 @@ extensions = ["myst_nb"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
-smartquotes = False  # two dashes before an option stay two
+smartquotes = False  # keeps two dashes before an option
 suppress_warnings = ["myst.header"]  # included sections begin at the second level
 
-# Pages with `file_format: mystnb` are notebooks. A cell that fails, or takes longer, fails the build.
+# Pages with `file_format: mystnb` are notebooks. A cell that fails or times out fails the build.
 nb_execution_mode = "force"
-nb_execution_timeout = 300  # s, a cell, which takes seconds where nobody else works
+nb_execution_timeout = 300  # timeout of a cell [s]
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
-nb_ipywidgets_js = {}  # nothing is fetched
+nb_ipywidgets_js = {}  # nothing is downloaded
 nb_render_markdown_format = "myst"
 
 html_theme = "furo"
@@ -42,7 +42,7 @@ html_math_renderer = "mathml"
 html_copy_source = html_show_sourcelink = html_show_copyright = html_show_sphinx = False
 
 
-# What a notebook shows: drawings whose words stay words, the same file each time.
+# Figures of notebooks: reproducible SVG files whose text stays text.
 KERNEL = """
 c.InteractiveShellApp.matplotlib = "inline"
 c.InlineBackend.figure_formats = {"svg"}
@@ -57,18 +57,18 @@ c.InlineBackend.rc = {
     "svg.hashsalt": "guiderail",
 }
 c.HistoryManager.enabled = False
-c.IPKernelApp.log_level = "ERROR"  # it warns that who builds could listen to their own pages being run
+c.IPKernelApp.log_level = "ERROR"  # hides a warning about local connections
 """
 ipython = tempfile.TemporaryDirectory()
 profile = Path(ipython.name) / "profile_default"
 profile.mkdir()
 (profile / "ipython_kernel_config.py").write_text(KERNEL, encoding="utf-8")
 os.environ["IPYTHONDIR"] = os.environ["JUPYTER_RUNTIME_DIR"] = ipython.name
-logging.getLogger("traitlets").setLevel(logging.WARNING)  # that a notebook is run
+logging.getLogger("traitlets").setLevel(logging.WARNING)  # hides messages about running notebooks
 
 
 def stale_notebooks(app, env, added, changed, removed):
-    """Notebooks that were run before the code changed: their pictures may be others now."""
+    """Return the notebooks that were run before the code changed."""
     code = (
         path for folder in ("models", "systems", "diagrams", "tools") for path in (HERE.parent / folder).rglob("*.*")
     )
@@ -81,7 +81,7 @@ def stale_notebooks(app, env, added, changed, removed):
 
 
 def setup(app):
-    """Equations as MathML, which browsers show without a script; the reference before any page is read."""
+    """Register the MathML renderer and generate the reference before pages are read."""
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
     app.connect("env-get-outdated", stale_notebooks)
     make_reference.make(HERE / "reference")

@@ -1,7 +1,7 @@
-"""Makes the moving pictures of the gallery: `python docs/make_gallery.py`, or some of them by name.
+"""Render the animations of the gallery: `python docs/make_gallery.py [NAME …]`.
 
-Each shows episodes side by side, on one clock, and says in its last frame how they ended. What they came to is also in
-`pictures/gallery.json`, by which a test sees whether the pictures are stale.
+Each animation has episodes side by side with a common clock and their endings in the last frame. The endings are also
+in `pictures/gallery.json`, from which a test detects stale animations.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from guiderail.tools.visualization.curves import draw_passage
 HERE = Path(__file__).parent
 FOLDER = HERE / "pictures"
 FONT = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
-GAP = 12  # between panels
-FRAMES = 45  # of a picture, beside the one it rests on
-REST = 2000  # ms, at the end
+GAP = 12  # between panels [pixels]
+FRAMES = 45  # frames of an animation
+REST = 2000  # duration of the last frame [ms]
 GREEN, DARK, RED = (0, 150, 60), (28, 31, 36), (179, 38, 30)
-SCALE = 2  # lines are drawn so much larger first, as nothing here smooths them
-LEARNING_EPISODES = 32  # as many as `make demo`
+SCALE = 2  # supersampling of lines, which Pillow does not smooth
+LEARNING_EPISODES = 32  # as in `make demo`
 SCRATCH = tempfile.TemporaryDirectory()
 
 
 @dataclass
 class Panel:
-    """An episode in a picture: who acts in what, and after it was run, what was seen of it."""
+    """Episode in an animation: its policy and environment, and its recording after `run_panel`."""
 
     title: str
     task: str | Callable[[], str]
@@ -54,7 +54,7 @@ class Panel:
     act: Callable[[Any], PolicyFn]
     seed: int = 1_000_000
     colour: tuple[int, int, int] = GREEN
-    says: Callable[[dict[str, Any]], str] | None = None
+    describe: Callable[[dict[str, Any]], str] | None = None
     row: dict[str, Any] = field(default_factory=dict)
     times: np.ndarray = field(default_factory=lambda: np.zeros(0))
     force: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -62,25 +62,25 @@ class Panel:
     images: dict[int, Image.Image] = field(default_factory=dict)
 
     def ending(self) -> str:
-        """How it ended, in a few words."""
+        """Return a short description of the ending."""
         words = str(self.row["termination"]).replace("_", " ")
         force = f", {self.row['peak_force']:.0f} N at most" if self.row["peak_force"] > 0 else ""
-        return self.says(self.row) if self.says else f"{words}{force}"
+        return self.describe(self.row) if self.describe else f"{words}{force}"
 
 
 def run_panel(panel: Panel, size: tuple[int, int], every: int | None) -> None:
-    """Runs the episode; a camera looks at every so many control steps, or a plane is drawn once where that is None."""
+    """Run the episode and render every `every` control steps; if None, draw the plane once."""
     task = panel.task if isinstance(panel.task, str) else panel.task()
     env = make_environment(task, panel.environment, render_mode=None if every is None else "rgb_array")
     base: Any = env.unwrapped
     env.reset(seed=0)
     act, period = panel.act(env), base.task.control_period
-    seen: dict[int, Image.Image] = {}
+    images: dict[int, Image.Image] = {}
 
     def look(context: Context) -> EventStatus:
         step = round(context.get_time() / period)
         if every is not None and abs(context.get_time() - step * period) < 1e-6 and step % every == 0:
-            seen[step] = _fitted(env.render(), size)
+            images[step] = _fitted(env.render(), size)
         return EventStatus.DidNothing()
 
     if every is not None:
@@ -90,11 +90,11 @@ def run_panel(panel: Panel, size: tuple[int, int], every: int | None) -> None:
     panel.force = np.append(0.0, base.trace.force)
     if every is None:
         image, to_pixels = _plane(size)
-        seen[0], panel.path = image, to_pixels(base.trace.measured)
+        images[0], panel.path = image, to_pixels(base.trace.measured)
     else:
-        seen[len(base.trace)] = _fitted(picture := env.render(), size)
+        images[len(base.trace)] = _fitted(picture := env.render(), size)
         panel.path = path_in_picture(base) * SCALE * size[0] / picture.shape[1]
-    panel.images = seen
+    panel.images = images
     env.close()
 
 
@@ -103,7 +103,7 @@ def _fitted(image: Any, size: tuple[int, int]) -> Image.Image:
 
 
 def _plane(size: tuple[int, int]) -> tuple[Image.Image, Callable[[np.ndarray], np.ndarray]]:
-    """The narrow passage from above, and what takes points (n, 2) to pixels of it."""
+    """Draw the narrow passage; return the image and the function from points (n, 2) to its pixels."""
     dpi = 100
     figure = Figure(figsize=(SCALE * size[0] / dpi, SCALE * size[1] / dpi), dpi=dpi)
     canvas = FigureCanvasAgg(figure)
@@ -117,7 +117,7 @@ def _plane(size: tuple[int, int]) -> tuple[Image.Image, Callable[[np.ndarray], n
 
 
 def compose(panels: Sequence[Panel], size: tuple[int, int], times: np.ndarray) -> list[Image.Image]:
-    """Frames with the panels side by side, each with its title, its path so far, time and force."""
+    """Return frames with the panels side by side: title, path, time and force of each."""
     font, line = ImageFont.truetype(FONT, SCALE * 11), SCALE * 18
     frames = []
     for number, time in enumerate(times):
@@ -146,14 +146,14 @@ def compose(panels: Sequence[Panel], size: tuple[int, int], times: np.ndarray) -
 
 
 def save(path: Path, frames: Sequence[Image.Image], seconds: float) -> None:
-    """A WebP that moves, and rests at its end before it begins anew."""
+    """Write an animated WebP that repeats after a pause."""
     each = round(1000 * seconds / (len(frames) - 1))
     durations = [each] * (len(frames) - 1) + [REST]
     options = {"save_all": True, "append_images": frames[1:], "duration": durations, "loop": 0}
     frames[0].save(path, quality=55, method=4, **options)
 
 
-def _white(seed: int) -> Callable[[Any], PolicyFn]:
+def _random(seed: int) -> Callable[[Any], PolicyFn]:
     return lambda env: BaselinePolicy(uniform_random, env, seed)
 
 
@@ -178,7 +178,7 @@ def _obstacle(row: dict[str, Any]) -> str:
 
 
 def _learned(env: Any) -> PolicyFn:
-    """What the demo learns: a run of `LEARNING_EPISODES` episodes, made here."""
+    """Train the policy of the demo."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         given = {"guidance": "skgrl"}
@@ -193,8 +193,8 @@ def _right(env: Any) -> PolicyFn:
 
 
 @cache
-def _onboarded(name: str) -> str:
-    """A task made of one of the tests' drawings, as `guiderail create-task` makes it; its name."""
+def _created_task(name: str) -> str:
+    """Create a task from parts of the tests; return its name."""
     sys.path.insert(0, str(HERE.parent / "tests"))
     try:
         from oracles.parts import PARTS
@@ -207,26 +207,30 @@ def _onboarded(name: str) -> str:
     return task_named(str(folder / "task"))[0]
 
 
-def _beside(distance: float) -> dict[str, Any]:
-    """The socket so far from where it is believed to be [m]."""
+def _with_offset(distance: float) -> dict[str, Any]:
+    """Return options with a socket offset [m]."""
     return {"guidance": "kgrl", "fixture_offset": "per_episode", "offset_range": [distance, distance]}
 
 
 PASSAGE, SQUARE = (240, 350), (320, 240)
 
-# Of each picture: its panels, their size in pixels, and how many control steps apart a camera looks (None: a plane).
+# Panels of each animation, their size in pixels, and control steps between renderings (None: a plane).
 PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None]] = {
     "passage_methods": (
         lambda: [
             Panel(
-                "KGRL, white actions", "NarrowPassage", {"guidance": "kgrl", "action_repeat": 10}, _white(1), says=_jerk
+                "KGRL, white actions",
+                "NarrowPassage",
+                {"guidance": "kgrl", "action_repeat": 10},
+                _random(1),
+                describe=_jerk,
             ),
             Panel(
                 "sKGRL, the same actions",
                 "NarrowPassage",
                 {"guidance": "skgrl", "action_repeat": 10},
-                _white(1),
-                says=_jerk,
+                _random(1),
+                describe=_jerk,
             ),
         ],
         PASSAGE,
@@ -234,21 +238,23 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "passage_constraint": (
         lambda: [
-            Panel("residual, always to the right", "NarrowPassage", {"guidance": "residual"}, _right, says=_worst),
-            Panel("KGRL, always to the right", "NarrowPassage", {"guidance": "kgrl"}, _right, says=_worst),
+            Panel("residual, always to the right", "NarrowPassage", {"guidance": "residual"}, _right, describe=_worst),
+            Panel("KGRL, always to the right", "NarrowPassage", {"guidance": "kgrl"}, _right, describe=_worst),
         ],
         PASSAGE,
         None,
     ),
     "passage_learned": (
         lambda: [
-            Panel("before: demonstration alone", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, says=_obstacle),
+            Panel(
+                "before: demonstration alone", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, describe=_obstacle
+            ),
             Panel(
                 f"after {LEARNING_EPISODES} episodes, sKGRL",
                 "NarrowPassage",
                 {"guidance": "skgrl"},
                 _learned,
-                says=_obstacle,
+                describe=_obstacle,
             ),
         ],
         PASSAGE,
@@ -272,7 +278,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
                 {"difficulty": "hard", **guidance},
                 make_baseline("BncConnector", "scripted"),
                 seed=1_000_002,
-                says=_within,
+                describe=_within,
             )
             for title, guidance in (
                 ("a rule by hand, through KGRL", {"guidance": "kgrl"}),
@@ -285,9 +291,11 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "parts": (
         lambda: [
-            Panel("a bayonet: demonstration", partial(_onboarded, "bayonet"), _beside(0.0), zero_policy),
-            Panel("the same, socket 1.5 mm beside", partial(_onboarded, "bayonet"), _beside(0.0015), zero_policy),
-            Panel("a snap-fit: demonstration", partial(_onboarded, "snap_fit"), _beside(0.0), zero_policy),
+            Panel("a bayonet: demonstration", partial(_created_task, "bayonet"), _with_offset(0.0), zero_policy),
+            Panel(
+                "the same, socket 1.5 mm beside", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy
+            ),
+            Panel("a snap-fit: demonstration", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
         ],
         SQUARE,
         8,
@@ -302,7 +310,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "pouring": (
         lambda: [
-            Panel("random inputs", "Pouring", {"time_limit": 6.0}, _white(1)),
+            Panel("random inputs", "Pouring", {"time_limit": 6.0}, _random(1)),
             Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
         ],
         SQUARE,
@@ -312,7 +320,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
 
 
 def draw(name: str) -> tuple[list[Panel], list[Image.Image], float]:
-    """Runs the episodes of a picture; its panels, its frames, and how long they last [s]."""
+    """Run the episodes of an animation; return panels, frames and duration [s]."""
     panels_of, size, every = PICTURES[name]
     panels = panels_of()
     for panel in panels:
@@ -322,15 +330,17 @@ def draw(name: str) -> tuple[list[Panel], list[Image.Image], float]:
 
 
 def make(folder: Path, names: Sequence[str]) -> None:
-    """Makes the pictures of these names."""
+    """Render the animations of these names."""
     folder.mkdir(exist_ok=True)
     log = folder / "gallery.json"
-    told = json.loads(log.read_text(encoding="utf-8")) if log.is_file() else {}
+    log_content = json.loads(log.read_text(encoding="utf-8")) if log.is_file() else {}
     for name in names:
         panels, frames, seconds = draw(name)
         save(folder / f"{name}.webp", frames, seconds)
-        told[name] = {panel.title: panel.ending() for panel in panels}
-        log.write_text(json.dumps(dict(sorted(told.items())), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        log_content[name] = {panel.title: panel.ending() for panel in panels}
+        log.write_text(
+            json.dumps(dict(sorted(log_content.items())), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes the reference from the code: it has nothing to say that the code doesn't."""
+"""Generation of the reference pages from docstrings, signatures and registries."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WORDS = {"Args": "Argument", "Attributes": "Attribute", "Raises": "Raises"}
 
 
 def make(folder: Path) -> None:
-    """Writes a page each; what did not change is left alone, so that a page is not built anew for nothing."""
+    """Write all pages into a folder. Unchanged files are not touched, so that Sphinx does not rebuild them."""
     folder.mkdir(exist_ok=True)
     for name, page in PAGES.items():
         text = page()
@@ -35,23 +35,23 @@ def make(folder: Path) -> None:
 
 
 def prose(text: str) -> str:
-    """A docstring's text as Markdown: double backticks are code in both, asterisks and angles are meant as they are."""
+    """Return a docstring's text as Markdown, with asterisks, angles and dollars escaped outside of code."""
     parts = re.split(r"(``.*?``|`[^`]*`)", text)
     return "".join(part if part.startswith("`") else re.sub(r"([*<$])", r"\\\1", part) for part in parts)
 
 
 def cell(text: Any) -> str:
-    """What a table's cell can hold."""
+    """Return a text as the content of a table cell."""
     return " ".join(prose(str(text)).split()).replace("|", "\\|")
 
 
 def code(text: Any) -> str:
-    """Code, in a table too."""
+    """Return a text as code, also for table cells."""
     return f"`{text}`".replace("|", "\\|") if str(text) else ""
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; nothing where there are no rows."""
+    """Return a Markdown table; an empty string without rows."""
     rows = list(rows)
     if not rows:
         return ""
@@ -63,7 +63,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def sections(doc: str) -> tuple[str, dict[str, list[tuple[str, str]]]]:
-    """The text of a docstring as `inspect.getdoc` gives it, and its sections as names with words."""
+    """Split a docstring into its text and its sections, each a list of names and descriptions."""
     text: list[str] = []
     found: dict[str, list[tuple[str, str]]] = {}
     current = None
@@ -88,7 +88,7 @@ def sections(doc: str) -> tuple[str, dict[str, list[tuple[str, str]]]]:
 
 
 def documented(thing: Any) -> str:
-    """A docstring as Markdown: its text, and a table for each of its sections."""
+    """Return a docstring as Markdown: its text, and a table for each section."""
     text, found = sections(DIAGRAM.sub("", (inspect.getdoc(thing) or "") + "\n"))
     page = paragraphs(text) + "\n\n"
     for name, rows in found.items():
@@ -100,7 +100,7 @@ def documented(thing: Any) -> str:
 
 
 def paragraphs(text: str) -> str:
-    """Text as Markdown; indented lines are a law or code."""
+    """Return text as Markdown; indented lines are equations or code."""
     lines = []
     for line in text.splitlines():
         lines.append(line if line.startswith("    ") else prose(line))
@@ -108,7 +108,7 @@ def paragraphs(text: str) -> str:
 
 
 def signature(name: str, thing: Callable[..., Any]) -> str:
-    """What it is called with."""
+    """Return the signature as a code block."""
     try:
         parameters = inspect.signature(thing).parameters.values()
     except (ValueError, TypeError):
@@ -134,18 +134,24 @@ def _default(value: Any) -> str:
 
 
 def field_words(kind: type) -> dict[str, str]:
-    """What the comment behind each field of a class says."""
-    lines = textwrap.dedent(inspect.getsource(kind)).splitlines()
-    words = {}
-    for node in ast.parse("\n".join(lines)).body[0].body:  # type: ignore[attr-defined]
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            comment = re.search(r"#\s(.*)$", lines[(node.end_lineno or node.lineno) - 1])
-            words[node.target.id] = comment[1] if comment else ""
-    return words
+    """Return the description of each field: from the docstring, the pydantic field or the comment behind it."""
+    words: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not base.__module__.startswith("guiderail."):
+            continue
+        lines = textwrap.dedent(inspect.getsource(base)).splitlines()
+        for node in ast.parse("\n".join(lines)).body[0].body:  # type: ignore[attr-defined]
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                comment = re.search(r"#\s(.*)$", lines[(node.end_lineno or node.lineno) - 1])
+                words[node.target.id] = comment[1] if comment else ""
+        _, found = sections(inspect.cleandoc(vars(base).get("__doc__") or ""))
+        for names, text in (*found.get("Attributes", ()), *found.get("Args", ())):
+            words |= {name.strip(" *"): text for name in re.split("[,/]", names)}
+    return words | {name: one.description for name, one in getattr(kind, "model_fields", {}).items() if one.description}
 
 
 def field_types(kind: type) -> dict[str, str]:
-    """The type of each field and its range, in words."""
+    """Return type and range of each field as text."""
     hints = typing.get_type_hints(kind, include_extras=True)
     bounds = {n: _bounds(f.metadata) for n, f in getattr(kind, "model_fields", {}).items()}
     return {name: f"{_typed(hint)}{bounds.get(name, '')}" for name, hint in hints.items()}
@@ -178,15 +184,15 @@ def _bounds(metadata: Iterable[Any]) -> str:
 
 
 def systems() -> str:
-    """Every LeafSystem with its ports."""
+    """Return the page of LeafSystems with their ports."""
     from pydrake.systems.framework import LeafSystem
 
     from guiderail import systems as module
 
     page = (
-        "# Systems\n\nEvery law is a Drake `LeafSystem` with named ports: `from guiderail.systems import …`. "
-        "A port `x` has the getter `get_x_input_port()` or `get_x_output_port()`; ports whose names the constructor is "
-        "given have one getter, by name.\n\n"
+        "# Systems\n\nEvery control law is a Drake `LeafSystem` with named ports: `from guiderail.systems import …`. "
+        "Port `x` has the getter `get_x_input_port()` or `get_x_output_port()`. Ports whose names are constructor "
+        "arguments have one getter, by name.\n\n"
     )
     for name in sorted(module.__all__):
         system = getattr(module, name)
@@ -198,7 +204,7 @@ def systems() -> str:
 
 
 def ports(system: type) -> list[tuple[str, str, str]]:
-    """Kind, name and words of each port, as the docstring lists them."""
+    """Return kind, name and description of each port in a system's docstring."""
     block = DIAGRAM.search((inspect.getdoc(system) or "") + "\n")
     rows = []
     for kind in ("input", "output"):
@@ -221,7 +227,7 @@ def ports(system: type) -> list[tuple[str, str, str]]:
 
 
 def api() -> str:
-    """The names that people import."""
+    """Return the page of public names."""
     import guiderail
     from guiderail.diagrams import guidance
     from guiderail.diagrams.envs.observation import CLOCKS
@@ -232,8 +238,8 @@ def api() -> str:
     from guiderail.systems.episode_monitor import TERMINATIONS
 
     page = (
-        "# Names to import\n\nWhat `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` "
-        "export. Systems have [a page of their own](systems.md).\n\n"
+        "# Public names\n\nNames that `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` "
+        "export. [Systems](systems.md) have a separate page.\n\n"
     )
     seen: set[str] = set()
     for module in (guiderail, primitives, guidance):
@@ -244,25 +250,29 @@ def api() -> str:
                 continue
             seen.add(name)
             page += f"### {name}\n\n" + exported(name, thing)
-    page += "## Words\n\n"
+    page += "## Constants\n\n"
     rows = [
         ("guiderail.diagrams.envs.observation.CLOCKS", CLOCKS, "signals that every observation can have"),
         (
             "guiderail.systems.episode_monitor.TERMINATIONS",
             TERMINATIONS,
-            "how an episode ends; the empty one: it goes on",
+            "terminations of an episode; the empty one while it runs",
         ),
-        ("guiderail.diagrams.guidance.registry.REQUIREMENTS", tuple(REQUIREMENTS), "what `register_guidance` can need"),
+        (
+            "guiderail.diagrams.guidance.registry.REQUIREMENTS",
+            tuple(REQUIREMENTS),
+            "requirements of `register_guidance`",
+        ),
         ("guiderail.diagrams.stations.station.OUTPUTS", OUTPUTS, "signals that every station has"),
         ("guiderail.diagrams.guidance.guidance.OUTPUTS", guidance_ports.OUTPUTS, "signals that every guidance has"),
     ]
     return page + table(
-        ["name", "words", "what they are"], [(code(n), _listed(map(repr, w)), cell(m)) for n, w, m in rows]
+        ["name", "values", "description"], [(code(n), _listed(map(repr, w)), cell(m)) for n, w, m in rows]
     )
 
 
 def exported(name: str, thing: Any) -> str:
-    """A class with its public methods, or a function."""
+    """Return the documentation of a class with its public methods, or of a function."""
     page = documented(thing)
     if not inspect.isclass(thing):
         return signature(name, thing) + page
@@ -279,7 +289,7 @@ def exported(name: str, thing: Any) -> str:
         text, _ = sections(inspect.getdoc(function) or "")
         call = method if isinstance(function, property) else f"{method}({_arguments(function)})"
         rows.append((code(call), cell(text.split("\n\n")[0])))
-    return page + table(["has", "what it is"], rows)
+    return page + table(["member", "description"], rows)
 
 
 def _arguments(function: Callable[..., Any]) -> str:
@@ -287,7 +297,7 @@ def _arguments(function: Callable[..., Any]) -> str:
 
 
 def command() -> str:
-    """The command with all its options."""
+    """Return the page of commands with their options."""
     import typer
 
     from guiderail.tools.cli.app import expand_choices
@@ -299,8 +309,7 @@ def command() -> str:
         commands |= {f"{name} {part}": sub for part, sub in one.commands.items()} if hasattr(one, "commands") else {}
         commands |= {} if hasattr(one, "commands") else {name: one}
     page = (
-        "# The command\n\n`guiderail COMMAND --help` says the same. Where a program may read the result, "
-        "`--json` prints one object.\n\n"
+        "# Commands\n\n`guiderail COMMAND --help` prints the same. `--json` prints the result as one JSON object.\n\n"
     )
     for name, one in commands.items():
         page += f"## guiderail {name}\n\n{prose(inspect.cleandoc(one.help or ''))}\n\n"
@@ -321,12 +330,12 @@ def command() -> str:
                 "" if is_flag or parameter.default in (None, "", inspect.Parameter.empty) else code(parameter.default)
             )
             rows.append((code(shown), cell(words), default))
-        page += table(["", "what it is", "unless given"], rows)
+        page += table(["", "description", "default"], rows)
     return page
 
 
 def _kinds(function: Any) -> dict[str, str]:
-    """What kind of value each parameter of a command is."""
+    """Return the kind of value of each parameter of a command."""
     words = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH"}
     found = {}
     for name, annotation in typing.get_type_hints(function).items():
@@ -336,17 +345,17 @@ def _kinds(function: Any) -> dict[str, str]:
 
 
 def options() -> str:
-    """Tasks, guidance, stations, robots and learners, and what each of them takes."""
+    """Return the page of tasks, guidance, stations, robots and learners with their options."""
     from guiderail.tools.cli.catalog import describe_all
 
     known = describe_all()
     page = (
         "# Tasks, guidance and their options\n\n`make_env(task, …)`, `gymnasium.make`, and `--env key=value` take "
-        "them; `guiderail list --json` has the same.\n\n## Of every environment\n\n"
+        "them; `guiderail list --json` prints them.\n\n## All environments\n\n"
     )
     page += _options(known["options"]["of every environment"])
-    for whose in ("guidance made of demonstrations", "guidance made of a template"):
-        page += f"## Of {whose}\n\n" + _options(known["options"][f"of {whose}"])
+    for kind_of_guidance in ("guidance made of demonstrations", "guidance made of a template"):
+        page += f"## With {kind_of_guidance}\n\n" + _options(known["options"][f"of {kind_of_guidance}"])
     for name, task in known["tasks"].items():
         page += f"## Task {name}\n\n{prose(task['is'])}\n\n"
         rows = [("environment", code(task["environment"]))]
@@ -357,21 +366,21 @@ def options() -> str:
         page += table(["", ""], rows) + _options(task["options"])
         page += "Options of `reset`:\n\n" + _options(task["reset_options"])
     page += "## Guidance\n\n" + table(
-        ["name", "what it is", "needs"],
+        ["name", "description", "needs"],
         [
             (code(n), cell(g["is"]), cell(" or ".join(" and ".join(x) for x in g["needs"])))
             for n, g in known["guidance"].items()
         ],
     )
     page += "## Stations\n\n" + table(
-        ["name", "what it is", "world"],
+        ["name", "description", "world"],
         [(code(n), cell(s["is"]), cell(s["world"])) for n, s in known["stations"].items()],
     )
     for name, station in known["stations"].items():
         if station["options"]:
             page += f"### Station {name}\n\n" + _options(station["options"])
     page += "## Robots and end effectors\n\n" + table(
-        ["name", "what it is"],
+        ["name", "description"],
         [(code(n), cell(r["is"])) for part in ("robots", "end_effectors") for n, r in known[part].items()],
     )
     return page + "## Learners\n\n" + _listed(known["learners"]) + "\n"
@@ -384,14 +393,14 @@ def _listed(values: Iterable[Any]) -> str:
 def _options(rows: list[Mapping[str, Any]]) -> str:
     return (
         table(
-            ["option", "what it is", "type and range", "unless given"],
-            [(code(r["name"]), cell(r["description"]), _range(r), _shown(r["default"])) for r in rows],
+            ["option", "description", "type and range", "default"],
+            [(code(r["name"]), cell(r["description"]), _range(r), _format_default(r["default"])) for r in rows],
         )
         or "None.\n\n"
     )
 
 
-def _shown(default: Any) -> str:
+def _format_default(default: Any) -> str:
     return "" if default in (None, "") or default is PydanticUndefined else code(default)
 
 
@@ -403,39 +412,39 @@ def _range(row: Mapping[str, Any]) -> str:
 
 
 TEMPLATE_WORDS = {
-    "name": "of the template, in messages and pictures",
-    "inputs": "how many numbers a person or a policy gives, 1 to 6, each in [−1, 1]",
-    "frames": "names of the objects that it is about; a task says where they are; `world` and `tool` are always there",
-    "parameters": "names with numbers that a task can replace; any number below may be arithmetic on them",
-    "initial_state": "the first state unless given",
-    "max_speed_m_per_s": "of what is commanded [m/s]",
-    "max_speed_rad_per_s": "of what is commanded [rad/s]",
-    "states": "by name: see below",
+    "name": "name of the template in messages and pictures",
+    "inputs": "number of inputs of a user or policy, 1 to 6, each in [−1, 1]",
+    "frames": "names of objects whose poses the task gives; `world` and `tool` always exist",
+    "parameters": "named numbers that a task can replace; any number below can be an expression of them",
+    "initial_state": "the initial state; the first one by default",
+    "max_speed_m_per_s": "largest commanded speed [m/s]",
+    "max_speed_rad_per_s": "largest commanded angular speed [rad/s]",
+    "states": "states by name: see below",
 }
 STATE_WORDS = {
-    "input_mapping": "a list: what the inputs move; what several of them say is added",
-    "active_constraints": "a list: what the requested pose is projected on, one after the other",
-    "transition_distance": "how far it is to the end of this state, in metres or degrees, which `…` stands for",
-    "starts_at_…": "the distance at which the state's progress is 0",
-    "ends_at_…": "the distance at which it is over; unless given the first transition's",
-    "weight_per_…": "how much of the reward's progress a metre or a degree is worth; 1 unless given",
-    "transitions": "a list of `to`, `below_…` and, for a way back, `hysteresis_…`: the state changes to `to` where its "
-    "distance falls below `below_…`, and returns where that distance exceeds `below_…` + `hysteresis_…`; without "
+    "input_mapping": "list of mappings from inputs to motion, which are added",
+    "active_constraints": "list of constraints onto which the requested pose is projected, in this order",
+    "transition_distance": "distance to the end of the state, in metres or degrees; `…` below is the unit",
+    "starts_at_…": "distance at which the state's progress is 0",
+    "ends_at_…": "distance at which the state ends; that of the first transition by default",
+    "weight_per_…": "weight of a metre or a degree in the reward's progress; 1 by default",
+    "transitions": "list of `to`, `below_…` and optionally `hysteresis_…`: the state changes to `to` when its "
+    "distance falls below `below_…`, and back when that distance exceeds `below_…` + `hysteresis_…`; without "
     "`hysteresis_…` it never returns",
 }
 
 
 KINDS_NOTES = {
-    "active_constraints": "They are applied in the order of the file. No kind bounds the turn about F's z axis (yaw) "
-    "and leaves it free in between: `fixed_orientation`, `tilt_limits`, `tilt_by_distance` and `arc` determine it, and "
-    "without any of them the orientation is free.\n\n",
-    "input_mapping": "Whatever the inputs ask for, a command moves no faster than `max_speed_m_per_s` and "
+    "active_constraints": "They are applied in the order of the file. No kind bounds the rotation about F's z axis "
+    "(yaw) to a range: `fixed_orientation`, `tilt_limits`, `tilt_by_distance` and `arc` determine it. "
+    "Without any of them the orientation is free.\n\n",
+    "input_mapping": "For all inputs, a command moves no faster than `max_speed_m_per_s` and "
     "`max_speed_rad_per_s`.\n\n",
 }
 
 
 def shipped_templates() -> str:
-    """The files of guiderail's own templates, as they are."""
+    """Return the files of the shipped templates."""
     from importlib import resources
 
     folder = Path(str(resources.files("guiderail.models") / "objects"))
@@ -448,19 +457,19 @@ def shipped_templates() -> str:
 
 
 def templates() -> str:
-    """The YAML of shared control templates."""
+    """Return the page of template files."""
     from guiderail.models.templates import schema
     from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 
     if changed := {*TEMPLATE_WORDS} ^ {*schema.TemplateFile.model_fields}:
-        raise ValueError(f"the fields of a template changed: {changed} have no words here")
+        raise ValueError(f"the fields of a template changed: {changed} have no description here")
     page = (
         "# Template files\n\nA shared control template is a YAML file; `load_template(path)` reads it and "
-        "`guiderail check FILE` says what is wrong with it, in a sentence. "
-        "[Write a template](../tutorials/write_a_template.md) makes one.\n\n"
+        "`guiderail template validate FILE` reports the first error. "
+        "[Write a template](../tutorials/write_a_template.md) is a tutorial.\n\n"
     )
-    page += table(["field", "what it is"], [(code(n), cell(w)) for n, w in TEMPLATE_WORDS.items()])
-    page += "## A state\n\n" + table(["field", "what it is"], [(code(n), cell(w)) for n, w in STATE_WORDS.items()])
+    page += table(["field", "description"], [(code(n), cell(w)) for n, w in TEMPLATE_WORDS.items()])
+    page += "## A state\n\n" + table(["field", "description"], [(code(n), cell(w)) for n, w in STATE_WORDS.items()])
     page += (
         f"At most {schema.MAX_STATES} states, {schema.MAX_PARTS} entries in a list, and {schema.MAX_NUMBER:g} "
         "for any number.\n\n"
@@ -474,7 +483,7 @@ def templates() -> str:
         page += f"## {title}\n\nEach entry of `{where}` has `kind` and the fields of that kind.\n\n"
         page += KINDS_NOTES.get(where, "")
         for name, kind in registry.items():
-            page += f"### {name}\n\n{paragraphs(inspect.getdoc(kind) or '')}\n\n"
+            page += f"### {name}\n\n{paragraphs(sections(inspect.getdoc(kind) or '')[0])}\n\n"
             words, kinds_of = field_words(kind), field_types(kind)
             rows = []
             for one in dataclasses.fields(kind):
@@ -487,16 +496,13 @@ def templates() -> str:
                         "" if missing else code(one.default),
                     )
                 )
-            page += table(["field", "type", "what it is", "unless given"], rows)
-    page += (
-        "## The templates that come along\n\nA task of yours can use them, with other parameters, or start from a "
-        "copy.\n\n"
-    )
+            page += table(["field", "type", "description", "default"], rows)
+    page += "## Shipped templates\n\nOther tasks can use them with other parameters, or start from a copy.\n\n"
     return page + shipped_templates()
 
 
 def worlds() -> str:
-    """What stations work on, and the signals that they have."""
+    """Return the page of workcells and stations with their signals."""
     from pydrake.systems.framework import PortDataType
 
     from guiderail.diagrams.envs.config import EnvConfig
@@ -507,9 +513,9 @@ def worlds() -> str:
     from guiderail.diagrams.tasks.registry import TASKS
 
     page = (
-        "# Worlds and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns what a station of that kind "
-        "is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a world of another kind, "
-        "`register_station(name, world=kind)` decorates a subclass of `Station` that is built from a world. Every "
+        "# Workcells and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns the object that a "
+        "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a workcell of "
+        "another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
         "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
     )
     rows = (
@@ -518,19 +524,19 @@ def worlds() -> str:
             r"^(`\w+`) +(\d+) +(.*(?:\n {6}.*)*)", inspect.getdoc(station_ports) or "", re.MULTILINE
         )
     )
-    page += table(["port", "size", "what it is"], rows)
+    page += table(["port", "size", "description"], rows)
     tasks = {TASKS.get(name).workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
-        world = EnvConfig.resolve(task, {}).make_task().workcell()
+        workcell = EnvConfig.resolve(task, {}).make_task().workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
-        page += f"`{type(world).__module__}.{type(world).__name__}`.\n\n"
+        page += f"`{type(workcell).__module__}.{type(workcell).__name__}`.\n\n"
         if kind == "workcell":
-            page += "Any object with these methods will do:\n\n"
+            page += "Any object with these methods is a workcell:\n\n"
             for protocol in (Workcell, ConvexWorkcell):
                 where = " (for `station=mujoco`)" if protocol is ConvexWorkcell else ""
                 page += f"### {protocol.__name__}{where}\n\n" + exported(protocol.__name__, protocol)
         else:
-            page += f"### {type(world).__name__}\n\n" + exported(type(world).__name__, type(world))
+            page += f"### {type(workcell).__name__}\n\n" + exported(type(workcell).__name__, type(workcell))
         rows = []
         for name in stations_for(kind):
             if not STATIONS.get(name).is_simulated:
@@ -540,27 +546,27 @@ def worlds() -> str:
             sizes = {one.get_name(): one.size() for one in ports if one.get_data_type() == PortDataType.kVectorValued}
             rows.append((code(name), ", ".join(f"`{port}` {size}" for port, size in sizes.items())))
             page += f"### Station {name}\n\n" + documented(STATIONS.get(name).build)
-        page += "Signals, and how many numbers each has:\n\n" + table(["station", "signals"], rows)
+        page += "Signals and their sizes:\n\n" + table(["station", "signals"], rows)
     return page
 
 
 def studies() -> str:
-    """The YAML of studies."""
+    """Return the page of study files."""
     from guiderail.tools.experiments import declaration
 
     page = (
-        "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × marks × what is judged on. "
+        "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × numbers of episodes × evaluation sets. "
         "Those of the project are in `research/studies`. Unknown fields are refused.\n\n"
     )
     kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.EvalSet, declaration.Sweep)
     for kind in (*kinds, declaration.Ratio):
         words, kinds_of = field_words(kind), field_types(kind)
-        page += f"## {kind.__name__}\n\n{prose(inspect.getdoc(kind) or '')}\n\n"
+        page += f"## {kind.__name__}\n\n{prose(sections(inspect.getdoc(kind) or '')[0])}\n\n"
         rows = []
         for name, field in kind.model_fields.items():
             default = "" if field.is_required() else code(_model_default(field.default))
             rows.append((code(field.alias or name), cell(kinds_of[name]), cell(words[name]), default))
-        page += table(["field", "type", "what it is", "unless given"], rows)
+        page += table(["field", "type", "description", "default"], rows)
     return page
 
 
@@ -571,7 +577,7 @@ def _model_default(value: Any) -> str:
 
 
 def files() -> str:
-    """What files there are, and what is in them."""
+    """Return the page of files."""
     from guiderail.models.primitives import io as limits
     from guiderail.models.primitives.demonstrations import Demonstrations
     from guiderail.tools.evaluation.metrics import COLUMNS
@@ -580,26 +586,26 @@ def files() -> str:
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 
     page = (
-        f"# Files\n\n## A run\n\n{prose(inspect.getdoc(RunFolder) or '')}\n\n"
-        "| file | what is in it |\n|---|---|\n"
-        "| `config.yaml` | everything resolved: the fields below |\n"
-        "| `episodes.csv` | one row an episode: see below |\n"
-        "| `steps/*.parquet` | one row a control step: see below |\n"
-        "| `checkpoint/` | what `--resume` goes on from |\n"
-        "| `policy.safetensors`, `policy.json` | the policy's weights, and its shape; loading them runs no code |\n"
-        "| `learning_curve.png`, `replay.html` | to look at |\n\n"
+        f"# Files\n\n## A run\n\n{prose(sections(inspect.getdoc(RunFolder) or '')[0])}\n\n"
+        "| file | content |\n|---|---|\n"
+        "| `config.yaml` | the resolved configuration: the fields below |\n"
+        "| `episodes.csv` | one row per episode: see below |\n"
+        "| `steps/*.parquet` | one row per control step: see below |\n"
+        "| `checkpoint/` | state from which `--resume` continues |\n"
+        "| `policy.safetensors`, `policy.json` | weights and shape of the policy; loading them runs no code |\n"
+        "| `learning_curve.png`, `replay.html` | pictures and page |\n\n"
     )
     page += "### config.yaml\n\n" + _fields(RunConfig)
-    page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(OffPolicyConfig) or '')} "
+    page += f"### learner, in config.yaml\n\n{prose(sections(inspect.getdoc(OffPolicyConfig) or '')[0])} "
     page += f"Presets are {', '.join(code(name) for name in PRESETS)}; `--set name=value` changes one setting.\n\n"
     page += _fields(OffPolicyConfig)
     page += (
-        "### episodes.csv\n\nAnd `reward_…`, the sum of each of the reward's terms. `collisions` and `collision_steps` "
-        "are of the signal that `Task.collision` names. An episode that a `TerminationTerm` ends as `collision` counts only "
-        "where that signal is above its limit too.\n\n"
+        "### episodes.csv\n\nBesides these, `reward_…` is the sum of each reward term. `collisions` and "
+        "`collision_steps` are of the signal that `Task.collision` names. An episode that a `TerminationTerm` ends as `collision` counts "
+        "only where that signal is above its limit too.\n\n"
     )
     page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
-    page += "### Step log\n\n`…_i` stands for a column for every number of a pose or a wrench.\n\n"
+    page += "### Step log\n\n`…_i` are columns for the numbers of a pose or a wrench.\n\n"
     page += table(["column", "unit", "meaning"], [(code(n), cell(u), cell(w)) for n, (u, w) in MEANINGS.items()])
     page += (
         f"## Demonstrations\n\n{paragraphs(inspect.getdoc(Demonstrations.load) or '').split('Raises:')[0]}\n"
@@ -618,36 +624,36 @@ def _fields(kind: type) -> str:
     for one in dataclasses.fields(kind):
         default = "" if one.default is dataclasses.MISSING else code(one.default)
         rows.append((code(one.name), cell(kinds_of[one.name]), cell(words[one.name]), default))
-    return table(["field", "type", "what it is", "unless given"], rows)
+    return table(["field", "type", "description", "default"], rows)
 
 
 def metrics() -> str:
-    """What each number means."""
+    """Return the page of metrics."""
     from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
     heads = ["name", "unit", "meaning"]
     page = (
-        "# Numbers\n\nEach is defined once, in `guiderail.tools.evaluation.metrics`, and computed from the "
-        "`EpisodeTrace`. `guiderail list metrics` prints them.\n\n## Of an episode\n\n"
+        "# Metrics\n\nEach metric is defined once, in `guiderail.tools.evaluation.metrics`, and computed from the "
+        "`EpisodeTrace`. `guiderail list metrics` prints them.\n\n## Episodes\n\n"
     )
     page += table(heads, [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
-    page += "## Of many episodes\n\nOf training, a study's table has them with `training_` before the name.\n\n"
+    page += "## Statistics of many episodes\n\nIn a study's table, those of training have the prefix `training_`.\n\n"
     return page + table(heads, [(code(m.name), cell(m.unit), cell(m.description)) for m in statistics_of().values()])
 
 
 def errors() -> str:
-    """What is raised, and what the command ends with."""
+    """Return the page of exceptions and exit codes."""
     from guiderail.models.common.errors import InputError, RunsFailedError
     from guiderail.models.primitives import UnsolvableError
     from guiderail.systems import DivergedError, PolicyError
 
     page = (
-        "# Errors\n\n| the command ends with | when |\n|---|---|\n"
-        "| 0 | it did what was asked |\n"
-        "| 1 | runs of a study failed, a stress test found something wrong, or commands to a robot stopped coming |\n"
-        "| 2 | something given is wrong: one sentence, before anything moves or is written |\n"
-        "| 130 | it was stopped by Ctrl-C; what can go on says how |\n\n"
-        "In Python these are raised, and nothing else is meant to be caught:\n\n"
+        "# Errors\n\n| exit code | meaning |\n|---|---|\n"
+        "| 0 | success |\n"
+        "| 1 | runs of a study failed, a check failed, or commands to a robot stopped arriving |\n"
+        "| 2 | wrong input: one sentence, before anything moves or is written |\n"
+        "| 130 | interrupted by Ctrl-C |\n\n"
+        "Exceptions of the Python API:\n\n"
     )
     for error in (InputError, UnsolvableError, PolicyError, DivergedError, RunsFailedError):
         bases = ", ".join(base.__name__ for base in error.__bases__)
@@ -656,8 +662,8 @@ def errors() -> str:
 
 
 def examples() -> str:
-    """Every example, under the question that it answers."""
-    page = "# How do I …?\n\nEach answer is a file in `examples/` that the tests run as it stands.\n\n"
+    """Return the page of examples, each under its question."""
+    page = "# How do I …?\n\nEach answer is a file in `examples/` that the tests run.\n\n"
     for path in sorted((Path(__file__).parents[1] / "examples").glob("*.py")):
         source = path.read_text(encoding="utf-8")
         doc = ast.get_docstring(ast.parse(source)) or ""
@@ -668,7 +674,7 @@ def examples() -> str:
 
 
 def wiring() -> str:
-    """Each kind of guidance as it is built: systems, and every connection between them."""
+    """Return the page of guidance diagrams with all connections."""
     import numpy as np
     from pydrake.math import RigidTransform
 
@@ -682,25 +688,25 @@ def wiring() -> str:
     reference = ReferenceTrajectory(times, np.column_stack([times, times]), np.tile(0.01 * np.eye(2), (20, 1, 1)))
     walls = KeepOut([[5.0, 5.0]], [[6.0, 6.0]], box, margin=0.0)
     skill = PrimitiveConfig(reference, box, period, horizon=4, keep_out=walls)
-    shown = PriorKnowledge(period, demonstrations=skill, pose_size=2)
+    demonstrated = PriorKnowledge(period, demonstrations=skill, pose_size=2)
     template = PriorKnowledge(period, template=PlacedTemplate(load_template("grid_clamp"), {"hole": RigidTransform()}))
     page = (
-        "# Guidance as it is wired\n\nRead from the diagrams that `build_guidance` makes, here of demonstrations in a "
-        "plane and of the grid clamp's template. A diagram's own ports have no system before the dot. "
-        "[Systems](systems.md) has what each of them does.\n\n"
+        "# Guidance diagrams\n\nConnections in the diagrams of `build_guidance`, here with planar demonstrations "
+        "and with the grid clamp's template. A diagram's own ports have no system before the dot. "
+        "[Systems](systems.md) describes each system.\n\n"
     )
     for name in GUIDANCE.names():
         if not GUIDANCE.get(name).build.__module__.startswith("guiderail."):
             continue
-        known = template if not GUIDANCE.get(name).missing_requirements({"template"}) else shown
-        diagram = build_guidance(name, known)
+        prior = template if not GUIDANCE.get(name).missing_requirements({"template"}) else demonstrated
+        diagram = build_guidance(name, prior)
         page += f"## {name}\n\n{prose(inspect.getdoc(GUIDANCE.get(name).build) or '').split(chr(10) * 2)[0]}\n\n"
         page += table(["from", "to"], [(code(one), code(other)) for one, other in connections(diagram)])
     return page
 
 
 def connections(diagram: Any) -> list[tuple[str, str]]:
-    """Every connection of a diagram, from and to, as `system.port`."""
+    """Return every connection of a diagram, from and to, as `system.port`."""
     from pydrake.systems.framework import InputPortIndex, OutputPortIndex
 
     rows = []

@@ -1,4 +1,4 @@
-"""Equations as MathML: nothing to fetch, nothing to run in the browser."""
+"""Equations as MathML, which browsers show without scripts."""
 
 from xml.etree import ElementTree
 
@@ -11,11 +11,11 @@ ACCENTS = ("ˆ", "ˉ", "˜")
 
 
 def mathml(tex: str, block: bool) -> str:
-    """An equation; where a letter has an accent and an index, the index is beside it and not below."""
+    """Convert an equation; the index of an accented letter is a subscript, not below the letter."""
     try:
         text = tex2mathml(tex, as_block=block)
     except MathError as error:
-        raise ValueError(f"the equation {tex!r} can't be shown: {error}") from error
+        raise ValueError(f"the equation {tex!r} cannot be converted: {error}") from error
     ElementTree.register_namespace("", NAMESPACE)
     root = ElementTree.fromstring(text)
     for over in root.iter(f"{{{NAMESPACE}}}munderover"):
@@ -25,17 +25,17 @@ def mathml(tex: str, block: bool) -> str:
             over[:] = [ElementTree.Element(f"{{{NAMESPACE}}}mover"), index]
             over[0].extend([base, accent])
     for over in root.iter(f"{{{NAMESPACE}}}mover"):
-        over.attrib.pop("accent", None)  # a browser would draw it into a capital letter
+        over.attrib.pop("accent", None)  # browsers draw it into capital letters
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def visit_inline(translator, node):
-    """An equation in a line."""
+    """Write an inline equation."""
     translator.body.append(mathml(node.astext(), block=False))
     raise SkipNode
 
 
 def visit_block(translator, node):
-    """An equation by itself."""
+    """Write a displayed equation."""
     translator.body.append(f'<div class="equation">{mathml(node.astext(), block=True)}</div>')
     raise SkipNode
