@@ -34,7 +34,7 @@ AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+
 MODULI = (2e9, 1e10, 3e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
 SNAP_MODULI = (2e7, 5e7, 5e6)  # [Pa] of a body that has to give way
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded below the target, as little as seats the plug
-BESIDE = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # so far from its place a socket must stop the plug
+MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets of the socket at which it must block the plug [m]
 TIME_STEPS = (None, 0.005)  # [s] of the simulation: its own, and half of it where parts are too deep in each other
 FAST_ENOUGH = 4.0  # times real time, from which the other side is not tried
 BEARABLE = 2.0  # times real time, which is not given up to be less deep
@@ -224,7 +224,10 @@ def _make(
     say(f"symmetry: {len(same)} of 7 candidate rotations and reflections, {len(near)} more approximately on the rim")
     contact, push, aligned = _choose_contact(folder, parts, numbers, clearance, snapping, say)
     file = _task_file(parts, contact, push, numbers)
-    off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in BESIDE]
+    off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in MISALIGNMENTS]
+    say(
+        f"misaligned by 1.5 mm: {'seated, but must be blocked' if any(t.success for t in off) else 'blocked (as required)'}"
+    )
     penetration = max(trial.penetration for trial in (aligned, *off))
     succeeded, page = demonstrate(folder, file), folder / "preview.html"
     measured = {
@@ -276,7 +279,7 @@ def _choose_contact(
             if trial.success:
                 # Pressed on the rim it is deepest: there an edge meets an edge.
                 file = _task_file(parts, contact, push, numbers)
-                deepest = max(deepest, *(insert(folder, file, offset=one).penetration for one in BESIDE))
+                deepest = max(deepest, *(insert(folder, file, offset=one).penetration for one in MISALIGNMENTS))
             say(
                 f"{side} compliant, {len(contact.pieces)} convex pieces, {modulus:.0e} Pa"
                 f"{f', {1e3 * time_step:g} ms a step' if time_step else ''}: "
