@@ -1,4 +1,4 @@
-"""From a declaration to a diagram: the loop of station, guidance and observation, and whoever judges it."""
+"""Builders of the task diagram and the skill diagram from a task, its station and its guidance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
-from guiderail.diagrams.envs.env import RECORDED, SAID
+from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import Observation, affine
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
@@ -32,7 +32,7 @@ from guiderail.systems.episode_monitor import EpisodeMonitor
 from guiderail.systems.policy_system import PolicySystem
 from guiderail.systems.reward_system import RewardSystem
 
-HALF_TURN_MARGIN = 0.1  # [rad] what actions and contact turn a motion further by
+HALF_TURN_MARGIN = 0.1  # [rad] how much further actions and contact can turn a motion
 
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
@@ -43,8 +43,8 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
         station: Station, for its period and sizes.
 
     Raises:
-        InputError: if the reference trajectory has another clock than the station, or turns to where the station's
-            angles jump.
+        InputError: If the steps of the reference trajectory are not control periods, or it comes near an angle at which
+            the station's pose jumps.
     """
     provides = task.provides()
     skill = None
@@ -78,82 +78,92 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
 
 
 def _check_clock(times: np.ndarray, period: float) -> None:
-    """Refuses a reference trajectory whose steps (N,) [s] are not control periods: its clock counts these."""
+    """Refuse a reference trajectory whose steps are not control periods; `times` are (N,) [s]."""
     steps = np.diff(times)
     if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
         raise InputError(
             f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
-            f"{period:g} s: resample it, or the motion is of another speed than was demonstrated"
+            f"{period:g} s: resample it, or the motion has another speed than was demonstrated"
         )
 
 
 def _refuse_half_turns(means: np.ndarray) -> None:
-    """Refuses a motion (N, 6) that comes near an angle at which the station's pose jumps by a full turn."""
+    """Refuse a motion (N, 6) that comes near an angle at which the station's pose jumps by a full turn."""
     furthest = np.abs(means[:, 3:]).max(initial=0.0)
     if furthest > np.pi - HALF_TURN_MARGIN:
         raise InputError(
             f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and what this station measures jumps by a full "
-            f"turn at 180°: draw the target's frame turned, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
+            f"turn at 180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
         )
 
 
 class Signals:
-    """Ports by name, while a diagram is built; "last_x" is x held from the control step before."""
+    """Ports by name while a diagram is built; "last_x" is the value of x one control step earlier."""
 
     def __init__(self, builder: DiagramBuilder, period: float, ports: Mapping[str, OutputPort]):
-        """
+        """Construct the collection.
+
         Args:
-            builder: what holds a signal is added to it.
-            period: s, seconds between control steps.
-            ports: the signals that there are.
+            builder: Builder that holds are added to.
+            period: Control period [s].
+            ports: Ports by name.
         """
         self._builder, self._period, self._ports = builder, period, dict(ports)
 
     def add(self, ports: Mapping[str, OutputPort]) -> None:
-        """Adds further signals; of two of the same name the later one counts."""
+        """Add signals; a later one replaces an earlier one of the same name."""
         self._ports |= ports
 
-    def get(self, name: str, whose: str) -> OutputPort:
-        """The port of a signal.
+    def get(self, name: str, user: str) -> OutputPort:
+        """Return the port of a signal.
+
+        Args:
+            name: Name of the signal.
+            user: Part that uses it, for the message.
 
         Raises:
-            InputError: if there is none of that name.
+            InputError: If there is none of that name.
         """
         held = name.removeprefix("last_")
         if name not in self._ports and held != name and held in self._ports:
-            # A change over a control step is the difference of the two.
             port = self._ports[held]
             hold = self._builder.AddNamedSystem(name, ZeroOrderHold(self._period, port.size()))
             self._builder.Connect(port, hold.get_input_port())
             self._ports[name] = hold.get_output_port()
         if name not in self._ports:
             raise InputError(
-                f"{whose} needs the signal {name!r}, which nothing here has: {did_you_mean(name, self._ports)}"
+                f"{user} needs the signal {name!r}, which does not exist here: {did_you_mean(name, self._ports)}"
             )
         return self._ports[name]
 
-    def connect(self, system: Any, names: Mapping[str, int], whose: str) -> None:
-        """Connects a system's inputs, each named and sized as its signal.
+    def connect(self, system: Any, names: Mapping[str, int], user: str) -> None:
+        """Connect a system's inputs to the signals of the same names.
+
+        Args:
+            system: System with `get_signal_input_port`.
+            names: Size of each input by name.
+            user: Part that the system belongs to, for the message.
 
         Raises:
-            InputError: if a signal is missing or of another size.
+            InputError: If a signal is missing or has another size.
         """
         for name, size in names.items():
-            port = self.get(name, whose)
+            port = self.get(name, user)
             if port.size() != size:
-                raise InputError(f"{whose} takes the signal {name!r} as {size} numbers, and it has {port.size()}")
+                raise InputError(f"{user} takes the signal {name!r} as {size} numbers, and it has {port.size()}")
             self._builder.Connect(port, system.get_signal_input_port(name))
 
 
 class Loop:
-    """Station, guidance and what a policy sees, closed but for the policy itself.
+    """Station, guidance and observation, connected to a loop that only lacks the policy.
 
     Attributes:
-        builder: of the root diagram.
-        station, guidance: its subsystems of these names.
-        signals: what can be named by whoever judges.
-        space: of observations.
-        observation: the port with what a policy sees.
+        builder: Builder of the root diagram.
+        station: Subsystem "station".
+        guidance: Subsystem "guidance".
+        signals: Signals that rewards, terminations and observations can name.
+        space: Space of observations.
+        observation: Port of the observation.
     """
 
     def __init__(self, task: Task, station: Station, guidance: Diagram):
@@ -176,9 +186,9 @@ class Loop:
             image = add_camera(self.builder, station.scene_graph, query, "observation_camera", observed)
             width, height = observed.size
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
-        whose = f"the observation of {task.name}"
+        user = f"the observation of {task.name}"
         names = [one.signal for one in observed if one.signal not in ("time", "phase")]
-        ports = {name: self.signals.get(name, whose) for name in names}
+        ports = {name: self.signals.get(name, user) for name in names}
         duration = task.num_steps * station.control_period
         sizes = {name: port.size() for name, port in ports.items()}
         seen = Observation(observed, sizes, duration, task.clip, task.name)
@@ -191,17 +201,17 @@ class Loop:
 def build_task_diagram(
     task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None
 ) -> TaskDiagram:
-    """Wires a task: its loop, and reward and monitor beside it. The policy's `action` is an input.
+    """Wire a task: its loop, reward and episode monitor. The policy's `action` is an input.
 
     Args:
-        task: the declaration.
-        station: where it is done.
-        guidance: a diagram with the ports of `Guidance`.
-        render_mode: "rgb_array" exports the picture of the task's camera; a browser view is no part of it.
+        task: Task.
+        station: Station.
+        guidance: Diagram with the ports of `Guidance`.
+        render_mode: "rgb_array" exports the image of the task's camera; a browser view is not part of the diagram.
 
     Raises:
-        InputError: if a signal that the task names doesn't exist here, a port has the wrong size, or a reward term has
-            the name of something else.
+        InputError: If a signal that the task names does not exist, a port has the wrong size, or the name of a reward
+            term is reserved.
     """
     loop = Loop(task, station, guidance)
     builder, signals, period = loop.builder, loop.signals, station.control_period
@@ -211,7 +221,7 @@ def build_task_diagram(
     conditions = task.termination_terms()
     monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period, task.name))
     watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
-    signals.connect(monitor, watched, f"the end of an episode of {task.name}")
+    signals.connect(monitor, watched, f"the termination of {task.name}")
     signals.add({"termination": monitor.get_termination_output_port()})
 
     terms = task.reward_terms(guidance.GetInputPort("action").size())
@@ -238,15 +248,14 @@ def build_task_diagram(
         "command_timed_out": station.get_command_timed_out_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
-    taken = {*exported, *SAID, *RECORDED}
+    taken = {*exported, *INFO_KEYS, *RECORDED_SIGNALS}
     for name in reward.term_names:
         if name in taken:
             raise InputError(
-                f"no reward term of {task.name} can be called {name!r}, which means something else in every task: "
-                "give it another name"
+                f"no reward term of {task.name} can be called {name!r}, which is reserved: give it another name"
             )
         exported[name] = reward.get_term_output_port(name)
-    # What this guidance has beyond the contract, such as the state of a template.
+    # Outputs that only this guidance has, such as the state of a template.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
         builder.ExportOutput(port, name)
@@ -254,7 +263,7 @@ def build_task_diagram(
         _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
-    displaces = GUIDANCE.get(task.config.guidance).displaces  # what a symmetry of the task takes an action for
+    displaces = GUIDANCE.get(task.config.guidance).displaces  # a symmetry of the task assumes it
     return TaskDiagram(
         diagram=diagram,
         control_period=period,
@@ -272,15 +281,15 @@ def build_task_diagram(
 
 @dataclass(frozen=True)
 class SkillDiagram:
-    """A learned skill as a plain diagram, for a `Simulator`: observation → policy → guidance → station.
+    """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station.
 
     Attributes:
-        diagram: with subsystems of these names; exports pose, desired_pose, wrench, contact_force, held_action,
+        diagram: Diagram with subsystems of these names; exports pose, desired_pose, wrench, contact_force, held_action,
             constraint_violation and fallback.
-        control_period: s, seconds between control steps.
-        num_steps: control steps of an episode.
-        randomize: as in `TaskDiagram`: call it with the root context before `Simulator.Initialize`.
-        meshcat: where the diagram publishes to, if anywhere.
+        control_period: Control period [s].
+        num_steps: Control steps of an episode.
+        randomize: As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
+        meshcat: Page that the diagram publishes to, if there is one.
     """
 
     diagram: Diagram
@@ -298,17 +307,18 @@ def build_skill_diagram(
     *,
     render_mode: str | None = None,
 ) -> SkillDiagram:
-    """Wires a learned skill, without whatever judges it.
+    """Wire a learned skill, without reward and episode monitor.
 
     Args:
-        task: what it is a skill of.
-        station, guidance: as for `build_task_diagram`.
-        policy: from an observation to an action, called at every `action_repeat` control periods by a `PolicySystem`; or any
-            system with an input `observation` and an output `action`.
-        render_mode: None, or "human" for a view in the browser.
+        task: Task that the skill was learned on.
+        station: Station.
+        guidance: Diagram with the ports of `Guidance`.
+        policy: Function from an observation to an action, which a `PolicySystem` calls every `action_repeat` control
+            periods; or system with an input `observation` and an output `action`.
+        render_mode: None, or "human" for a browser view.
 
     Raises:
-        InputError: as `build_task_diagram`, or if the policy's ports have other sizes.
+        InputError: As `build_task_diagram`, or if the sizes of the policy's ports do not match.
     """
     loop = Loop(task, station, guidance)
     builder, action = loop.builder, guidance.GetInputPort("action")
@@ -320,7 +330,7 @@ def build_skill_diagram(
     seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
     if seen.size() != loop.observation.size() or acts.size() != action.size():
         raise InputError(
-            f"a policy of {task.name} sees {loop.observation.size()} numbers and gives {action.size()}, "
+            f"a policy of {task.name} takes {loop.observation.size()} numbers and returns {action.size()}, "
             f"this one {seen.size()} and {acts.size()}: it was trained with other options"
         )
     builder.Connect(loop.observation, seen)
@@ -345,7 +355,7 @@ def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
 
 
 def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
-    """Judges commanded and measured poses by the task's own constraints; where it has none, guidance judges."""
+    """Add the violations of the task's constraints; without any, those that guidance computes are used."""
     constraints = task.constraints()
     poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
     poses["measured_violation"] = station.get_pose_output_port()
@@ -364,7 +374,7 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
 
 
 def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
-    """What draws an episode's conditions and writes them into the root context: `TaskDiagram.randomize`."""
+    """Return `TaskDiagram.randomize`: it samples an episode's conditions and writes them into the root context."""
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         drawn = task.reset(
@@ -372,12 +382,11 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
         )
         if not isinstance(drawn, Mapping):
             raise InputError(
-                f"reset of {task.name} returns what it drew by name, {{}} where it drew nothing, not {brief(drawn)}"
+                f"reset of {task.name} must return the sampled values by name, {{}} if none, not {brief(drawn)}"
             )
-        if taken := [name for name in drawn if name in SAID]:
+        if taken := [name for name in drawn if name in INFO_KEYS]:
             raise InputError(
-                f"reset of {task.name} can call nothing that it drew {taken[0]!r}, which info says of every task: "
-                "give it another name"
+                f"reset of {task.name} returns a value named {taken[0]!r}, which is reserved: give it another name"
             )
         return {**drawn, **station.disturb(context, rng)}
 
@@ -393,14 +402,13 @@ def _push(station: Station) -> Any:
 
 
 def _add_picture(builder: DiagramBuilder, task: Task, station: Station) -> None:
-    """Adds the task's camera, whose image is exported."""
+    """Add the task's camera and export its image."""
     camera = task.camera()
     if camera is None:
         raise InputError(
-            f"{task.name} has no camera that could take a picture: leave out what asks for one "
-            "(--picture, render_mode='rgb_array'), or write its camera()"
+            f"{task.name} has no camera: leave out render_mode='rgb_array' or --image, or write its camera()"
         )
     picture = add_camera(
-        builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera, for_people=True
+        builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera, is_picture=True
     )
     builder.ExportOutput(picture, "rgb_image")

@@ -1,4 +1,4 @@
-"""Cameras for image observations and for people, and the browser view."""
+"""Cameras for image observations and for pictures, and the browser view."""
 
 import ctypes
 import logging
@@ -29,30 +29,30 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from guiderail.models.common.errors import InputError
 
-_RENDERER, _FOR_PEOPLE = "vtk", "vtk_for_people"
-PUBLISH_PERIOD = 1 / 50  # s, between two pictures of a browser view
+_OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_for_people"
+PUBLISH_PERIOD = 1 / 50  # period of a browser view [s]
 
 
-# What policies see is lit from the camera, as Drake does unless told otherwise. People see edges better where light
-# comes from above too, and a page is white.
+# Observations have Drake's default light, from the camera. In pictures, light from above shows edges better, and the
+# background is white as a page.
 _LIGHTS = [
     LightParameter(type="directional", frame="camera", direction=[0.3, 0.2, 1.0], intensity=0.7),
     LightParameter(type="directional", frame="world", direction=[-0.2, 0.3, -1.0], intensity=0.5),
 ]
 _PARAMETERS = {
-    _RENDERER: RenderEngineVtkParams(),
-    _FOR_PEOPLE: RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=_LIGHTS),
+    _OBSERVATION_RENDERER: RenderEngineVtkParams(),
+    _PICTURE_RENDERER: RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=_LIGHTS),
 }
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A fixed camera.
+    """Fixed camera.
 
     Attributes:
-        size: width and height of its image, in pixels.
-        vertical_fov: its vertical field of view [rad].
-        X_WC: where it is; C has x to the right, y down and z into the picture.
+        size: Width and height of its image [pixels].
+        vertical_fov: Vertical field of view [rad].
+        X_WC: Pose of the camera; C has x to the right, y down and z into the picture.
     """
 
     size: tuple[int, int]
@@ -60,14 +60,14 @@ class Camera:
     X_WC: RigidTransform
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Where points (n, 3) of the world are in its image: (n, 2), pixels from its upper left corner."""
+        """Return the pixels, (n, 2) from the upper left corner, of points (n, 3) in the world."""
         p_C = self.X_WC.inverse() @ np.asarray(points, float).T
         focal = 0.5 * self.size[1] / np.tan(0.5 * self.vertical_fov)
         return (focal * p_C[:2] / p_C[2]).T + 0.5 * np.array(self.size)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
-    """The pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), the horizon level."""
+    """Return the pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), with a level horizon."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -75,7 +75,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
 
 
 def look_from_front(target: np.ndarray, distance: float, height: float) -> RigidTransform:
-    """A camera X_WC that looks slightly down at `target` from the side that faces away from the arm."""
+    """Return the pose X_WC of a camera that looks slightly down at `target` (3,) from the side away from the arm."""
     return look_at(target + np.array([0.8 * distance, -0.6 * distance, height]), target)
 
 
@@ -86,19 +86,27 @@ def add_camera(
     name: str,
     camera: Camera,
     *,
-    for_people: bool = False,
+    is_picture: bool = False,
 ) -> OutputPort:
-    """Adds a camera and returns its colour image, an `ImageRgba8U`; `for_people` lights it for them, and not a policy.
+    """Add a camera and return the port of its colour image, an `ImageRgba8U`.
+
+    Args:
+        builder: Builder of the root diagram.
+        scene_graph: Scene graph.
+        query: Query port of the scene.
+        name: Name of the camera's system.
+        camera: Camera.
+        is_picture: Light the scene for a picture instead of an observation.
 
     Raises:
-        InputError: if this machine lacks the library that renders without a display.
+        InputError: If this machine lacks the library that renders without a display.
     """
     check_rendering()
-    # Mesa renders with an LLVM, and Triton, which PyTorch with CUDA brings, has another one: loaded second, that of
-    # Triton ends the process in a segmentation fault, as it would when PyTorch imports its compiler after a render.
+    # Mesa renders with one LLVM, and Triton, a dependency of PyTorch with CUDA, has another: if Triton's is loaded
+    # second, the process ends in a segmentation fault. PyTorch imports Triton with its compiler.
     with suppress(ImportError):
         import_module("triton")
-    renderer = _FOR_PEOPLE if for_people else _RENDERER
+    renderer = _PICTURE_RENDERER if is_picture else _OBSERVATION_RENDERER
     if not scene_graph.HasRenderer(renderer):
         scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(_PARAMETERS[renderer]))
     clipping = ClippingRange(0.01, 10.0)
@@ -116,10 +124,10 @@ def add_camera(
 
 
 def check_rendering() -> None:
-    """Refuses to render where EGL is missing, before Drake would end the process over it.
+    """Refuse to render if EGL is missing; Drake would abort the process.
 
     Raises:
-        InputError: naming the package to install.
+        InputError: If EGL is missing; the message names the package to install.
     """
     try:
         ctypes.CDLL("libEGL.so.1")
@@ -131,13 +139,13 @@ def check_rendering() -> None:
 
 
 def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
-    """A browser view, on this machine only: Meshcat would listen on every interface by default.
+    """Open a browser view on localhost; Meshcat would listen on every interface by default.
 
     Args:
-        meshcat: a page that is there already; a new one unless given.
+        meshcat: Existing page; default: a new one.
 
     Raises:
-        InputError: if the environment forbids Drake to open a port at all.
+        InputError: If the environment forbids Drake to open a network port.
     """
     try:
         meshcat = meshcat or Meshcat(MeshcatParams(host="localhost"))
@@ -151,10 +159,10 @@ def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisual
 
 
 def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> Meshcat:
-    """Adds a browser view to a diagram, with which it stays.
+    """Add a browser view to a diagram and return its page.
 
     Raises:
-        InputError: as `open_meshcat`.
+        InputError: As `open_meshcat`.
     """
     meshcat, visualizer = open_meshcat()
     builder.AddNamedSystem("meshcat", visualizer)

@@ -54,7 +54,7 @@ class EnvConfig:
     def resolve(cls, task: str, options: Mapping[str, Any] | None = None) -> EnvConfig:
         """Validate the options of a task's environment and fill in the defaults.
 
-        The same options are resolved once in a process. Resolving the `options` of a configuration returns an equal one.
+        The same options are resolved once in a process. The `options` of a configuration resolve to an equal one.
 
         Args:
             task: Name of the task, or path of a task folder.

@@ -19,7 +19,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.policy_system import PolicyError
 
-RECORDED = (
+RECORDED_SIGNALS = (
     "commanded_violation",
     "measured_violation",
     "wrench",
@@ -29,9 +29,9 @@ RECORDED = (
     "fallback",
     "state",
 )
-"""Ports whose values the trace has for every control step, where a task's diagram has them."""
+"""Ports whose values the trace records in every control step, if a task's diagram has them."""
 
-SAID = (
+INFO_KEYS = (
     "is_success",
     "termination",
     "constraint_violation",
@@ -41,11 +41,11 @@ SAID = (
     "control_steps",
     "simulation_failure",
 )
-"""What `info` says of every task: no reward term and nothing that a reset draws can have one of these names."""
+"""Keys of `info` in every task; no reward term and no value that a reset samples can have one of these names."""
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
-# What Drake, or a system with another engine, says when the physics, and not the wiring, went wrong. Drake's own
+# Messages of Drake, or of a system with another engine, when the physics failed and not the wiring. Drake's own
 # assertions arrive in Python as SystemExit.
 _SIMULATION_FAILURE = re.compile(
     r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE
@@ -53,27 +53,27 @@ _SIMULATION_FAILURE = re.compile(
 
 
 class GuidedEnv(DrakeGymEnv):
-    """Runs a `TaskDiagram` as a Gymnasium environment that can be trusted with a reset.
+    """Gymnasium environment that runs a `TaskDiagram`.
 
     It keeps `DrakeGymEnv`'s interface and replaces its `reset` and `step`. The diagram is built once. A reset restores
-    the context to how it was built, lets the task randomize it from `self.np_random`, writes the neutral action and
-    initializes. A step checks the action before anything moves, advances `action_repeat` control steps by an integer count, and
-    reads every port at the end of each of them, before the events of that instant.
+    the default context, lets the task randomize it from `self.np_random`, writes the neutral action and initializes. A
+    step checks the action before anything moves, advances `action_repeat` control steps by an integer count, and reads
+    every port at the end of each of them, before the events of that instant.
 
-    `info` has at every step, and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
-    `constraint_violation` and `measured_violation` (the worst of the step; negative is slack), `contact_force` (the
-    largest of the step, N), `fallback` (whether guidance fell back to something safe in it), every reward term by name
-    (summed over the step), and `control_steps` since the reset. A reset's `info` also has what the task drew.
+    `info` has, at every step and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
+    `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `contact_force` (maximum of
+    the step [N]), `fallback` (True if guidance fell back to a safe command), every reward term by name (summed over the
+    step), and `control_steps` since the reset. The `info` of a reset also has the values that the task sampled.
 
-    An episode that lasts as long as the task allows is truncated with `termination` "time_limit". Where the simulation
-    itself fails (a solver that doesn't converge, NaN), the episode is truncated with the last sound observation, and
-    `info["simulation_failure"]` says what Drake said; every other error is a bug and propagates.
+    An episode that reaches the task's number of control steps is truncated with `termination` "time_limit". If the
+    simulation fails (a solver that does not converge, NaN), the episode is truncated with the last valid observation,
+    and `info["simulation_failure"]` is Drake's message; every other error is a bug and propagates.
 
     Attributes:
-        task: the `TaskDiagram`.
-        hold: control steps for which an action is held.
-        trace: the `EpisodeTrace` of the current episode.
-        drawn: what the task drew for it.
+        task: The `TaskDiagram`.
+        action_repeat: Control steps per action.
+        trace: `EpisodeTrace` of the current episode.
+        drawn: Values that the task sampled for it.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
@@ -86,26 +86,25 @@ class GuidedEnv(DrakeGymEnv):
         render_mode: str | None = None,
         release: Callable[[], None] | None = None,
     ):
-        """
+        """Construct the environment.
+
         Args:
-            task: what to run.
-            hold: control steps per decision, at least 1.
-            render_mode: None, "human" (Meshcat) or "rgb_array" (a camera).
-            release: called once, when the environment is closed or nobody has it any more.
+            task: Task diagram to run.
+            action_repeat: Control steps per action, at least 1.
+            render_mode: None, "human" (Meshcat) or "rgb_array" (camera).
+            release: Function that is called once, when the environment is closed or garbage-collected.
 
         Raises:
-            InputError: if `action_repeat` is no positive integer, or the task can't be rendered that way.
+            InputError: If `action_repeat` is not a positive integer, or the task cannot be rendered in this mode.
         """
         if isinstance(action_repeat, bool) or not isinstance(action_repeat, int | np.integer) or action_repeat < 1:
-            raise InputError(
-                f"action_repeat is the number of control steps of an action: give an integer from 1, not {action_repeat}"
-            )
+            raise InputError(f"action_repeat is the number of control steps of an action, from 1, not {action_repeat}")
         diagram = task.diagram
         _check_view(task, render_mode)
         view = None if render_mode != "human" or task.query is None else View(task.query)
         self.task = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
-        # The parent class writes into whatever `metadata` it finds; this one is our own, not every environment's.
+        # The parent class writes into `metadata`: an instance of our own keeps that from all other environments.
         self.metadata = {
             "render_modes": ["human", "rgb_array"],
             "render_fps": round(1 / (action_repeat * task.control_period)),
@@ -134,7 +133,8 @@ class GuidedEnv(DrakeGymEnv):
         self._reward_port = diagram.GetOutputPort("reward")
         self._term_ports = [(name, diagram.GetOutputPort(name)) for name in task.reward_terms]
         self._termination_port = diagram.GetOutputPort("termination")
-        self._recorded = [(name, diagram.GetOutputPort(name)) for name in RECORDED if diagram.HasOutputPort(name)]
+        recorded = filter(diagram.HasOutputPort, RECORDED_SIGNALS)
+        self._recorded = [(name, diagram.GetOutputPort(name)) for name in recorded]
         self._force_port = diagram.GetOutputPort("contact_force")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._pose_port = diagram.GetOutputPort("pose")
@@ -146,30 +146,30 @@ class GuidedEnv(DrakeGymEnv):
         self._observation: np.ndarray | None = None
         self._violations = (-np.inf, -np.inf)
         self._closed = False
-        self._release = weakref.finalize(self, release or _nothing)
+        self._release = weakref.finalize(self, release or _do_nothing)
         self._release.atexit = False
 
     def close(self) -> None:
-        """Ends the environment and its view; what it recorded stays."""
+        """Close the environment and its view; the trace stays readable."""
         self._running, self._closed = False, True
         self.simulator.clear_monitor()
         self.task = replace(self.task, view=None)
         self._release()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """A simulation in progress is not to be copied."""
-        made = "gymnasium.make" if self.spec is None else f"gymnasium.make({self.spec.id!r}, ...)"
-        raise InputError(f"an environment holds a simulation and cannot be pickled: call {made} in the worker instead")
+        """Refuse to copy a simulation in progress."""
+        call = "gymnasium.make" if self.spec is None else f"gymnasium.make({self.spec.id!r}, ...)"
+        raise InputError(f"an environment holds a simulation and cannot be pickled: call {call} in the worker instead")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode.
+        """Start an episode.
 
         Args:
-            seed: of everything that the episodes from here on draw; what was drawn before goes on unless given.
-            options: the task's own, by name (its `Reset`).
+            seed: Seed of this and all later episodes; default: continue the random stream.
+            options: Options of the task's `Reset` by name.
 
         Raises:
-            InputError: for an option that the task doesn't have, a value out of range, or a closed environment.
+            InputError: If an option is unknown, a value is out of range, or the environment is closed.
         """
         if self._closed:
             raise InputError("the environment is closed: make another one")
@@ -177,7 +177,7 @@ class GuidedEnv(DrakeGymEnv):
             raise InputError(
                 f"the options of a reset are values by name, such as {{'held_out': True}}, not {brief(options)}"
             )
-        # Not the parent's reset: it initializes before the state is set, and refuses options.
+        # The parent's reset initializes before the state is set, and refuses options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
         context = self.simulator.get_mutable_context()
@@ -185,10 +185,10 @@ class GuidedEnv(DrakeGymEnv):
         self._action_value.GetMutableData().set_value(self._neutral)
         self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
         self.simulator.Initialize()
-        return self._begun()
+        return self._begin_episode()
 
-    def _begun(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """What a reset returns, with an initialized simulator."""
+    def _begin_episode(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the result of a reset; the simulator is initialized."""
         context = self.simulator.get_context()
         self._control_steps = 0
         self.trace.clear()
@@ -201,13 +201,13 @@ class GuidedEnv(DrakeGymEnv):
         return self._observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Holds `action` for `action_repeat` control steps, or until the episode ends.
+        """Apply `action` for `action_repeat` control steps, or until the episode ends.
 
         Raises:
-            InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped. If
-                a term of the reward or the observation is not finite where the simulation itself went well.
+            InputError: If the action is not finite or has the wrong shape; a finite one outside [-1, 1] is clipped. If
+                a reward term or the observation is not finite although the simulation did not fail.
         """
-        action = self._checked(action)
+        action = self._check_action(action)
         if not self._running:
             raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() first")
         simulator = self.simulator
@@ -227,7 +227,7 @@ class GuidedEnv(DrakeGymEnv):
                 if not np.isfinite(pose).all():
                     failure = "the measured pose is not finite"
             except PolicyError:
-                raise  # a policy inside the diagram, and not the simulation
+                raise  # a policy inside the diagram failed, not the simulation
             except (RuntimeError, SystemExit) as error:
                 if not _SIMULATION_FAILURE.search(str(error)):
                     raise
@@ -255,7 +255,7 @@ class GuidedEnv(DrakeGymEnv):
         if truncated and failure is None:
             termination = _TIME_LIMIT
         if self._control_steps == first_step:
-            # It failed before there was anything new to read.
+            # The simulation failed before the first control step ended.
             commanded_violation, measured_violation = self._violations
         self._violations = commanded_violation, measured_violation
         info = self._info(termination, commanded_violation, measured_violation, peak_force, fallback, terms)
@@ -267,11 +267,11 @@ class GuidedEnv(DrakeGymEnv):
         return self._observation, total, terminated, truncated, info
 
     def _advance(self) -> None:
-        """One control step. By an integer count: a sum of periods would drift across the plant's steps."""
+        """Advance one control step, by an integer count: a sum of periods would drift across the plant's steps."""
         self.simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
 
     def render(self) -> Any:
-        """An (h, w, 3) image of uint8 for "rgb_array"; publishes to Meshcat for "human"."""
+        """Return an (h, w, 3) image of uint8 for "rgb_array"; publish to Meshcat for "human"."""
         if self.render_mode is None:
             gymnasium.logger.warn("nothing to render: make the environment with render_mode='human' or 'rgb_array'")
             return None
@@ -282,13 +282,13 @@ class GuidedEnv(DrakeGymEnv):
         return None
 
     def push(self, displacement: np.ndarray) -> None:
-        """Moves the robot, as a person would who pushes it between two control steps.
+        """Displace the robot, as an operator who pushes it between two control steps.
 
         Args:
-            displacement: (O,), in the units of a pose.
+            displacement: Displacement of the pose, (O,).
 
         Raises:
-            InputError: if the task has no robot that can be pushed, or these are not O finite numbers.
+            InputError: If the task's robot cannot be pushed, or `displacement` is not O finite numbers.
         """
         if self.task.push is None:
             raise InputError("this task has no robot that can be pushed")
@@ -297,7 +297,7 @@ class GuidedEnv(DrakeGymEnv):
             raise InputError(f"a push is {self._pose_port.size()} finite numbers, not {displacement}")
         self.task.push(self.simulator.get_mutable_context(), displacement)
 
-    def _checked(self, action: Any) -> np.ndarray:
+    def _check_action(self, action: Any) -> np.ndarray:
         try:
             if np.iscomplexobj(action):
                 raise TypeError
@@ -314,7 +314,7 @@ class GuidedEnv(DrakeGymEnv):
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
         observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
-        # A learner that takes this in diverges, and is blamed for it episodes later.
+        # A learner would diverge on it episodes later.
         if not np.isfinite(observation).all():
             of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
@@ -341,15 +341,15 @@ class GuidedEnv(DrakeGymEnv):
         }
 
 
-def _nothing() -> None:
-    """Nobody waits for the environment's diagram."""
+def _do_nothing() -> None:
+    """Release nothing."""
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Refuses a word that is no render mode, before anything is built.
+    """Refuse an unknown render mode.
 
     Raises:
-        InputError: naming those that there are.
+        InputError: If `render_mode` is not None, "human" or "rgb_array".
     """
     if render_mode not in (None, "human", "rgb_array"):
         raise InputError(f"there is no render mode '{render_mode}': use None, 'human' or 'rgb_array'")

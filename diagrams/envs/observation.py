@@ -1,4 +1,4 @@
-"""What a policy sees, as a diagram: signals one after the other, each centred, scaled and clipped."""
+"""Observation of a policy as a diagram: signals one after the other, each centred, scaled and clipped."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from pydrake.trajectories import PiecewisePolynomial
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
-"""Signals that an observation has by itself: seconds since the episode began, and the same from −1 to 1."""
+"""Signals that every observation can have: time since the episode began [s], and the same from −1 to 1."""
 
 
 @dataclass(frozen=True)
 class ObservationTerm:
-    """A signal that a policy sees, as (value − centre) / scale.
+    """Signal in an observation, as (value − centre) / scale.
 
     Attributes:
-        signal: its name: a port of station, guidance or task, or one of `CLOCKS`.
-        centre, scale: finite numbers, or one per entry (n,), in the signal's unit; the scale is not 0.
-        entries: which of the signal's numbers; all unless given.
+        signal: Name of a port of station, guidance or task, or one of `CLOCKS`.
+        centre: Finite number, or one per entry (n,), in the signal's unit.
+        scale: Finite number, or one per entry (n,), in the signal's unit; not 0.
+        entries: Indices of the signal's numbers; default: all.
     """
 
     signal: str
@@ -34,33 +35,34 @@ class ObservationTerm:
 
 
 class Observation(Diagram):
-    """Signals to an observation.
+    """Diagram from signals to an observation.
 
     .. pydrake_system::
 
         name: Observation
         input_ports:
-        - one per signal that is no clock
+        - one per signal that is not a clock
         output_ports:
         - observation
 
-    ``observation`` is (n,), its entries in the order in which they are listed, clipped to ± the clip.
+    ``observation`` is (n,), its entries in the order of the terms, clipped to ± the clip.
     """
 
     def __init__(
         self, observed: Sequence[ObservationTerm], sizes: Mapping[str, int], duration: float, clip: float, of: str = ""
     ):
-        """
+        """Construct the diagram.
+
         Args:
-            observed: what is seen, at least one.
-            sizes: of the signals by name.
-            duration: of an episode [s].
-            clip: the largest number that is seen, positive.
-            of: whose observation it is, for sentences.
+            observed: Terms of the observation, at least one.
+            sizes: Sizes of the signals by name.
+            duration: Duration of an episode [s].
+            clip: Largest absolute value, positive.
+            of: Name of the task, for messages.
 
         Raises:
-            InputError: if nothing is seen, an entry is none of its signal's, or a centre or a scale would make no
-                finite number of a finite signal.
+            InputError: If there is no entry, an index is out of range, or a centre or a scale would not map finite
+                signals to finite numbers.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -69,7 +71,7 @@ class Observation(Diagram):
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
             raise InputError(
-                f"the observation{f' of {of}' if of else ''} is of nothing: let observation_terms() list a signal"
+                f"the observation{f' of {of}' if of else ''} is empty: let observation_terms() list a signal"
             )
         together = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
         exported: set[str] = set()
@@ -95,16 +97,16 @@ class Observation(Diagram):
 
     @property
     def signals(self) -> list[str]:
-        """The names of the input ports."""
+        """Names of the input ports."""
         return [self.get_input_port(index).get_name() for index in range(self.num_input_ports())]
 
     def get_observation_output_port(self) -> OutputPort:
-        """What a policy sees, (n,)."""
+        """Return the port of the observation, (n,)."""
         return self.GetOutputPort("observation")
 
 
 def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:
-    """y = D u + y0, evaluated in C++."""
+    """Return the system y = D u + y0, which is evaluated in C++."""
     outputs, inputs = D.shape
     return AffineSystem(
         A=np.zeros((0, 0)), B=np.zeros((0, inputs)), f0=np.zeros(0), C=np.zeros((outputs, 0)), D=D, y0=np.asarray(y0)
@@ -118,7 +120,7 @@ def _add_clock(builder: DiagramBuilder, name: str, duration: float) -> OutputPor
 
 
 def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which entries (n, size), their centres (n,) and scales (n,)."""
+    """Return the selection of entries (n, size), their centres (n,) and scales (n,)."""
     try:
         selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
         if selection.ndim != 2:
@@ -139,7 +141,7 @@ def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndar
 
 
 def _numbers(one: ObservationTerm, name: str, number: int, of: str) -> np.ndarray:
-    """The centre or the scale of each entry, (n,)."""
+    """Return the centre or the scale of each entry, (n,)."""
     given = getattr(one, name)
     try:
         numbers = np.broadcast_to(given, number).astype(float)

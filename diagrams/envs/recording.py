@@ -1,4 +1,4 @@
-"""A station that is driven along a given motion and recorded: for demonstrations, benchmarks and tests of physics."""
+"""Station that is driven along a given motion and recorded, for demonstrations, benchmarks and tests of physics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """A station whose commands come from anything with a (6,) output, are held for a control period, and recorded."""
+    """Station whose commands come from a system with a (6,) output, are held for a control period, and recorded."""
 
     def __init__(
         self,
@@ -27,13 +27,14 @@ class DrivenStation:
         num_samples: int,
         add_to_builder: Callable[[DiagramBuilder, Station], None] | None = None,
     ):
-        """
+        """Construct the diagram and its simulator.
+
         Args:
-            station: what is driven; it becomes part of this diagram.
-            source: a system whose first output is the desired pose: a trajectory, a person's input device, a policy.
-            num_samples: how many control periods the recorder has room for.
-            add_to_builder: called with the builder and the station before the diagram is built, to add a camera or a
-                visualizer.
+            station: Station; it becomes part of the diagram.
+            source: System whose first output is the desired pose, such as a trajectory, an input device or a policy.
+            num_samples: Largest number of control periods to record.
+            add_to_builder: Function of the builder and the station that is called before the diagram is built, to add
+                a camera or a visualizer.
         """
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
@@ -53,21 +54,21 @@ class DrivenStation:
 
     @property
     def context(self) -> Context:
-        """The root context."""
+        """Root context."""
         return self.simulator.get_mutable_context()
 
     @property
     def plant_context(self) -> Context:
-        """The plant's context."""
+        """Context of the plant."""
         return self.station.plant.GetMyMutableContextFromRoot(self.context)
 
     def start(self, pose: np.ndarray) -> None:
-        """Puts the tool centre at rest at `pose`, (6,); call it before `run`."""
+        """Put the tool centre at rest at `pose`, (6,), and initialize; call it before `run`."""
         self.station.set_pose(self.context, pose)
         self.simulator.Initialize()
 
     def run(self, num_steps: int | None = None) -> Recording:
-        """Advances by control periods, all there is room for unless given, and returns what was recorded."""
+        """Advance `num_steps` control periods, by default all that can be recorded, and return the recording."""
         recorder_context = self.recorder.GetMyContextFromRoot(self.context)
         done = int(self.recorder.get_num_recorded_output_port().Eval(recorder_context)[0])
         last = self._num_samples if num_steps is None else done + num_steps
@@ -77,14 +78,21 @@ class DrivenStation:
 
 
 def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
-    """Straight lines between `poses` (N, 6) at `times` (N,), and at rest thereafter."""
+    """Return straight lines between `poses` (N, 6) at `times` (N,), which end at rest."""
     return TrajectorySource(PiecewisePolynomial.FirstOrderHold(np.asarray(times), np.asarray(poses).T))
 
 
 def drive_along(
     station: Station, times: np.ndarray, poses: np.ndarray, prepare: Callable[[Any, Any], None] | None = None
 ) -> tuple[DrivenStation, Recording]:
-    """Drives a station from the first pose to the last; `prepare` is called with the plant and its context before."""
+    """Drive a station along poses and return it with the recording.
+
+    Args:
+        station: Station.
+        times: Times of the poses, (N,) [s].
+        poses: Poses, (N, 6).
+        prepare: Function of the plant and its context that is called before the start.
+    """
     times, poses = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     if prepare is not None:

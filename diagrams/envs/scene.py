@@ -1,4 +1,4 @@
-"""How a task is drawn: what belongs into a picture besides the robot, and where to look from."""
+"""Drawing of a task: the browser view, viewpoints, and the lines that a picture shows besides the robot."""
 
 from __future__ import annotations
 
@@ -15,43 +15,44 @@ from guiderail.diagrams.envs.cameras import PUBLISH_PERIOD, open_meshcat
 
 
 class View:
-    """Publishes a scene from beside the diagram that simulates it.
+    """Browser view that publishes a scene from outside of the diagram that simulates it.
 
-    A diagram with Python in it is never freed, and whatever publishes from inside it would keep its port, its thread
-    and its descriptors as long. A view is nobody's subsystem: they are given back when nobody has it any more.
+    A diagram with Python in it is never freed, and a publisher inside it would keep its network port, thread and file
+    descriptors as long. A view is not a subsystem, so that they are released with it.
 
     Attributes:
-        meshcat: the page.
+        meshcat: Meshcat page.
     """
 
     meshcat: Meshcat
 
     def __init__(self, query: OutputPort, meshcat: Meshcat | None = None):
-        """
+        """Open the view.
+
         Args:
-            query: of a scene graph inside a diagram.
-            meshcat: a page that is there already; a new one unless given.
+            query: Query port of a scene graph inside a diagram.
+            meshcat: Existing page; default: a new one.
 
         Raises:
-            InputError: if the environment forbids Drake to open a port at all.
+            InputError: If the environment forbids Drake to open a network port.
         """
         self._query = query
         visualizer: MeshcatVisualizer
         self.meshcat, visualizer = open_meshcat(meshcat)
         self._visualizer = visualizer
         self._context = visualizer.CreateDefaultContext()
-        self._published = -1.0  # s, when it was last
+        self._published = -1.0  # time of the last publication [s]
 
     def follow(self, context: Context) -> EventStatus:
-        """Publishes often enough for the eye; a `Simulator`'s monitor, called with the root context."""
+        """Publish at `PUBLISH_PERIOD`; a monitor for `Simulator`, called with the root context."""
         elapsed = context.get_time() - self._published
-        # The clock of an episode begins anew; steps of the simulation are far longer than what rounding makes of them.
+        # The time of a new episode restarts at zero. The tolerance covers rounding, far below a simulation step.
         if elapsed < 0 or elapsed > PUBLISH_PERIOD - 1e-6:
             self.publish(context)
         return EventStatus.DidNothing()
 
     def publish(self, context: Context) -> None:
-        """Shows what a root context says."""
+        """Publish the scene of a root context."""
         self._published = context.get_time()
         self._context.SetTime(self._published)
         scene = self._query.Eval(self._query.get_system().GetMyContextFromRoot(context))
@@ -60,7 +61,7 @@ class View:
 
 
 Viewpoint = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Where to look from, and where to look at, in the world [m]."""
+"""Positions of eye and target in the world [m]."""
 
 ARM_VIEW: Viewpoint = ((1.05, -0.75, 0.55), (0.42, 0.0, 0.32))
 TOOL_VIEW: Viewpoint = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
@@ -68,15 +69,15 @@ TOOL_VIEW: Viewpoint = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 
 @dataclass(frozen=True)
 class Scene:
-    """How a task is drawn.
+    """Drawing of a task.
 
     Attributes:
-        to_world: takes poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
-        demonstrations: poses (N, O) of each demonstration.
-        constraint: corner points (k, 3) of each line that bounds what is allowed.
-        viewpoint: where a page looks from.
-        arm_views: the same where a whole arm does it, by name; a page opens with the first and offers them all.
-        line_radius: how thick a path is drawn [m].
+        to_world: Function from poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
+        demonstrations: Poses (N, O) of each demonstration.
+        constraint: Corner points (k, 3) of each line that bounds the allowed region [m].
+        viewpoint: Viewpoint of a page.
+        arm_views: Viewpoints of a page with a whole arm, by name; the page opens with the first and offers all.
+        line_radius: Radius of a drawn path [m].
     """
 
     to_world: Callable[[np.ndarray], np.ndarray]
@@ -88,7 +89,7 @@ class Scene:
 
 
 def in_plane(poses: np.ndarray) -> np.ndarray:
-    """Points (n, 3): (x, y) at height zero, or the position of a pose of six numbers."""
+    """Return points (n, 3) of poses: (x, y) at height zero, or the position of six numbers."""
     poses = np.asarray(poses)
     if poses.shape[1] >= 3:
         return poses[:, :3]
@@ -96,17 +97,25 @@ def in_plane(poses: np.ndarray) -> np.ndarray:
 
 
 def in_frame(X_WT: RigidTransform) -> Callable[[np.ndarray], np.ndarray]:
-    """Takes poses (n, 6) that are given in T to points (n, 3) in the world."""
+    """Return a function from poses (n, 6) in T to points (n, 3) in the world."""
     return lambda poses: X_WT.multiply(np.asarray(poses)[:, :3].T).T
 
 
 def viewpoint(eye: np.ndarray, target: np.ndarray) -> Viewpoint:
-    """A viewpoint of two points (3,)."""
+    """Return the viewpoint of an eye (3,) and a target (3,)."""
     return (float(eye[0]), float(eye[1]), float(eye[2])), (float(target[0]), float(target[1]), float(target[2]))
 
 
 def box_edges(lower: ArrayLike, upper: ArrayLike) -> list[np.ndarray]:
-    """The twelve edges (2, 3) of a box by its corners (3,) each: a path that turns sharply is drawn side by side."""
+    """Return the edges of a box, as lines without sharp turns.
+
+    Args:
+        lower: Lower corner, (3,).
+        upper: Upper corner, (3,).
+
+    Returns:
+        Twelve edges, (2, 3) each.
+    """
     (left, front, low), (right, back, high) = np.array([lower, upper], dtype=float)
     square = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
     rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]

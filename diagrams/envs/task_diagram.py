@@ -1,4 +1,4 @@
-"""What a task has to build, so that one environment class runs them all."""
+"""Task diagram: a wired task with the ports that `GuidedEnv` reads."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ PORTS = (
     "pose",
     "fallback",
 )
-"""The output ports that every task's diagram exports, beside one per reward term."""
+"""Output ports of every task diagram, in addition to one per reward term."""
 
 
 def round_period(seconds: float) -> float:
-    """The period nearest to `seconds` (a picosecond away at most) whose multiples are exact in double precision.
+    """Return the nearest period, at most a picosecond away, whose multiples are exact in double precision.
 
-    Drake triggers two events together only where their times are the same number, and fl(10 k · 0.002),
-    fl(0.02 + k · 0.02) and fl(k · 0.02) often differ in the last bit: a plant would then step once more or once less
-    between two control steps, or a history shift after the command it should have taken in. Take the plant's period
-    from here and the control period as an integer multiple of it.
+    Drake triggers two events together only if their times are equal, and fl(10 k · 0.002), fl(0.02 + k · 0.02) and
+    fl(k · 0.02) often differ in the last bit: the plant would then step once more or once less between two control
+    steps, or a history would shift after the command that it should include. Round the plant's period, and use an
+    integer multiple of it as the control period.
 
     Args:
-        seconds: the period that is wanted, positive.
+        seconds: Period [s], positive.
 
     Raises:
-        InputError: if it is not positive and finite.
+        InputError: If it is not positive and finite.
     """
     if not (np.isfinite(seconds) and seconds > _GRID):
         raise InputError(f"a period must be positive, not {seconds} s")
@@ -56,11 +56,11 @@ def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: M
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Turns and mirrors under which a task stays what it is, up to small things such as demonstrations' means.
+    """Rotations and reflections under which a task is invariant, up to details such as demonstrations' means.
 
-    Args:
-        observations: K sides from which an observation can be seen, (K, n, n): each exchanges numbers or their signs.
-        actions: and an action, (K, A, A).
+    Attributes:
+        observations: Signed permutation of the observation for each of K symmetries, (K, n, n).
+        actions: Signed permutation of the action, (K, A, A).
     """
 
     observations: np.ndarray
@@ -68,65 +68,65 @@ class Symmetry:
 
     def __post_init__(self) -> None:
         if len(self.observations) != len(self.actions):
-            raise ValueError("a symmetry has as many sides of the action as of the observation")
-        for side in (*self.observations, *self.actions):
-            exchanged = np.abs(side)
+            raise ValueError("a symmetry has as many matrices of the action as of the observation")
+        for matrix in (*self.observations, *self.actions):
+            magnitudes = np.abs(matrix)
             if not (
-                np.isin(side, (-1, 0, 1)).all() and (exchanged.sum(0) == 1).all() and (exchanged.sum(1) == 1).all()
+                np.isin(matrix, (-1, 0, 1)).all() and (magnitudes.sum(0) == 1).all() and (magnitudes.sum(1) == 1).all()
             ):
-                raise ValueError("a symmetry exchanges numbers or their signs")
+                raise ValueError("each matrix of a symmetry is a signed permutation")
 
     @classmethod
     def of_signs(cls, observation: ArrayLike, action: ArrayLike) -> Symmetry:
-        """One other side, from which each observed number (n,) and each action (A,) is multiplied by 1 or −1."""
+        """Return the symmetry that multiplies each observed number (n,) and each action (A,) by 1 or −1."""
         return cls(np.diag(np.asarray(observation, float))[None], np.diag(np.asarray(action, float))[None])
 
 
 @dataclass(frozen=True)
 class TaskDiagram:
-    """A task, wired and built: what `GuidedEnv` needs to know of it.
+    """Task, wired and built, as `GuidedEnv` runs it.
 
     The diagram exports the input ``action`` (A,), in [-1, 1], and these outputs:
 
     ======================= ================================================================================
-    ``observation``         what the policy sees: a vector, or an abstract `ImageRgba8U`
-    ``reward``              (1,) of the control step that is just over
+    ``observation``         observation of the policy: a vector, or an abstract `ImageRgba8U`
+    ``reward``              (1,) of the control step that ends
     one per reward term     (1,) each, named as in `reward_terms`
     ``termination``         (1,) an index into `guiderail.systems.episode_monitor.TERMINATIONS`
     ``commanded_violation`` (1,) max over the constraints of c - G y of the commanded output; negative is slack
-    ``measured_violation``  (1,) the same of the measured one
+    ``measured_violation``  (1,) the same of the measured pose
     ``contact_force``       (1,) N
-    ``desired_pose``        (O,) what is commanded
-    ``pose``                (O,) what is measured
-    ``fallback``            (1,) 1 where guidance commanded something safe instead of what was asked for
-    ``wrench``              of the surroundings on the tool, where the diagram has one; as are the next three
-    ``saturation``          (A,) the demand on each actuator beyond its limit
-    ``collision``           (1,) positive while the robot touches what it must not
-    ``command_timed_out``             (1,) 1 while the last safe pose is held, as commands stopped or are no numbers
-    ``rgb_image``           an abstract `ImageRgba8U`; only where the task was built with a camera
+    ``desired_pose``        (O,) commanded pose
+    ``pose``                (O,) measured pose
+    ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
+    ``wrench``              of the surroundings on the tool; this port and the next three are optional
+    ``saturation``          (A,) demand on each actuator beyond its limit
+    ``collision``           (1,) positive during a collision
+    ``command_timed_out``   (1,) 1 while the last safe pose is held because commands stopped or are not finite
+    ``rgb_image``           an abstract `ImageRgba8U`; only if the diagram was built with a camera
     ======================= ================================================================================
 
-    The environment reads them at the end of each control step, before the events of that instant. For a system that
-    samples a plant at control steps to see the same numbers, the plant must be built with
-    ``use_sampled_output_ports=False``: with sampled output ports its step is an unrestricted update, which Drake does
-    before the discrete updates of the same instant, so that they see the plant one of its steps later.
+    The environment reads them at the end of each control step, before the events of that instant. Build the plant with
+    ``use_sampled_output_ports=False``, so that systems that sample it at control steps read the same numbers. With
+    sampled output ports the plant's step is an unrestricted update, which Drake runs before the discrete updates of the
+    same instant: they would read the plant one plant step later.
 
-    Args:
-        diagram: the root diagram.
-        control_period: seconds between control steps; best an integer multiple of the plant's `round_period`.
-        num_steps: control steps after which an episode is truncated.
-        observation_space: the space of observations; its dtype is what the environment returns.
-        reward_terms: names of the reward's terms, which are ports of the diagram and keys of `info`.
-        randomize: called at every reset with the root context (just restored to how the diagram was built), the
-            environment's own random generator and the reset's options; draws the episode's conditions, writes them
-            into the context and returns what `info` should say about them. Refuses an unknown option by `InputError`.
-        push: called with the root context and a displacement; moves the measured pose by it, as a person would who
-            pushes the robot. None where a task has no such thing.
-        query: of the scene, for a browser view.
-        view: the browser view of an environment made with `render_mode="human"`.
-        symmetry: of task and guidance, where they have one; what was seen may be learned from as seen from other sides.
-        near_symmetry: the same, with sides from which only most of an episode stays what it is.
-        declaration: the `Task` that this was assembled of, where it was.
+    Attributes:
+        diagram: Root diagram.
+        control_period: Control period [s]; an integer multiple of the plant's `round_period`.
+        num_steps: Control steps after which an episode is truncated.
+        observation_space: Space of observations, in the dtype that the environment returns.
+        reward_terms: Names of the reward terms, which are ports of the diagram and keys of `info`.
+        randomize: Function of the root context, which was just restored to the default, the environment's random
+            generator and the options of a reset. It samples the episode's conditions, writes them into the context and
+            returns them for `info`. It raises an `InputError` for an unknown option.
+        push: Function of the root context and a displacement that moves the measured pose; None if the robot cannot be
+            pushed.
+        query: Query port of the scene, for a browser view.
+        view: Browser view of an environment made with `render_mode="human"`.
+        symmetry: Symmetry of task and guidance for data augmentation, if there is one.
+        near_symmetry: The same, with symmetries that hold only for most of an episode.
+        declaration: `Task` that the diagram was built from, if there is one.
     """
 
     diagram: Diagram
@@ -144,7 +144,7 @@ class TaskDiagram:
 
     @property
     def meshcat(self) -> Meshcat | None:
-        """The page of the browser view, where there is one."""
+        """Meshcat page of the browser view, if there is one."""
         return None if self.view is None else self.view.meshcat
 
     def __post_init__(self) -> None:
@@ -160,4 +160,4 @@ class TaskDiagram:
                 symmetry.observations.shape[1:] != 2 * self.observation_space.shape
                 or symmetry.actions.shape[1:] != 2 * (self.diagram.GetInputPort("action").size(),)
             ):
-                raise ValueError("a symmetry is of every observed number and of every action")
+                raise ValueError("a symmetry permutes every observed number and every action")

@@ -1,4 +1,4 @@
-"""Guidance: what stands between a policy's action and the pose that a robot is commanded."""
+"""Guidance between a policy's action and the commanded pose."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Guidance without a diagram of one's own: a function of action, measured pose and wrench."""
+"""Guidance by a function of action, measured pose and wrench, without a diagram of its own."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, G
 
 
 class FunctionGuidance(Guidance):
-    """Commands law(action, pose, wrench) once a control step; see `FunctionGuidanceSystem`.
+    """Guidance that commands law(action, pose, wrench) once a control step; see `FunctionGuidanceSystem`.
 
-    Nothing is constrained by it: ``constraint_violation`` says by how much the law left the task's constraints.
+    The function is not constrained: ``constraint_violation`` is the violation of the task's constraints by its command.
     """
 
-    def __init__(self, known: PriorKnowledge, law: GuidanceFunction, action_size: int):
-        """
+    def __init__(self, prior: PriorKnowledge, law: GuidanceFunction, action_size: int):
+        """Construct the guidance.
+
         Args:
-            known: for the control period, the station's sizes and the task's constraints.
-            law: from an action (A,), the measured pose (O,) and wrench (W,) to a desired pose (O,); a pure function.
+            prior: Prior knowledge, for the control period, the station's sizes and the task's constraints.
+            law: Pure function from an action (A,), the measured pose (O,) and wrench (W,) to a desired pose (O,).
             action_size: A, at least 1.
 
         Raises:
-            InputError: if a size or the period is out of range.
+            InputError: If a size or the period is out of range.
         """
         super().__init__()
         builder = DiagramBuilder()
-        system = FunctionGuidanceSystem(law, action_size, known.pose_size, known.wrench_size, known.period)
+        system = FunctionGuidanceSystem(law, action_size, prior.pose_size, prior.wrench_size, prior.period)
         builder.AddNamedSystem("law", system)
-        judge = builder.AddNamedSystem("violation", ConstraintViolation(known.constraints, known.period))
-        builder.Connect(system.get_desired_pose_output_port(), judge.get_pose_input_port())
+        violation = builder.AddNamedSystem("violation", ConstraintViolation(prior.constraints, prior.period))
+        builder.Connect(system.get_desired_pose_output_port(), violation.get_pose_input_port())
         for name in ("action", "pose", "wrench"):
             builder.ExportInput(system.GetInputPort(name), name)
         for name in ("desired_pose", "held_action", "fallback"):
             builder.ExportOutput(system.GetOutputPort(name), name)
-        builder.ExportOutput(judge.get_violation_output_port(), "constraint_violation")
+        builder.ExportOutput(violation.get_violation_output_port(), "constraint_violation")
         builder.BuildInto(self)

@@ -1,23 +1,23 @@
-"""The contract of all guidance: the ports that stand between a policy's action and the pose that a robot is commanded.
+"""Contract of all guidance: the ports between a policy's action and the commanded pose.
 
 =================  =====  ==========================================================================================
 input              size   meaning
 =================  =====  ==========================================================================================
-`action`           A      the policy's, in [−1, 1]; held for a control period
-`pose`             O      measured, in the station's coordinates
-`wrench`           W      measured; the port is there whether or not this guidance listens to it
+`action`           A      action of the policy in [−1, 1]; held for a control period
+`pose`             O      measured pose, in the station's coordinates
+`wrench`           W      measured wrench; the port exists even if the guidance does not use it
 =================  =====  ==========================================================================================
 
 ======================  =====  =====================================================================================
 output                  size   meaning
 ======================  =====  =====================================================================================
-`desired_pose`          O      what to command
-`held_action`           A      the action that acts now
-`constraint_violation`  1      max(c − G y) of the command over the constraints that are known; negative is slack
-`fallback`              1      1 where something safe is commanded instead of what was asked for
+`desired_pose`          O      commanded pose
+`held_action`           A      action of the current control period
+`constraint_violation`  1      max(c − G y) of the command over the known constraints; negative is slack
+`fallback`              1      1 if a safe pose is commanded instead of the requested one
 ======================  =====  =====================================================================================
 
-Guidance may export more; a task's reward can name such a port (`progress` of a template, for one).
+Guidance may export more; a task's reward can name such a port, for example a template's `progress`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ OUTPUTS = ("desired_pose", "held_action", "constraint_violation", "fallback")
 
 
 class Guidance(Diagram):
-    """A diagram with the ports above.
+    """Diagram with the ports of the contract.
 
     .. pydrake_system::
 
@@ -51,54 +51,55 @@ class Guidance(Diagram):
     """
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Says where objects are in this episode, by name; guidance that knows of none does nothing."""
+        """Set the poses of objects in this episode, by name; guidance without objects does nothing."""
 
     def get_action_input_port(self) -> InputPort:
-        """The policy's action in [−1, 1], (A,)."""
+        """Return the port of the policy's action in [−1, 1], (A,)."""
         return self.GetInputPort("action")
 
     def get_pose_input_port(self) -> InputPort:
-        """The measured pose, (O,)."""
+        """Return the port of the measured pose, (O,)."""
         return self.GetInputPort("pose")
 
     def get_wrench_input_port(self) -> InputPort:
-        """The measured wrench, (W,)."""
+        """Return the port of the measured wrench, (W,)."""
         return self.GetInputPort("wrench")
 
     def get_desired_pose_output_port(self) -> OutputPort:
-        """What to command, (O,)."""
+        """Return the port of the commanded pose, (O,)."""
         return self.GetOutputPort("desired_pose")
 
     def get_held_action_output_port(self) -> OutputPort:
-        """The action that acts now, (A,)."""
+        """Return the port of the current action, (A,)."""
         return self.GetOutputPort("held_action")
 
     def get_constraint_violation_output_port(self) -> OutputPort:
-        """max(c − G y) of the command, (1,)."""
+        """Return the port of max(c − G y) of the command, (1,)."""
         return self.GetOutputPort("constraint_violation")
 
     def get_fallback_output_port(self) -> OutputPort:
-        """1 where something safe is commanded instead of what was asked for, (1,)."""
+        """Return the port that is 1 if a safe pose is commanded instead of the requested one, (1,)."""
         return self.GetOutputPort("fallback")
 
 
 def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, kind: str = "") -> None:
-    """Refuses a diagram that can't stand between a policy and a station.
+    """Refuse a diagram whose ports do not fit a station.
 
     Args:
-        guidance: the diagram.
-        pose_size, wrench_size: O and W of the station.
-        kind: what the sentence calls it; the diagram's name unless given.
+        guidance: Diagram.
+        pose_size: O of the station.
+        wrench_size: W of the station.
+        kind: Name of the guidance for the message; default: the diagram's.
 
     Raises:
-        InputError: if a port of the contract is missing or of another size than the station's.
+        InputError: If a port of the contract is missing or has another size.
     """
-    called = f"guidance '{kind or guidance.get_name()}'"
-    unlistened = [name for name in INPUTS if not guidance.HasInputPort(name)]
-    missing = unlistened + [name for name in OUTPUTS if not guidance.HasOutputPort(name)]
+    name_of_guidance = f"guidance '{kind or guidance.get_name()}'"
+    missing_inputs = [name for name in INPUTS if not guidance.HasInputPort(name)]
+    missing = missing_inputs + [name for name in OUTPUTS if not guidance.HasOutputPort(name)]
     if missing:
-        remedy = ", and an input that it doesn't use from a PassThrough of its size" if unlistened else ""
-        raise InputError(f"{called} exports no port {', '.join(missing)}: all guidance does{remedy}")
+        remedy = ", and an input that it doesn't use from a PassThrough of its size" if missing_inputs else ""
+        raise InputError(f"{name_of_guidance} exports no port {', '.join(missing)}: all guidance does{remedy}")
     sizes = {
         "pose": (guidance.GetInputPort("pose").size(), pose_size),
         "wrench": (guidance.GetInputPort("wrench").size(), wrench_size),
@@ -107,6 +108,6 @@ def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, ki
         "constraint_violation": (guidance.GetOutputPort("constraint_violation").size(), 1),
         "fallback": (guidance.GetOutputPort("fallback").size(), 1),
     }
-    for name, (found, wanted) in sizes.items():
-        if found != wanted:
-            raise InputError(f"port {name} of {called} has size {found}, where {wanted} is needed")
+    for name, (size, needed) in sizes.items():
+        if size != needed:
+            raise InputError(f"port {name} of {name_of_guidance} has size {size}, where {needed} is needed")

@@ -1,4 +1,4 @@
-"""What all guidance made of a movement primitive shares: its ports, and the demonstrations that nothing pulls at."""
+"""Guidance by a movement primitive: the demonstrations alone (KMP), KGRL and sKGRL."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
-def skill_of(known: PriorKnowledge) -> PrimitiveConfig:
-    """The demonstrations that are known; whoever registered its needs has them."""
-    assert known.demonstrations is not None
-    return known.demonstrations
+def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
+    """Return the prior's demonstrations, which the kind of guidance requires."""
+    assert prior.demonstrations is not None
+    return prior.demonstrations
 
 
 class PrimitiveGuidance(Guidance):
-    """A diagram with the ports of all guidance, around a movement primitive.
+    """Base class of guidance around a movement primitive.
 
-    ``action`` has one entry per action_dims output. ``constraint_violation`` is judged of the command as it comes out,
-    whether or not this kind keeps the constraints.
+    ``action`` has one entry per explored output. ``constraint_violation`` is that of the command, whether or not this
+    kind of guidance enforces the constraints.
     """
 
-    def _export_inputs(self, builder: DiagramBuilder, skill: PrimitiveConfig) -> tuple[OutputPort, OutputPort]:
-        """Exports the inputs and returns where the held action, spread over all outputs (O,), and the pose come out."""
-        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(skill.control_period, skill.num_actions))
+    def _export_inputs(self, builder: DiagramBuilder, config: PrimitiveConfig) -> tuple[OutputPort, OutputPort]:
+        """Export the inputs; return the ports of the held action, spread over all outputs (O,), and of the pose."""
+        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(config.control_period, config.num_actions))
         action = hold.get_output_port()
-        if not np.array_equal(skill.selection, np.eye(skill.num_outputs)):
-            spread = builder.AddNamedSystem("explored_outputs", MatrixGain(D=skill.selection))
+        if not np.array_equal(config.selection, np.eye(config.num_outputs)):
+            spread = builder.AddNamedSystem("explored_outputs", MatrixGain(D=config.selection))
             builder.Connect(action, spread.get_input_port())
             action = spread.get_output_port()
-        pose = builder.AddNamedSystem("pose", PassThrough(skill.num_outputs))
-        wrench = builder.AddNamedSystem("wrench", PassThrough(skill.wrench_size))
+        pose = builder.AddNamedSystem("pose", PassThrough(config.num_outputs))
+        wrench = builder.AddNamedSystem("wrench", PassThrough(config.wrench_size))
         builder.ExportInput(hold.get_input_port(), "action")
         builder.ExportInput(pose.get_input_port(), "pose")
         builder.ExportInput(wrench.get_input_port(), "wrench")
@@ -46,11 +46,11 @@ class PrimitiveGuidance(Guidance):
         return action, pose.get_output_port()
 
     def _finish(
-        self, builder: DiagramBuilder, skill: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
+        self, builder: DiagramBuilder, config: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
     ) -> None:
-        """Exports the outputs and builds."""
+        """Export the outputs and build the diagram."""
         violation = builder.AddNamedSystem(
-            "constraint_violation", ConstraintViolation(skill.constraints, skill.control_period)
+            "constraint_violation", ConstraintViolation(config.constraints, config.control_period)
         )
         builder.Connect(desired_pose, violation.get_pose_input_port())
         builder.ExportOutput(desired_pose, "desired_pose")
@@ -60,13 +60,13 @@ class PrimitiveGuidance(Guidance):
         builder.BuildInto(self)
 
 
-def add_demonstration(builder: DiagramBuilder, skill: PrimitiveConfig, action: OutputPort) -> LcNsKmpSystem:
-    """Adds the primitive without actions, constraints or history: what the demonstrations alone command."""
-    primitive = skill.primitive(history=False, constrained=False)
-    kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, skill.control_period))
-    # Not a ConstantVectorSource: Drake takes that for something that depends on time, and the primitive would be
-    # computed anew at every step of the plant.
-    zero = builder.AddNamedSystem("no_action", MatrixGain(D=np.zeros((skill.num_outputs, skill.num_outputs))))
+def add_demonstration(builder: DiagramBuilder, config: PrimitiveConfig, action: OutputPort) -> LcNsKmpSystem:
+    """Add the primitive without actions, constraints or history, which commands the demonstrations' mean."""
+    primitive = config.primitive(history=False, constrained=False)
+    kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
+    # Not a ConstantVectorSource: Drake assumes that it depends on time, so the primitive would be computed again at
+    # every step of the plant.
+    zero = builder.AddNamedSystem("no_action", MatrixGain(D=np.zeros((config.num_outputs, config.num_outputs))))
     builder.Connect(action, zero.get_input_port())
     builder.Connect(zero.get_output_port(), kmp.get_null_space_action_input_port())
     return kmp
@@ -81,14 +81,14 @@ def add_demonstration(builder: DiagramBuilder, skill: PrimitiveConfig, action: O
     displaces=True,
 )
 class KmpGuidance(PrimitiveGuidance):
-    """Commands the demonstrations' mean; the action changes nothing."""
+    """Guidance that commands the demonstrations' mean; the action has no effect."""
 
-    def __init__(self, known: PriorKnowledge):
+    def __init__(self, prior: PriorKnowledge):
         super().__init__()
-        skill, builder = skill_of(known), DiagramBuilder()
-        action, _ = self._export_inputs(builder, skill)
-        kmp = add_demonstration(builder, skill, action)
-        self._finish(builder, skill, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+        config, builder = primitive_config_of(prior), DiagramBuilder()
+        action, _ = self._export_inputs(builder, config)
+        kmp = add_demonstration(builder, config, action)
+        self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())
 
 
 @register_guidance(
@@ -100,17 +100,17 @@ class KmpGuidance(PrimitiveGuidance):
     displaces=True,
 )
 class KgrlGuidance(PrimitiveGuidance):
-    """A policy's actions deviate where the demonstrations did, and every command keeps the constraints."""
+    """KGRL: actions deviate where the demonstrations did, and every command satisfies the constraints."""
 
-    def __init__(self, known: PriorKnowledge):
+    def __init__(self, prior: PriorKnowledge):
         super().__init__()
-        skill, builder = skill_of(known), DiagramBuilder()
-        action, _ = self._export_inputs(builder, skill)
-        primitive = skill.primitive(history=False)
-        gains = skill.null_space_gains(primitive)
-        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period))
+        config, builder = primitive_config_of(prior), DiagramBuilder()
+        action, _ = self._export_inputs(builder, config)
+        primitive = config.primitive(history=False)
+        gains = config.null_space_gains(primitive)
+        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period))
         builder.Connect(action, kmp.get_null_space_action_input_port())
-        self._finish(builder, skill, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())
 
 
 @register_guidance(
@@ -122,39 +122,39 @@ class KgrlGuidance(PrimitiveGuidance):
     displaces=True,
 )
 class SkgrlGuidance(PrimitiveGuidance):
-    """Null-space actions through a history of outputs: exploration is smooth.
+    """SKGRL: null-space actions through a history of outputs, so that exploration is smooth.
 
-    With an adaptive history the motion passes through less of it in contact, so that it answers to forces as quickly as
-    KGRL there, and is as smooth as ever elsewhere. The shortest history is one output, never none: every command still
-    begins where the last one ended, whatever the length does.
+    With an adaptive history the motion passes through fewer past outputs during contact, where it reacts to forces as
+    quickly as KGRL, and is smooth elsewhere. The shortest history is one output: every command begins at the last one,
+    whatever the length.
     """
 
-    def __init__(self, known: PriorKnowledge):
+    def __init__(self, prior: PriorKnowledge):
         super().__init__()
-        skill, builder = skill_of(known), DiagramBuilder()
-        action, pose = self._export_inputs(builder, skill)
-        primitive = skill.primitive(history=True)
-        gains = skill.null_space_gains(primitive)
+        config, builder = primitive_config_of(prior), DiagramBuilder()
+        action, pose = self._export_inputs(builder, config)
+        primitive = config.primitive(history=True)
+        gains = config.null_space_gains(primitive)
         shorter = [
-            (one, skill.null_space_gains(one)) for one in map(skill.primitive_of_length, skill.shorter_histories)
+            (each, config.null_space_gains(each)) for each in map(config.primitive_of_length, config.shorter_histories)
         ]
-        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period, shorter))
+        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period, shorter))
         if shorter:
             schedule = builder.AddNamedSystem(
                 "history_length",
                 HistoryLengthSchedule(
-                    (skill.history, *skill.shorter_histories), skill.control_period, wrench_size=skill.wrench_size
+                    (config.history, *config.shorter_histories), config.control_period, wrench_size=config.wrench_size
                 ),
             )
             builder.ConnectInput("wrench", schedule.get_wrench_input_port())
             builder.Connect(schedule.get_history_length_output_port(), kmp.get_history_length_input_port())
         history = builder.AddNamedSystem(
-            "history", HistoryBuffer(skill.num_outputs, skill.history, skill.control_period)
+            "history", HistoryBuffer(config.num_outputs, config.history, config.control_period)
         )
-        past = kmp.get_command_output_port() if skill.history_source == "commanded" else pose
+        past = kmp.get_command_output_port() if config.history_source == "commanded" else pose
         builder.Connect(action, kmp.get_null_space_action_input_port())
         builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
         builder.Connect(past, history.get_output_input_port())
-        # Either way it starts from where the robot is: a command from anywhere else would be a jump.
+        # A history of either source starts at the robot's pose: a command from elsewhere would be a jump.
         builder.Connect(pose, history.get_initial_output_input_port())
-        self._finish(builder, skill, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())

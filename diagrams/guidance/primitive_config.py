@@ -1,4 +1,4 @@
-"""A skill learned from demonstrations: what every guidance made of a movement primitive is built from."""
+"""Configuration of a movement primitive, which KMP, KGRL, sKGRL and residual guidance are built from."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,28 +16,30 @@ HISTORY_SOURCES = ("commanded", "measured")
 
 @dataclass(frozen=True)
 class PrimitiveConfig:
-    """Demonstrations, constraints, and how a policy may move between them.
+    """Demonstrations, constraints, and the range of a policy around them.
 
     Attributes:
-        reference: what the demonstrations have in common; its clock is the control period.
+        reference: Reference trajectory of the demonstrations, in steps of the control period.
         constraints: G y ≥ c on every command.
-        control_period: s, seconds between control steps.
+        control_period: Control period [s].
         history: P, past outputs that sKGRL's motion passes through.
-        history_variance: ρ [output²], how exactly it does.
-        adaptive_history: whether sKGRL's history halves, down to a single output, while the robot touches something.
-        history_source: "commanded" or "measured": what counts as the past. Commanded under impedance control (else the
-            command follows the robot, and the push dies); measured where a person may push a robot that tracks well.
-        horizon: H, future points that constraints are kept at.
-        lambda_, beta: λ and β of problem 4.5.
+        history_variance: ρ, variance of the past outputs [output²].
+        adaptive_history: True if sKGRL's history halves, down to a single output, during contact.
+        history_source: "commanded" or "measured". Use commanded poses under impedance control (otherwise the command
+            follows the robot, and its force vanishes), and measured ones if an operator may push a robot that tracks
+            well.
+        horizon: H, future points at which the constraints are satisfied.
+        lambda_: λ of problem 4.5.
+        beta: β of problem 4.5.
         kernel: k of the movement primitive.
-        action_scale: κ, where a constant action of ±1 ends up: √3 κ demonstration standard deviations away.
-        explored: indices of the outputs that the policy moves; all unless given. An action has one entry for each.
-        gains: (O,) raw null-space units per action, instead of those computed from κ.
-        isotropic_groups: outputs of one unit each; a residual moves all outputs of a group alike. One group unless
-            given.
-        solver: of the constrained primitive's QP: "daqp", "osqp" or "piqp".
-        keep_out: what safe residual learning stops before; None where nobody has written that down.
-        wrench_size: numbers in a measured wrench.
+        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_dims: Indices of the outputs that an action moves, one entry each; default: all.
+        gains: Raw null-space units per action, (O,); default: computed from κ.
+        isotropic_groups: Indices of outputs of one unit, group by group; a residual moves all outputs of a group by the
+            same amount. Default: one group.
+        solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
+        keep_out: Walls that safe residual learning stops at, if the task provides any.
+        wrench_size: W, size of a measured wrench.
     """
 
     reference: ReferenceTrajectory
@@ -63,39 +65,39 @@ class PrimitiveConfig:
         if self.history_source not in HISTORY_SOURCES:
             raise InputError(f"a history is {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
         if not (np.isfinite(self.action_scale) and self.action_scale > 0):
-            raise InputError(f"action_scale is how far a policy may go and must be positive, not {self.action_scale}")
+            raise InputError(f"action_scale must be positive, not {self.action_scale}")
         if self.history < 1:
-            raise InputError(f"history is how many past outputs sKGRL remembers, at least 1, not {self.history}")
+            raise InputError(f"history must be at least 1 past output, not {self.history}")
         if self.action_dims is not None and not self.action_dims:
-            raise InputError("a policy must move at least one output: name it in explored")
+            raise InputError("a policy must move at least one output: name it in action_dims")
         if len(set(self.action_dims or ())) < len(self.action_dims or ()):
-            raise InputError(f"explored names an output twice, {self.action_dims}: each has one action")
+            raise InputError(f"action_dims names an output twice, {self.action_dims}: each has one action")
         if any(not 0 <= o < self.num_outputs for o in self.action_dims or ()):
-            raise InputError(f"explored names outputs 0 … {self.num_outputs - 1}, not {self.action_dims}")
+            raise InputError(f"action_dims names outputs 0 … {self.num_outputs - 1}, not {self.action_dims}")
 
     @property
     def num_outputs(self) -> int:
-        """O."""
+        """O, size of a pose."""
         return self.reference.num_outputs
 
     @property
     def explored_outputs(self) -> tuple[int, ...]:
-        """The outputs that an action moves, in the order of its entries."""
+        """Indices of the outputs that an action moves, in the order of its entries."""
         return tuple(range(self.num_outputs)) if self.action_dims is None else self.action_dims
 
     @property
     def num_actions(self) -> int:
-        """Entries of an action."""
+        """A, size of an action."""
         return len(self.explored_outputs)
 
     @cached_property
     def selection(self) -> np.ndarray:
-        """(O, A): puts an action's entries where the outputs that it moves are."""
+        """Matrix (O, A) from an action to all outputs."""
         return np.eye(self.num_outputs)[:, list(self.explored_outputs)]
 
     @property
     def shorter_histories(self) -> tuple[int, ...]:
-        """The lengths that an adaptive history has beside P: P/2, P/4, … 1."""
+        """Lengths of an adaptive history other than P: P/2, P/4, … 1."""
         lengths, length = [], self.history
         while self.adaptive_history and length > 1:
             length //= 2
@@ -103,11 +105,11 @@ class PrimitiveConfig:
         return tuple(lengths)
 
     def primitive_of_length(self, history: int) -> LcNsKmp:
-        """sKGRL's movement primitive with another history."""
+        """Return sKGRL's movement primitive with another length of the history."""
         return replace(self, history=history).primitive(history=True)
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
-        """The movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""
+        """Return the movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""
         return get_shared_primitive(
             self.reference,
             self.constraints if constrained else LinearConstraints.none(self.num_outputs),
@@ -121,10 +123,10 @@ class PrimitiveConfig:
         )
 
     def null_space_gains(self, primitive: LcNsKmp) -> np.ndarray:
-        """(O,): what an action of one is worth in raw null-space units.
+        """Return the raw null-space units of an action of one, (O,).
 
         Raises:
-            InputError: if `gains` are not O finite numbers, or actions do nothing to this primitive.
+            InputError: If `gains` are not O finite numbers, or actions have no effect on this primitive.
         """
         if self.gains is None:
             return authority_gains(primitive, self.action_scale, outputs=np.array(self.explored_outputs))
@@ -134,10 +136,10 @@ class PrimitiveConfig:
         return gains
 
     def residual_gains(self) -> np.ndarray:
-        """(O,): what an action of one adds to the command, alike for all outputs of a unit.
+        """Return the displacement of the command by an action of one, (O,), equal for all outputs of a group.
 
-        √3 κ times the RMS over the motion of the demonstrations' standard deviations: as far as a null-space action of
-        one goes on average, but everywhere and in every direction.
+        It is √3 κ times the RMS over the motion of the demonstrations' standard deviations: the average displacement by
+        a null-space action of one, but at any time and in every direction.
         """
         variances = np.mean(self.reference.standard_deviations**2, axis=0)
         gains = np.zeros(self.num_outputs)

@@ -1,4 +1,4 @@
-"""What is known about a task, for guidance to be made of."""
+"""Prior knowledge about a task, which guidance is built from."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from guiderail.models.templates import SharedControlTemplate
 
 @dataclass(frozen=True)
 class PlacedTemplate:
-    """A shared control template and the poses of its objects in a scene.
+    """Shared control template and the poses of its objects in a scene.
 
     Attributes:
-        template: the template.
-        frames: poses X_TF of the template's objects by name, in the frame of the station's poses.
-        active_constraints: whether the active constraints are enforced; None: the kind of guidance decides.
-        max_tracking_error: distance [m] between the robot and its command beyond which the command waits.
+        template: Shared control template.
+        frames: Poses X_TF of the template's objects by name, in the frame of the station's poses.
+        active_constraints: True if the active constraints are enforced; None: the guidance's default.
+        max_tracking_error: Distance between the robot and its command beyond which the command waits [m].
     """
 
     template: SharedControlTemplate
@@ -38,12 +38,12 @@ class PlacedTemplate:
 
 @dataclass(frozen=True)
 class ScriptedApproach:
-    """A straight line along z that needs no demonstrations, and how far a policy may lead away from it.
+    """Straight motion along z, without demonstrations, and the range of a policy around it.
 
     Attributes:
-        heights: where it begins and ends [m].
-        speed: [m/s].
-        reach: how far a full action moves the command along each axis [m].
+        heights: First and last height [m].
+        speed: Speed [m/s].
+        reach: Displacement of the command along each axis by a full action [m].
     """
 
     heights: tuple[float, float]
@@ -53,14 +53,14 @@ class ScriptedApproach:
 
 @dataclass(frozen=True)
 class PriorKnowledge:
-    """What a task knows; None where the task does not override the method of that name.
+    """Prior knowledge about a task; None for what the task does not provide.
 
     Attributes:
-        period: s, seconds between control steps.
-        demonstrations: with constraints, walls to keep out of, and how a policy may move between them.
-        template: shared control template and the poses of its objects.
-        approach: a scripted one.
-        options: of the kind of guidance itself, by name, where it declares some.
+        period: Control period [s].
+        demonstrations: Demonstrations, constraints, walls to keep out of, and the range of a policy around them.
+        template: Shared control template and the poses of its objects.
+        approach: Scripted approach.
+        options: Options of the kind of guidance by name, if it declares any.
         pose_size: O of the station.
         wrench_size: W of the station.
     """
@@ -75,12 +75,12 @@ class PriorKnowledge:
 
     @property
     def constraints(self) -> LinearConstraints:
-        """The linear ones on a commanded pose (O,), which come with demonstrations; none where there are none."""
-        known = self.demonstrations
-        return LinearConstraints.none(self.pose_size) if known is None else known.constraints
+        """Linear constraints on a commanded pose (O,); no rows without demonstrations."""
+        config = self.demonstrations
+        return LinearConstraints.none(self.pose_size) if config is None else config.constraints
 
-    def has(self, ingredient: str) -> bool:
-        """Whether the task declares "demonstrations", "keep_out" (beside demonstrations), "template" or "approach"."""
-        if ingredient == "keep_out":
+    def has(self, requirement: str) -> bool:
+        """Return True if the task provides a requirement: "demonstrations", "keep_out", "template" or "approach"."""
+        if requirement == "keep_out":
             return self.demonstrations is not None and self.demonstrations.keep_out is not None
-        return getattr(self, ingredient) is not None
+        return getattr(self, requirement) is not None

@@ -1,4 +1,4 @@
-"""The kinds of guidance by name: how each is made, what it needs, and how it is drawn."""
+"""Registry of the kinds of guidance: builder, requirements, and label and colour in figures."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ REQUIREMENTS = {
     "template": "a shared control template",
     "approach": "a scripted approach",
 }
-"""What a kind of guidance can need, in words."""
+"""Possible requirements of a kind of guidance, with their description in messages."""
 
 
 @dataclass(frozen=True)
 class GuidanceKind:
-    """A kind of guidance.
+    """Kind of guidance.
 
     Attributes:
-        name: what `guidance=` calls it.
-        build: from what is known to a diagram with the ports of `Guidance`.
-        needs: alternatives, each a tuple of names out of `REQUIREMENTS`; the task must declare all names of one of them.
-        label: what a legend calls it.
-        colour: what it is drawn with, "#rrggbb".
-        demonstrates: whether an action of zero is the demonstrations or the script alone, so that success before
-            anything is learned can be stated.
-        displaces: whether an action displaces the explored outputs, a number for each. Only of such actions a task's
-            symmetry says what they are from another side; learning by any other goes on without it.
-        options: a model of further options of the environment; none unless given.
+        name: Value of the option `guidance`.
+        build: Function from prior knowledge to a diagram with the ports of `Guidance`.
+        needs: Alternative tuples of names in `REQUIREMENTS`; the task must provide all names of one alternative.
+        label: Label in figures.
+        colour: Colour in figures, "#rrggbb".
+        demonstrates: True if an action of zero reproduces the demonstrations or the script, so that their success
+            before learning can be stated.
+        displaces: True if an action displaces the explored outputs, one number for each. A task's symmetry is used
+            for data augmentation only if it does.
+        options: Model of further options of the environment, if there are any.
     """
 
     name: str
@@ -51,7 +51,11 @@ class GuidanceKind:
     options: type[Options] | None = None
 
     def missing_requirements(self, known: Collection[str]) -> tuple[str, ...]:
-        """The names in `needs` that `known` lacks, of the alternative that lacks fewest; empty if one is complete."""
+        """Return the missing requirements of the alternative that lacks fewest; empty if one is complete.
+
+        Args:
+            known: Requirements that the task provides.
+        """
         lacking = [tuple(one for one in needed if one not in known) for needed in self.needs]
         return min(lacking, key=len, default=())
 
@@ -74,12 +78,16 @@ def register_guidance(
     displaces: bool = False,
     options: type[Options] | None = None,
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
-    """A decorator that adds a kind of guidance; it decorates a function or a class that takes a `PriorKnowledge`.
+    """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
 
     Args:
-        name: what `guidance=` calls it.
-        needs, colour, demonstrates, displaces, options: see `GuidanceKind`.
-        label: what a legend calls it; its name unless given.
+        name: Value of the option `guidance`.
+        needs: See `GuidanceKind`.
+        label: Label in figures; default: its name.
+        colour: Colour in figures, "#rrggbb".
+        demonstrates: See `GuidanceKind`.
+        displaces: See `GuidanceKind`.
+        options: Model of further options of the environment.
     """
 
     def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
@@ -91,15 +99,20 @@ def register_guidance(
 
 
 def possible_guidance(known: Collection[str]) -> list[str]:
-    """The names of all kinds of guidance whose `needs` are among `known`."""
+    """Return the names of all kinds of guidance whose requirements are among `known`."""
     return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).missing_requirements(known)]
 
 
 def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
-    """The kind of that name, if its `needs` are among what is known of a task.
+    """Return the kind of guidance of a name, if a task meets its requirements.
+
+    Args:
+        name: Name of the kind.
+        known: Requirements that the task provides.
+        task: Name of the task, for the message.
 
     Raises:
-        InputError: if there is no such kind, or something that it needs is missing: then it says what.
+        InputError: If there is no such kind, or a requirement is missing, which the message names.
     """
     kind = GUIDANCE.get(name)
     lacking = kind.missing_requirements(known)
@@ -112,15 +125,15 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
 
 
 def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") -> Diagram:
-    """The guidance of that name, made of what is known.
+    """Build the guidance of a name from prior knowledge.
 
     Args:
-        name: of the kind.
-        known: what it is made of.
-        task: of what, for a sentence.
+        name: Name of the kind.
+        known: Prior knowledge.
+        task: Name of the task, for the message.
 
     Raises:
-        InputError: if there is no such kind, or something that it needs is missing.
+        InputError: If there is no such kind, or a requirement is missing.
     """
     kind = check_guidance(name, [one for one in REQUIREMENTS if known.has(one)], task)
     guidance = kind.build(known)

@@ -1,4 +1,4 @@
-"""Residual learning (thesis, section 4.4.1): a policy adds to a script, as far in every direction and at any time."""
+"""Residual learning (thesis, section 4.4.1): actions add to a motion, equally in every direction and at any time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydrake.systems.primitives import MatrixGain, PassThrough, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, skill_of
+from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, primitive_config_of
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
@@ -18,21 +18,22 @@ from guiderail.systems.safety_filter import SafetyFilter
 
 
 class ResidualDescent(Guidance):
-    """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t comes straight down.
+    """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t descends straight.
 
     ``action`` is (3,); the command also respects the template's greatest speeds. Exports ``measured_violation`` too.
     """
 
-    def __init__(self, known: PriorKnowledge):
-        """
+    def __init__(self, prior: PriorKnowledge):
+        """Construct the guidance.
+
         Args:
-            known: its approach, and a template whose active constraints are kept; that one has one object's frame, in
-                which poses are given.
+            prior: Prior knowledge with an approach, and with a template whose active constraints are enforced. Its only
+                object is the frame in which poses are given.
         """
         super().__init__()
-        assert known.template is not None
-        assert known.approach is not None
-        placed, approach, period = known.template, known.approach, known.period
+        assert prior.template is not None
+        assert prior.approach is not None
+        placed, approach, period = prior.template, prior.approach, prior.period
         template = placed.template if placed.constrained(True) else placed.template.without_active_constraints()
         builder = DiagramBuilder()
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, 3))
@@ -40,7 +41,7 @@ class ResidualDescent(Guidance):
         corners = np.zeros((POSE_SIZE, 2))
         corners[2] = approach.heights
         line = builder.AddNamedSystem("descent", TrajectorySource(PiecewisePolynomial.FirstOrderHold(times, corners)))
-        # Held: otherwise everything behind it would be computed anew at every step of the plant.
+        # Without a hold, all systems behind it would be computed again at every step of the plant.
         held = builder.AddNamedSystem("descent_hold", ZeroOrderHold(period, POSE_SIZE))
         spread = builder.AddNamedSystem("spread", MatrixGain(D=np.eye(POSE_SIZE, 3)))
         residual = builder.AddNamedSystem("residual", Residual(np.array([approach.reach] * 3 + [0.0] * 3)))
@@ -61,30 +62,30 @@ class ResidualDescent(Guidance):
 
 
 class ResidualGuidance(PrimitiveGuidance):
-    """Adds to the demonstrations: p̂_t = p_t^kmp + Δp_t."""
+    """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t."""
 
-    def __init__(self, known: PriorKnowledge, *, safe: bool = False):
-        """
+    def __init__(self, prior: PriorKnowledge, *, safe: bool = False):
+        """Construct the guidance.
+
         Args:
-            known: with demonstrations; with `safe`, also what to keep away from.
-            safe: True puts hand-made active constraints behind the sum; ``fallback`` is then 1 where a wall was in
-                the way.
+            prior: Prior knowledge with demonstrations, and with walls to keep out of if `safe`.
+            safe: Put a safety filter behind the sum; ``fallback`` is then 1 if it stopped at a wall.
         """
         super().__init__()
-        skill, builder = skill_of(known), DiagramBuilder()
-        action, pose = self._export_inputs(builder, skill)
-        kmp = add_demonstration(builder, skill, action)
-        residual = builder.AddNamedSystem("residual", Residual(skill.residual_gains()))
+        config, builder = primitive_config_of(prior), DiagramBuilder()
+        action, pose = self._export_inputs(builder, config)
+        kmp = add_demonstration(builder, config, action)
+        residual = builder.AddNamedSystem("residual", Residual(config.residual_gains()))
         builder.Connect(kmp.get_command_output_port(), residual.get_reference_input_port())
         builder.Connect(action, residual.get_action_input_port())
         desired, fallback = residual.get_desired_pose_output_port(), kmp.get_fallback_output_port()
         if safe:
-            assert skill.keep_out is not None
-            safety = builder.AddNamedSystem("safety_filter", SafetyFilter(skill.keep_out, skill.control_period))
+            assert config.keep_out is not None
+            safety = builder.AddNamedSystem("safety_filter", SafetyFilter(config.keep_out, config.control_period))
             builder.Connect(desired, safety.get_desired_pose_input_port())
             builder.Connect(pose, safety.get_pose_input_port())
             desired, fallback = safety.get_safe_pose_output_port(), safety.get_intervention_output_port()
-        self._finish(builder, skill, desired, fallback)
+        self._finish(builder, config, desired, fallback)
 
 
 @register_guidance(
@@ -95,9 +96,9 @@ class ResidualGuidance(PrimitiveGuidance):
     demonstrates=True,
     displaces=True,
 )
-def residual(known: PriorKnowledge) -> Diagram:
-    """Adds to the demonstrations, or to a scripted approach behind a template's active constraints."""
-    return ResidualGuidance(known) if known.demonstrations is not None else ResidualDescent(known)
+def residual(prior: PriorKnowledge) -> Diagram:
+    """Build residual learning with demonstrations, or with a scripted approach behind active constraints."""
+    return ResidualGuidance(prior) if prior.demonstrations is not None else ResidualDescent(prior)
 
 
 @register_guidance(
@@ -108,6 +109,6 @@ def residual(known: PriorKnowledge) -> Diagram:
     demonstrates=True,
     displaces=True,
 )
-def safe_residual(known: PriorKnowledge) -> Diagram:
-    """Residual learning that stops before walls."""
-    return ResidualGuidance(known, safe=True)
+def safe_residual(prior: PriorKnowledge) -> Diagram:
+    """Build residual learning that stops at walls."""
+    return ResidualGuidance(prior, safe=True)

@@ -1,4 +1,4 @@
-"""Guidance by a shared control template: a person's or a policy's few inputs in, a safe pose out."""
+"""Guidance by a shared control template, from a few inputs of a user or a policy to a safe pose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from guiderail.systems.sct_state_machine import SctStateMachine
 
 
 class ActiveConstraintFilter(Diagram):
-    """The active constraints and the state machine of a template, behind anything that requests a pose.
+    """Active constraints and state machine of a template, for a requested pose.
 
     .. pydrake_system::
 
@@ -46,12 +46,13 @@ class ActiveConstraintFilter(Diagram):
         period: float,
         max_tracking_error: float = np.inf,
     ):
-        """
+        """Construct the diagram.
+
         Args:
-            template: the template.
-            frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
-            period: seconds between control steps.
-            max_tracking_error: distance [m] between the robot and its command beyond which the command waits.
+            template: Shared control template.
+            frames: Poses X_WF of its objects by name; W is the frame of all poses.
+            period: Control period [s].
+            max_tracking_error: Distance between the robot and its command beyond which the command waits [m].
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -59,8 +60,8 @@ class ActiveConstraintFilter(Diagram):
         builder.AddNamedSystem("projector", self._projector)
         self._machine = SctStateMachine(template, frames, period)
         builder.AddNamedSystem("state_machine", self._machine)
-        # The state follows the command, not the measured pose: so the command is always inside the constraints of the
-        # state that it is made for, and a transition doesn't depend on how well the robot tracks.
+        # The state follows the command, not the measured pose. The command is then always inside the constraints of its
+        # state, and a transition does not depend on how well the robot tracks.
         builder.Connect(self._projector.get_desired_pose_output_port(), self._machine.get_pose_input_port())
         builder.Connect(self._machine.get_state_output_port(), self._projector.get_state_input_port())
         builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
@@ -76,23 +77,23 @@ class ActiveConstraintFilter(Diagram):
         builder.BuildInto(self)
 
     def export_outputs(self, builder: DiagramBuilder) -> None:
-        """Exports this filter's outputs from a diagram of guidance that contains it."""
+        """Export this filter's outputs from a guidance diagram that contains it."""
         names = ("desired_pose", "fallback", "state", "transition_distance", "progress", "measured_violation")
         for name in names:
             builder.ExportOutput(self.GetOutputPort(name), name)
         builder.ExportOutput(self.GetOutputPort("commanded_violation"), "constraint_violation")
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Moves objects; those that aren't named stay. The context is the root diagram's."""
+        """Set the poses of objects; those that are not named stay. The context is the root diagram's."""
         for system in (self._projector, self._machine):
             system.frames.set(system.GetMyMutableContextFromRoot(root_context), frames)
 
 
 class SctGuidance(Guidance):
-    """Shared control: input mapping, then active constraints, in the state that the state machine is in.
+    """Shared control: input mapping, then active constraints, both of the state machine's state.
 
-    ``action`` is (n,), whoever gives it: a policy, or a person's device. ``constraint_violation`` is the larger of
-    metres and radians from the projection, 0 inside. Beside the ports of all guidance it exports ``state``,
+    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the larger of metres and
+    radians from the projection, 0 inside. In addition to the ports of all guidance it exports ``state``,
     ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
 
@@ -106,15 +107,16 @@ class SctGuidance(Guidance):
         active_constraints: bool = True,
         max_tracking_error: float = np.inf,
     ):
-        """
+        """Construct the guidance.
+
         Args:
-            template: the template.
-            frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
-            period: seconds between control steps.
-            input_mapping: a second template whose initial state maps the inputs in place of the first one's mappings.
-                The active constraints are then a safety filter, for example for a plain end-effector velocity.
-            active_constraints: False leaves the constraints out, and what was requested is commanded.
-            max_tracking_error: distance [m] between the robot and its command beyond which the command waits.
+            template: Shared control template.
+            frames: Poses X_WF of its objects by name; W is the frame of all poses.
+            period: Control period [s].
+            input_mapping: Second template whose initial state maps the inputs instead of `template`. The active
+                constraints are then a safety filter, for example for a plain end-effector velocity.
+            active_constraints: False commands the requested pose without constraints.
+            max_tracking_error: Distance between the robot and its command beyond which the command waits [m].
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -137,7 +139,7 @@ class SctGuidance(Guidance):
 
         builder.ExportInput(hold.get_input_port(), "action")
         builder.ExportInput(self._filter.GetInputPort("pose"), "pose")
-        # No template of ours listens to forces yet; the port is there because all guidance has the same ports.
+        # The port is unused: all guidance has the same ports.
         wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
         builder.ExportInput(wrench.get_input_port(), "wrench")
         self._filter.export_outputs(builder)
@@ -145,36 +147,35 @@ class SctGuidance(Guidance):
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Moves objects; those that aren't named stay. The context is the root diagram's."""
+        """Set the poses of objects; those that are not named stay. The context is the root diagram's."""
         self._filter.set_frames(root_context, frames)
-        known = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
-        self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), known)
+        mapped = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
+        self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), mapped)
 
 
-def _through_template(
-    known: PriorKnowledge, input_mapping: SharedControlTemplate | None, constrained: bool
+def _build_sct(
+    prior: PriorKnowledge, input_mapping: SharedControlTemplate | None, *, is_constrained_by_default: bool
 ) -> SctGuidance:
-    assert known.template is not None
-    placed = known.template
+    assert prior.template is not None
+    placed = prior.template
+    is_constrained = placed.constrained(is_constrained_by_default)
     return SctGuidance(
         placed.template,
         placed.frames,
-        known.period,
+        prior.period,
         input_mapping=input_mapping,
-        active_constraints=constrained,
-        max_tracking_error=placed.max_tracking_error if constrained else np.inf,
+        active_constraints=is_constrained,
+        max_tracking_error=placed.max_tracking_error if is_constrained else np.inf,
     )
 
 
 @register_guidance("sct", needs=(("template",),), label="RL-SCT", colour="#9467bd")
-def sct(known: PriorKnowledge) -> SctGuidance:
-    """A few inputs through the template, its active constraints behind them."""
-    assert known.template is not None
-    return _through_template(known, None, known.template.constrained(True))
+def sct(prior: PriorKnowledge) -> SctGuidance:
+    """Build RL-SCT: a few inputs through the template, followed by its active constraints."""
+    return _build_sct(prior, None, is_constrained_by_default=True)
 
 
 @register_guidance("none", needs=(("template",),), label="RL", colour="#7f7f7f")
-def unguided(known: PriorKnowledge) -> SctGuidance:
-    """Six inputs as the end effector's velocity; the template says only how far it is, unless it is to constrain."""
-    assert known.template is not None
-    return _through_template(known, load_template("end_effector_velocity"), known.template.constrained(False))
+def unguided(prior: PriorKnowledge) -> SctGuidance:
+    """Build unguided RL: six inputs are the end effector's velocity, and the template only provides its state."""
+    return _build_sct(prior, load_template("end_effector_velocity"), is_constrained_by_default=False)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.envs.env import RECORDED, SAID
+from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
@@ -136,7 +136,10 @@ def test_settings_of_another_guidance_are_no_mistake():
             {"termination_terms": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
             "the condition 'success' of lab/Own is called with .*, pose, and takes position",
         ),
-        ({"reset": lambda self, *given: None}, "reset of lab/Own returns what it drew by name, {} .*, not None"),
+        (
+            {"reset": lambda self, *given: None},
+            "reset of lab/Own must return the sampled values by name, {} .*, not None",
+        ),
     ],
 )
 def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, says):
@@ -148,8 +151,8 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
 @pytest.mark.parametrize(
     ("observed", "says"),
     [
-        ((), "the observation of lab/Own is of nothing: let observation_terms"),
-        ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is of nothing"),
+        ((), "the observation of lab/Own is empty: let observation_terms"),
+        ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is empty"),
         (
             (ObservationTerm("pose", scale=0.0),),
             "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0",
@@ -185,18 +188,18 @@ def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
     np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*SAID, *RECORDED, "observation", "pose", "desired_pose"])
+@pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "desired_pose"])
 def test_no_reward_term_takes_the_place_of_a_safety_number(name):
     declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
     with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):
         make_env("lab/Own", guidance="kmp")
 
 
-@pytest.mark.parametrize("name", SAID)
+@pytest.mark.parametrize("name", INFO_KEYS)
 def test_nothing_that_a_reset_draws_takes_the_place_of_a_safety_number(name):
     declare(reset=lambda self, *given: {name: -9.0})
     env = make_env("lab/Own", guidance="kmp")
-    with pytest.raises(InputError, match=f"reset of lab/Own can call nothing that it drew {name!r}"):
+    with pytest.raises(InputError, match=f"reset of lab/Own returns a value named {name!r}, which is reserved"):
         env.reset(seed=0)
 
 

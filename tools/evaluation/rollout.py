@@ -179,7 +179,7 @@ _MAX_DIFFERENCES = 5  # options that a message names
 
 
 def _describe_mismatch(policy: Policy, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
-    """Return a sentence with the shapes of policy and environment, and the options in which their environments differ."""
+    """Return a sentence with the shapes of policy and environment, and the options that differ."""
     sees, moves = tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
     config = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
     options = {} if config is None else config.config.options

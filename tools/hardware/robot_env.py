@@ -172,7 +172,7 @@ class RobotEnv(GuidedEnv):
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
         self._switch_station(simulator, self._task_station)
         self.fault, self.drawn = Fault.NONE, drawn
-        return self._begun()
+        return self._begin_episode()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one action; truncate the episode if the arm is stopped."""

@@ -36,7 +36,7 @@ def known(turn, station, period=PERIOD):
 
 @pytest.mark.parametrize("period", [0.01, 0.1])
 def test_a_motion_keeps_the_speed_at_which_it_was_demonstrated(period):
-    with pytest.raises(InputError, match="of another speed than was demonstrated"):
+    with pytest.raises(InputError, match="has another speed than was demonstrated"):
         known(1.0, GantryStation, period)
 
 

@@ -6,7 +6,7 @@ import pytest
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from guiderail.diagrams.envs.env import SAID, GuidedEnv
+from guiderail.diagrams.envs.env import INFO_KEYS, GuidedEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram, round_period
 from guiderail.models.common.errors import InputError
 
@@ -100,7 +100,7 @@ def make(num_steps=20, **arguments):
 
 def test_info_says_everything_at_reset_and_at_every_step():
     env = make()
-    expected = {*SAID, "double", "one"} - {"simulation_failure"}  # of an episode that is over
+    expected = {*INFO_KEYS, "double", "one"} - {"simulation_failure"}  # of an episode that is over
     _, info = env.reset(options={"start": 0.0})
     assert set(info) == expected | {"start"}
     assert info["constraint_violation"] == -1.0
@@ -266,7 +266,7 @@ def test_what_info_says_of_every_task_is_listed():
     env.reset()
     env.step([0.0])
     said |= set(env.step([0.0])[4])
-    assert said - set(env.task.reward_terms) == set(SAID)
+    assert said - set(env.task.reward_terms) == set(INFO_KEYS)
 
 
 def test_stepping_on_after_the_end_is_refused():
