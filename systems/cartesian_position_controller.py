@@ -23,7 +23,7 @@ from pydrake.systems.framework import (
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
-from guiderail.models.control.damped_inverse import damped_joint_velocities, follows
+from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support.caching import declare_plant_context
 from guiderail.systems.support.last_valid_pose import CommandValidity
 from guiderail.systems.support.sampling import check_period
@@ -232,7 +232,7 @@ class CartesianPositionController(LeafSystem):
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
             velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))
-            return velocities, not follows(J, velocities, V)
+            return velocities, not is_following(J, velocities, V)
         if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, position_limits):
             return velocities, False  # no limit is active: the optimum in closed form, which is faster
         self._parameters.set_joint_position_limits(position_limits)

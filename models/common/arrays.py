@@ -1,4 +1,4 @@
-"""Arrays of numbers, as callers and files give them."""
+"""Conversion to arrays of numbers, and the cross product of two vectors."""
 
 from __future__ import annotations
 
@@ -11,19 +11,24 @@ from guiderail.models.common.errors import InputError
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a × b of two vectors (3,). NumPy's own is made for arrays of vectors, and many times slower for one."""
+    """Compute a × b of two vectors (3,), many times faster than `numpy.cross`, which is made for arrays of vectors."""
     (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
-_EXACT = 2**53  # from there on a double skips whole numbers
+_EXACT = 2**53  # a double represents smaller whole numbers exactly
 
 
 def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
-    """A new array of doubles that holds exactly the numbers given; `what` names them in messages.
+    """Convert values to a new array of doubles without rounding.
+
+    Args:
+        values: Numbers, nested in any way that NumPy accepts.
+        what: Name of the values for messages.
 
     Raises:
-        InputError: if they are ragged, or no real numbers: texts, dates, complex numbers and objects are none.
+        InputError: If the values are ragged or are not real numbers (text, dates, complex numbers, other objects), or a
+            double cannot represent them.
     """
     try:
         given = np.asarray(values)

@@ -1,23 +1,23 @@
-"""What a person is told when what they gave makes no sense."""
+"""Exceptions with messages for users."""
 
 import reprlib
 from typing import Any
 
 
 class InputError(ValueError):
-    """Something from outside is wrong: data, a file, an argument, a name.
+    """Error in user input: data, a file, an argument or a name.
 
-    Its message is one sentence that names the thing and the remedy; the command prints it and exits with code 2.
-    Everything that is raised because of what a user gave is of this type, so that nothing else is ever mistaken for it.
+    Its message is one sentence that names the problem and the remedy; the command prints it and exits with code 2. All
+    errors in user input have this type, which tells them from errors in the program.
     """
 
 
 class RunsFailedError(RuntimeError):
-    """Some runs of a study failed, and the others are finished.
+    """Failure of some runs of a study after all others have finished.
 
     Attributes:
-        sentences: one for each that failed; the command prints them and exits with code 1.
-        rows: what the others came to, a data frame.
+        sentences: One sentence for each failed run; the command prints them and exits with code 1.
+        rows: Results of the other runs, a data frame.
     """
 
     def __init__(self, sentences: list[str], rows: Any):
@@ -31,5 +31,5 @@ _SHORT.maxlevel = 3
 
 
 def brief(value: Any) -> str:
-    """A value as a sentence can quote it: its repr, on one line, short however large the value is."""
+    """Return the repr of a value on one line, shortened for a message."""
     return " ".join(_SHORT.repr(value).split())

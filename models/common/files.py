@@ -1,4 +1,4 @@
-"""Reading a file that a person named."""
+"""Bounded reading, atomic writing and digests of files."""
 
 import hashlib
 import os
@@ -12,10 +12,10 @@ from guiderail.models.common.errors import InputError
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file so that a reader, or a run that was killed, finds the old content or the new, never a part.
+    """Write a file atomically: readers find the old content or the new, even if the process is killed.
 
     Raises:
-        InputError: if the file cannot be written.
+        InputError: If the file cannot be written.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -26,33 +26,38 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        with suppress(OSError):  # below a file there is no folder to remove anything from
+        with suppress(OSError):  # the parent may be a file
             temporary.unlink(missing_ok=True)
         raise InputError(f"{path} cannot be written ({error.strerror}): choose a folder with room to write") from error
 
 
 def digest(arrays: Mapping[str, np.ndarray], text: str) -> str:
-    """A digest of names, types, shapes and contents, and of a text."""
-    found = hashlib.blake2b(text.encode())
+    """Compute a digest of a text and of arrays with their names, types and shapes."""
+    digest = hashlib.blake2b(text.encode())
     for key in sorted(arrays):
-        found.update(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode())
-        found.update(arrays[key].tobytes())
-    return found.hexdigest()
+        digest.update(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode())
+        digest.update(arrays[key].tobytes())
+    return digest.hexdigest()
 
 
-def read_bytes(path: Path, what: str, most: int) -> bytes:
-    """The content of a file of at most `most` bytes; `what` names its kind in messages.
+def read_bytes(path: Path, what: str, max_size: int) -> bytes:
+    """Read a regular file.
+
+    Args:
+        path: Path of the file.
+        what: Kind of the file for messages, such as "template".
+        max_size: Largest accepted size [bytes].
 
     Raises:
-        InputError: if there is no such regular file, it can't be read, or it is larger.
+        InputError: If there is no such file, it cannot be read, or it is too large.
     """
     try:
-        if not path.is_file():  # a pipe or a device would be waited for
+        if not path.is_file():  # reading a pipe or a device would block
             raise InputError(f"there is no {what} '{path}': check the path")
         with path.open("rb") as file:
-            data = file.read(most + 1)
+            data = file.read(max_size + 1)
     except OSError as error:
         raise InputError(f"the {what} '{path}' can't be read ({error.strerror}): check the path") from error
-    if len(data) > most:
-        raise InputError(f"the {what} '{path}' is larger than {most} bytes: leave out what is not needed")
+    if len(data) > max_size:
+        raise InputError(f"the {what} '{path}' is larger than {max_size} bytes: leave out what is not needed")
     return data

@@ -1,4 +1,4 @@
-"""Model files, read where no network is."""
+"""Parsing of local model files, without access to the network."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -16,21 +16,21 @@ _DIRECTIVES = (".yaml", ".yml")
 
 
 def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
-    """Adds the one model of an SDF or URDF file on this machine.
+    """Add the only model of a local SDF or URDF file to a plant.
 
-    Every `Parser` knows the remote package `drake_models`, and refuses to exist where DRAKE_ALLOW_NETWORK forbids
-    packages from the network, whatever it is asked to read. A file of ours refers to none.
+    Drake's `Parser` registers the remote package `drake_models`, and its constructor raises an error if
+    DRAKE_ALLOW_NETWORK forbids remote packages. The files that are read here refer to no remote package.
     """
     (model,) = add_models(plant, path)
     return model
 
 
 def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceIndex]:
-    """Adds the models of an SDF or URDF file, or of a file of Drake model directives (.yaml), on this machine.
+    """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.yaml), to a plant.
 
-    Directives may name packages (folders with a `package.xml`) that lie in the folder of their file.
+    Directives may refer to packages (folders with a `package.xml`) in the folder of their file.
     """
-    with _remote_packages_may_be_named():
+    with _allow_package_map():
         parser = Parser(plant)
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
@@ -38,21 +38,21 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
 
 
 def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective]) -> None:
-    """Adds what Drake's model directives say; files are named with their whole path (file://).
+    """Add the models of Drake model directives, whose files have absolute paths (file://), to a plant.
 
     Raises:
-        InputError: if they can't be followed.
+        InputError: If the directives cannot be processed.
     """
     try:
-        with _remote_packages_may_be_named():
+        with _allow_package_map():
             ProcessModelDirectives(ModelDirectives(directives=list(directives)), Parser(plant))
     except RuntimeError as error:
         words = " ".join(str(error).split())
-        raise InputError(f"what should stand around the robot can't be added: {words}") from error
+        raise InputError(f"the model directives of the robot's surroundings can't be processed: {words}") from error
 
 
 @contextmanager
-def _remote_packages_may_be_named() -> Iterator[None]:
+def _allow_package_map() -> Iterator[None]:
     allowed = os.environ.get(_VARIABLE)
     if allowed is None or "package_map" in allowed:
         yield

@@ -1,4 +1,4 @@
-"""Open lists: things that are found by name, this package's own and those of whoever adds some."""
+"""Plugin registry: entries by name, from this package, from entry points, or registered at runtime."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Entry = TypeVar("Entry")
 
 
 class Registry(Generic[Entry]):
-    """Entries by name; a name costs no import, an entry that of its own module.
+    """Registry of entries by name.
 
-    An entry is added by whoever defines it, with `register` as a decorator or a call. A new module of `package` is
-    found by being there; an installed package adds its own by an entry point of the group `entry_points`, and a file
-    that is not installed by being imported.
+    Listing the names imports nothing; getting an entry imports its module. An entry is added by `register`, as a
+    decorator or a call: in a module of `package`, which is found without being imported; in an installed package with
+    an entry point of the group `entry_points`; or in any other file that is imported.
     """
 
     def __init__(
@@ -34,13 +34,14 @@ class Registry(Generic[Entry]):
         decorator: str | None = None,
         entry_points: str | None = None,
     ):
-        """
+        """Create an empty registry.
+
         Args:
-            noun: what an entry is, for sentences: "task", "robot".
-            package: import name of the package, or of each package, whose modules register entries.
-            decorator: the function by whose calls, with a name as first argument, they do that: it is looked for in
-                their text. Unless given they are all imported when the list is first looked at.
-            entry_points: the group of entry points that name further ones.
+            noun: Kind of the entries for messages, such as "task".
+            package: Import name of the package, or of each package, whose modules register entries.
+            decorator: Name of the function whose calls, with a name as first argument, register entries; the modules'
+                source is searched for it. Without it, all modules are imported at the first use.
+            entry_points: Group of entry points of further entries.
         """
         self.noun = noun
         self._packages = (package,) if isinstance(package, str) else tuple(package)
@@ -53,25 +54,25 @@ class Registry(Generic[Entry]):
     @overload
     def register(self, name: str, value: Entry) -> Entry: ...
     def register(self, name: str, value: Entry | None = None) -> Entry | Callable[[Entry], Entry]:
-        """Adds an entry; without a value, a decorator that adds what it decorates.
+        """Add an entry; without a value, return a decorator that adds the decorated object.
 
         Raises:
-            InputError: if the name is taken by something that was defined elsewhere.
+            InputError: If the name is already used by an object that is defined elsewhere.
         """
         if value is None:
             return lambda decorated: self.register(name, decorated)
         origin = _origin(value)
-        known = self._origins.get(name, origin)
-        if name in self._entries and known != origin:
-            raise InputError(f"there is a {self.noun} {name!r} already, from {known[0]}: choose another name")
+        existing = self._origins.get(name, origin)
+        if name in self._entries and existing != origin:
+            raise InputError(f"there is a {self.noun} {name!r} already, from {existing[0]}: choose another name")
         self._entries[name], self._origins[name] = value, origin
         return value
 
     def get(self, name: str) -> Entry:
-        """The entry of that name.
+        """Return the entry of a name.
 
         Raises:
-            InputError: if there is none, the sentence has the nearest name or all of them; or if it is no word.
+            InputError: If there is no such entry, or the name is not a string.
         """
         if not isinstance(name, str):
             raise InputError(f"a {self.noun} is named by a word, not {brief(name)}: {did_you_mean('', self.names())}")
@@ -79,19 +80,19 @@ class Registry(Generic[Entry]):
             import_module(self._modules[name])
         if name not in self._entries and name in self._points:
             value = self._points[name].load()
-            if name not in self._entries:  # its module may have registered it while it was imported
+            if name not in self._entries:  # importing the module may have registered it
                 self.register(name, value)
         if name not in self._entries:
             raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 
     def names(self) -> list[str]:
-        """The names of all entries, sorted."""
+        """Return the names of all entries, sorted."""
         return sorted({*self._modules, *self._points, *self._entries})
 
     @cached_property
     def _modules(self) -> dict[str, str]:
-        """The module of each name that the package's own modules register."""
+        """Module of each name that the modules of the package register."""
         files = {
             ".".join((package, *file.relative_to(folder).with_suffix("").parts)): file
             for package in self._packages
@@ -115,7 +116,13 @@ class Registry(Generic[Entry]):
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:
-    """The end of a sentence about an unknown name: the nearest known one, else all of them and what else helps."""
+    """Return the end of a message about an unknown name: the closest known name, or all of them.
+
+    Args:
+        name: Unknown name.
+        known: Known names.
+        otherwise: Text after the list of all names.
+    """
     known = sorted(known)
     lower = {word.lower(): word for word in known}
     near = difflib.get_close_matches(str(name).lower(), lower, n=1)
@@ -128,7 +135,7 @@ def _folders(package: str) -> list[Path]:
 
 
 def _registered(source: str, decorator: str) -> Iterator[str]:
-    """The names with which a module's text calls `decorator`."""
+    """Return the names with which the source of a module calls `decorator`."""
     if not re.search(rf"\b{decorator}\(\s*[\"']", source):  # parsing takes longer
         return
     for node in ast.walk(ast.parse(source)):
@@ -139,10 +146,10 @@ def _registered(source: str, decorator: str) -> Iterator[str]:
 
 
 def _origin(value: object) -> tuple[str, str]:
-    """Where something was defined, a file or a module, and as what: imported again, it is the same thing again.
+    """Return the file or module in which an object is defined, and its qualified name.
 
-    An entry that is a record is told by what it builds with. A module's file counts, not its name: the same file can be
-    imported under several.
+    The origin identifies the object when its module is imported again, possibly under another name. The origin of an
+    entry with an attribute `build` is that of the attribute.
     """
     defined: Any = value if hasattr(value, "__qualname__") else getattr(value, "build", value)
     while isinstance(defined, partial):

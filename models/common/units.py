@@ -1,4 +1,4 @@
-"""Units that are not SI's own, in SI's."""
+"""Units outside SI, in SI units."""
 
 import math
 

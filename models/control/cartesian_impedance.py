@@ -1,6 +1,6 @@
-"""The law of a Cartesian impedance: a spring to a desired pose, and a damper that suits the spring and the inertia.
+"""Cartesian impedance law: a spring to the desired pose, and a damper designed from the spring and the inertia.
 
-Every vector of six here is [translational, rotational], and everything is in the axes of one frame.
+Vectors of six are [translational, rotational], and all quantities are expressed in one frame.
 """
 
 from __future__ import annotations
@@ -14,17 +14,22 @@ from guiderail.models.common.arrays import cross
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 
-# Towards a singular posture the arm gets ever heavier at the tool, in the direction that it loses. Up to the first mass
-# [kg] a direction is the impedance's alone, from the second on the posture's; usual ones weigh 1 to 50 kg.
+# Towards a singular posture, the effective mass at the tool grows in the direction that is lost. Up to the first mass
+# [kg] only the impedance acts in a direction, from the second on only the posture's torque; usual are 1 to 50 kg.
 LIGHT, HEAVY = 300.0, 3000.0
-# The distance from the tool centre at which a turning tool counts as a mass [m].
-LEVER = 0.25
+LEVER = 0.25  # distance from the tool centre that converts rotational to translational quantities [m]
 _SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 
 
 @dataclass(frozen=True)
 class JointTorques:
-    """What a step of the law leads to; `wrench` (6,) is the impedance's, `torque` (n,) what is sent."""
+    """Result of the law.
+
+    Attributes:
+        torque: Joint torques to command (n,) [Nm].
+        wrench: Wrench of the impedance (6,) [N, Nm].
+        is_saturated: True if a wrench or a torque is at its limit.
+    """
 
     torque: np.ndarray
     wrench: np.ndarray
@@ -32,16 +37,17 @@ class JointTorques:
 
 
 def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.ndarray) -> np.ndarray:
-    """The wrench of the potential ½ eᵀ K e, e = [p_error, 2ε], at an orientation error of quaternion (η, ε).
+    """Compute the wrench (6,) of the potential ½ eᵀ K e with e = [p_error, 2ε].
 
-    Its rotational part is E(η, ε)ᵀ times that of K e, E = η I + [ε]× (Caccavale, Natale, Siciliano, Villani 1999):
-    exactly the potential's gradient, so that a spring never gives back more than it was given. For small errors it is
-    K times the rotation vector.
+    The rotational part is E(η, ε)ᵀ times that of K e with E = η I + [ε]× (Caccavale, Natale, Siciliano, Villani 1999).
+    This is the gradient of the potential, so that the spring is passive. For small errors it is K times the rotation
+    vector.
 
     Args:
-        K: stiffness (6, 6), symmetric, positive definite.
-        p_error: desired minus actual position, (3,).
-        eta, epsilon: of R_desired Rᵀ.
+        K: Stiffness (6, 6), symmetric, positive definite.
+        p_error: Desired minus actual position (3,) [m].
+        eta: Scalar part of the quaternion of R_desired Rᵀ.
+        epsilon: Vector part (3,) of that quaternion.
     """
     generalized = K @ np.concatenate([p_error, 2.0 * epsilon])
     torque = generalized[3:]
@@ -49,11 +55,11 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
 
 
 def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: float) -> np.ndarray:
-    """D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ: every mode of the pair (K, Λ) has the damping ratio ζ.
+    """Compute D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ, which gives every mode of (K, Λ) the damping ratio ζ.
 
     Args:
-        K: stiffness (6, 6), symmetric, positive definite.
-        Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, the inertia at the tool, inverted.
+        K: Stiffness (6, 6), symmetric, positive definite.
+        Lambda_inverse: Inverse inertia at the tool, Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6).
         damping_ratio: ζ.
     """
     L_modes, eigenvalues = _modes(K, _root_of_inverse(Lambda_inverse))
@@ -61,8 +67,8 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
 
 
 def _root_of_inverse(Lambda_inverse: np.ndarray) -> np.ndarray:
-    """R⁻¹, (6, 6), lower triangular, of Λ⁻¹ = R Rᵀ: Λ = R⁻ᵀ R⁻¹, and nothing else has to be inverted."""
-    # LAPACK itself: what NumPy does around six numbers takes longer than they do.
+    """Compute R⁻¹ (6, 6), lower triangular, of Λ⁻¹ = R Rᵀ, so that Λ = R⁻ᵀ R⁻¹."""
+    # LAPACK is called directly: NumPy's overhead exceeds the computation for matrices of six rows.
     R, failed = lapack.dpotrf(Lambda_inverse, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("the inertia at the tool is not positive definite")
@@ -70,7 +76,7 @@ def _root_of_inverse(Lambda_inverse: np.ndarray) -> np.ndarray:
 
 
 def _modes(K: np.ndarray, R_inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """L U with L = R⁻ᵀ, Λ = L Lᵀ and (L U)ᵀ Λ⁻¹ L U = 1, U the eigenvectors of L⁻¹ K L⁻ᵀ, and its eigenvalues, (6,)."""
+    """Compute L U with L = R⁻ᵀ, Λ = L Lᵀ, and the eigenvectors U and eigenvalues (6,) of L⁻¹ K L⁻ᵀ."""
     R = lapack.dtrtri(R_inverse, lower=1)[0]
     eigenvalues, modes, failed = lapack.dsyevd(R.T @ K @ R, lower=1)
     if failed:
@@ -83,10 +89,10 @@ def _dampings(eigenvalues: np.ndarray, damping_ratio: float) -> np.ndarray:
 
 
 def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
-    """Λ without the directions that a singular arm has lost: each eigenvalue, a mass m, times its share of [0, 1].
+    """Compute Λ without the directions that a singular arm has lost.
 
-    The share falls smoothly with log m, from 1 at `LIGHT` to 0 at `HEAVY`: a damped inverse of Λ⁻¹ that damps nothing
-    where the arm is regular. It is what makes the posture's torque act where the tool's wrench can't.
+    Each eigenvalue, a mass m, is multiplied by a factor that falls smoothly with log m, from 1 at `LIGHT` to 0 at
+    `HEAVY`. The result equals Λ for a regular arm. It lets the posture's torque act where the tool's wrench cannot.
 
     Args:
         Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6), positive definite, [translational, rotational].
@@ -114,24 +120,29 @@ def impedance_torques(
     gravity_torque: np.ndarray,
     torque_limits: np.ndarray,
 ) -> JointTorques:
-    """τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to what the motors can.
+    """Compute τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to the torque limits.
 
-    The wrench is clipped per axis, spring and damper together: whatever happens, the tool pushes with no more, and it
-    still follows a fast command, where the two cancel. N = I − Jᵀ Λ J M⁻¹ leaves of the posture's torque what
-    accelerates no part of the tool's pose.
+    The sum of spring and damper is clipped per axis: the tool never pushes with more, and it can still follow a fast
+    command, for which the two cancel. N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the
+    tool.
 
     Args:
-        K: stiffness (6, 6) in the axes of the stiffness frame.
+        K: Stiffness (6, 6) in the axes of the stiffness frame.
         damping_ratio: ζ of every mode.
-        wrench_limits: (6,) along the axes of the stiffness frame [N, Nm].
-        R_axes: from the stiffness frame's axes to those of everything else, (3, 3); None where they are the same.
-        p_error, eta, epsilon: see `spring_wrench`.
-        J: geometric Jacobian of the tool centre, (6, n).
-        M: mass matrix with the rotors' reflected inertia, (n, n).
-        v: joint velocities (n,).
-        posture_torque: what would pull the joints to their posture, (n,).
-        gravity_torque: what holds the arm's weight, (n,).
-        torque_limits: (n,) [Nm].
+        wrench_limits: Limits (6,) along the axes of the stiffness frame [N, Nm].
+        R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None if they are equal.
+        p_error: Position error (3,), as in `spring_wrench`.
+        eta: Orientation error, as in `spring_wrench`.
+        epsilon: Orientation error (3,), as in `spring_wrench`.
+        J: Geometric Jacobian of the tool centre (6, n).
+        M: Mass matrix (n, n), including the reflected rotor inertia.
+        v: Joint velocities (n,) [rad/s].
+        posture_torque: Torque (n,) that pulls the joints to their preferred posture [Nm].
+        gravity_torque: Gravity compensation (n,) [Nm].
+        torque_limits: Torque limits (n,) [Nm].
+
+    Raises:
+        LinAlgError: If the mass matrix or the inertia at the tool is not positive definite.
     """
     if R_axes is not None:
         R = np.zeros((6, 6))
@@ -145,28 +156,28 @@ def impedance_torques(
     R_inverse = _root_of_inverse(Lambda_inverse)
     L_modes, eigenvalues = _modes(K, R_inverse)
     damping = L_modes @ (_dampings(eigenvalues, damping_ratio) * (L_modes.T @ (J @ v)))
-    wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
-    along_axes = wanted_wrench if R_axes is None else R.T @ wanted_wrench
+    unlimited_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
+    along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
     wrench = _clipped(along_axes, wrench_limits)
     if R_axes is not None:
         wrench = R @ wrench
     tool_acceleration = M_inverse_JT.T @ posture_torque
     if _is_regular(R_inverse):
-        leak = R_inverse.T @ (R_inverse @ tool_acceleration)  # the tool wrench of the posture's torque
+        leak = R_inverse.T @ (R_inverse @ tool_acceleration)  # tool wrench of the posture's torque
     else:
         leak = reachable_inertia(Lambda_inverse) @ tool_acceleration
-    wanted_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
-    torque = _clipped(wanted_torque, torque_limits)
-    is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != wanted_torque).any())
+    unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
+    torque = _clipped(unlimited_torque, torque_limits)
+    is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != unlimited_torque).any())
     return JointTorques(torque, wrench, is_saturated)
 
 
 def _is_regular(R_inverse: np.ndarray) -> bool:
-    """Whether no direction weighs more than `LIGHT`, for certain: all six together don't."""
+    """Return True if the trace of the scaled inertia, and so its largest eigenvalue, is less than `LIGHT`."""
     scaled = R_inverse / _SCALE
     return float(np.vdot(scaled, scaled)) < LIGHT
 
 
 def _clipped(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    # Twice as fast as np.clip on a handful of numbers; this runs at every step of a plant.
+    # Twice as fast as np.clip for a few numbers; this runs at every step of a plant.
     return np.minimum(np.maximum(values, -limits), limits)

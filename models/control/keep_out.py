@@ -1,4 +1,4 @@
-"""Active constraints made by hand: stop before walls and boundaries (thesis, section 4.4.1)."""
+"""Manually defined active constraints: stop before walls and boundaries (thesis, section 4.4.1)."""
 
 import math
 
@@ -8,28 +8,28 @@ from guiderail.models.primitives import LinearConstraints
 
 
 class KeepOut:
-    """Axis-aligned boxes not to enter and linear constraints to keep, both at a distance.
+    """Axis-aligned boxes that must not be entered and linear constraints, both with a margin.
 
-    A commanded position is projected to the nearest allowed one, and the robot then goes towards that in a straight
-    line, until just before it would enter a box: a big step can't jump through a wall.
+    A commanded position is projected to the nearest allowed one. The motion towards it stops before it would enter a
+    box, so that a large step cannot jump through a wall.
 
     Attributes:
-        margin: the distance kept, in the unit of a position.
+        margin: Distance from boxes and constraints [unit of a position].
     """
 
-    #: How far before a box a motion stops, so that rounding can't put it inside.
-    _GAP = 1e-6
+    _GAP = 1e-6  # distance from a box at which a motion stops, so that rounding cannot put it inside
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, constraints: LinearConstraints, margin: float):
-        """
+        """Check the arguments.
+
         Args:
-            lower: (B, O) lower corners of the boxes.
-            upper: (B, O) upper corners; a box may extend to infinity.
-            constraints: G y ≥ c on (O,) positions, the same at every step.
-            margin: the distance to keep from boxes and constraints, not negative.
+            lower: Lower corners of the boxes (B, O).
+            upper: Upper corners of the boxes (B, O); a box may extend to infinity.
+            constraints: G y ≥ c on positions (O,), the same at every step.
+            margin: Distance from boxes and constraints, not negative.
 
         Raises:
-            ValueError: if shapes don't fit, a box is empty, or the margin is negative.
+            ValueError: If shapes do not match, a box is empty, or the margin is negative.
         """
         self._lower = np.atleast_2d(np.asarray(lower, dtype=float))
         self._upper = np.atleast_2d(np.asarray(upper, dtype=float))
@@ -42,43 +42,51 @@ class KeepOut:
         self.margin = float(margin)
         norms = np.linalg.norm(constraints.G, axis=1)
         self._constraints = LinearConstraints(constraints.G, constraints.c + self.margin * norms)
-        # A few boxes in the plane or in space: plain numbers are several times faster than arrays of two.
+        # For a few boxes in the plane or in space, Python numbers are several times faster than small arrays.
         self._boxes = [(lower.tolist(), upper.tolist()) for lower, upper in zip(self._lower, self._upper, strict=True)]
 
     @property
     def num_outputs(self) -> int:
-        """O."""
+        """Number of outputs O."""
         return self._lower.shape[1]
 
     def project(self, position: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Where to go instead of `desired` (O,) from `position` (O,), and whether a box is the reason for it."""
-        target, pushed = self._outside(self._inside(desired))
-        if pushed:
-            target = self._inside(target)
+        """Project a desired position to an allowed one.
+
+        Args:
+            position: Current position (O,).
+            desired: Desired position (O,).
+
+        Returns:
+            The allowed position (O,), and True if a box changed it.
+        """
+        target, was_in_box = self._project_to_faces(self._project_to_constraints(desired))
+        if was_in_box:
+            target = self._project_to_constraints(target)
         reach = self._free_fraction(position.tolist(), target.tolist())
         if reach < 1.0:
             length = float(np.linalg.norm(target - position))
             return position + max(reach - self._GAP / length, 0.0) * (target - position), True
-        return target, pushed
+        return target, was_in_box
 
-    def _inside(self, desired: np.ndarray) -> np.ndarray:
-        """The nearest point within the constraints."""
+    def _project_to_constraints(self, desired: np.ndarray) -> np.ndarray:
+        """Return the nearest point within the constraints."""
         G, c = self._constraints.G, self._constraints.c
         violation = c - G @ desired
         if not violation.size or violation.max() <= 0:
             return desired
-        # Where moving straight out of the worst one is enough, that is the nearest point, and no QP is needed.
+        # If the projection to the most violated constraint satisfies all of them, no QP is needed.
         worst = int(np.argmax(violation))
         nearest = desired + violation[worst] / (G[worst] @ G[worst]) * G[worst]
         if (c - G @ nearest).max() <= 1e-12:
             return nearest
         return self._constraints.nearest(desired)
 
-    def _outside(self, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """The nearest point on a face of the boxes that `desired` is in."""
-        point, pushed, margin = desired.tolist(), False, self.margin
+    def _project_to_faces(self, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the nearest point on a face of the boxes that contain `desired`, and True if there is such a box."""
+        point, was_in_box, margin = desired.tolist(), False, self.margin
         for lower, upper in self._boxes:
-            # Depth below each face: (depth, axis, where the face is).
+            # For each face: depth below it, axis, position.
             faces = [
                 face
                 for axis, x in enumerate(point)
@@ -87,31 +95,31 @@ class KeepOut:
                     (upper[axis] + margin - x, axis, upper[axis] + margin + self._GAP),
                 )
             ]
-            depth, axis, where = min(faces)
+            depth, axis, face_position = min(faces)
             if depth > 0:
-                point[axis] = where
-                pushed = True
-        return np.array(point), pushed
+                point[axis] = face_position
+                was_in_box = True
+        return np.array(point), was_in_box
 
     def _free_fraction(self, start: list[float], end: list[float]) -> float:
-        """How much of the way from `start` to `end` is outside all boxes: 1 for all of it."""
+        """Return the fraction of the line from `start` to `end` before it enters a box."""
         free = 1.0
         for lower, upper in self._boxes:
-            # A robot that is already nearer to a box than the margin, or in it (someone pushed it), may leave but not
-            # come nearer: the box is taken as small as that.
+            # A robot that is already closer to a box than the margin, or inside it (after a push), may leave but not
+            # come closer: the margin is reduced to its clearance.
             clearance = max(max(a - x, x - b) for a, b, x in zip(lower, upper, start, strict=True))
             margin = min(clearance, self.margin)
             enter, leave = -math.inf, math.inf
             for a, b, x, y in zip(lower, upper, start, end, strict=True):
                 a, b, way = a - margin, b + margin, y - x
                 if way == 0:
-                    # Parallel to two faces: between them all the way, or never.
+                    # Parallel to two faces: always between them, or never.
                     if not a < x < b:
                         leave = -math.inf
                     continue
                 first, second = (a - x) / way, (b - x) / way
                 enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
-            # It starts outside, so that less than zero is rounding, or a box that it already left behind.
+            # The start is outside, so that a negative value is a rounding error, or the box is behind it.
             if -1e-9 <= enter < min(leave, free):
                 free = max(enter, 0.0)
         return free

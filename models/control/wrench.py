@@ -1,4 +1,4 @@
-"""The wrench of the surroundings on a tool, from what a wrist feels and how the tool moves."""
+"""External wrench on a tool from the wrist's reaction and the tool's motion, and its center of pressure."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import numpy as np
 from guiderail.models.common.arrays import cross
 
 
-def center_of_pressure(wrench: np.ndarray, least_force: float) -> np.ndarray:
-    """(−τ_y, τ_x) / f_z of a wrench (6,) about a tool centre: from there to where it pushes, (2,) [m].
+def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
+    """Compute the center of pressure (−τ_y, τ_x) / f_z relative to the tool centre, (2,) [m].
 
-    Zero where f_z is less than `least_force` [N]: a torque divided by next to nothing says nothing.
+    Args:
+        wrench: Wrench about the tool centre (6,), force first [N, Nm].
+        min_force: Smallest normal force f_z [N]; below it the result is zero, because the quotient is not reliable.
     """
-    if wrench[2] < least_force:
+    if wrench[2] < min_force:
         return np.zeros(2)
     return np.array([-wrench[4], wrench[3]]) / wrench[2]
 
@@ -20,19 +22,20 @@ def center_of_pressure(wrench: np.ndarray, least_force: float) -> np.ndarray:
 def external_wrench(
     F_reaction: np.ndarray, M: np.ndarray, V: np.ndarray, A: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:
-    """Newton and Euler for a rigid tool: F_external = M A + bias(V) − M [0, g] − F_reaction.
+    """Compute the external wrench on a rigid tool, F_external = M A + bias(V) − M [0, g] − F_reaction.
 
-    All spatial vectors are [rotational, translational] (6,), about one point P of the tool and in the axes of one
-    frame, which may be any; M is the tool's spatial inertia (6, 6) about P in those axes.
+    Spatial vectors are [rotational, translational] (6,), about one point P of the tool, and expressed in one frame,
+    which may be any.
 
     Args:
-        F_reaction: of the wrist on the tool.
-        M: mass [kg] and inertia.
-        V, A: spatial velocity and acceleration of the tool at P, in an inertial frame.
-        gravity: (3,) [m/s²].
+        F_reaction: Wrench of the wrist on the tool (6,).
+        M: Spatial inertia of the tool about P (6, 6).
+        V: Spatial velocity of the tool at P in an inertial frame (6,).
+        A: Spatial acceleration of the tool at P in an inertial frame (6,).
+        gravity: Gravity vector (3,) [m/s²].
 
     Returns:
-        The wrench of the surroundings on the tool, [torque, force] (6,).
+        The wrench of the surroundings on the tool (6,), [torque, force].
     """
     omega = V[:3]
     momentum = M[:, :3] @ omega  # I ω, and m ω × p_PCom by the inertia's own coupling block

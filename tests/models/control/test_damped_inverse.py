@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.control.damped_inverse import LEVER, REGULAR, damped_joint_velocities, follows
+from guiderail.models.control.damped_inverse import LEVER, REGULAR, damped_joint_velocities, is_following
 
 SCALE = np.array([LEVER] * 3 + [1.0] * 3)
 
@@ -60,9 +60,9 @@ def test_a_lost_direction_is_left_to_what_is_preferred():
 def test_following_is_going_there():
     J = np.eye(6)
     V = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
-    assert follows(J, V, V)
-    assert follows(J, 0.05 * V, V)
-    assert not follows(J, 0.001 * V, V)
-    assert not follows(J, -V, V)
-    assert not follows(J, V + [0, 0, 0, 0, 0.05, 0], V)
-    assert follows(J, np.zeros(6), 1e-3 * V)
+    assert is_following(J, V, V)
+    assert is_following(J, 0.05 * V, V)
+    assert not is_following(J, 0.001 * V, V)
+    assert not is_following(J, -V, V)
+    assert not is_following(J, V + [0, 0, 0, 0, 0.05, 0], V)
+    assert is_following(J, np.zeros(6), 1e-3 * V)

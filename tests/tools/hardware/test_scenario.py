@@ -107,5 +107,5 @@ directives:
     lost = load_scenario(
         written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'file:///nowhere.sdf'}}]\n")
     )
-    with pytest.raises(InputError, match="can't be added"):
+    with pytest.raises(InputError, match="can't be processed"):
         SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=lost.directives)
