@@ -78,7 +78,7 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
 
 
 def _check_clock(times: np.ndarray, period: float) -> None:
-    """Refuse a reference trajectory whose steps are not control periods; `times` are (N,) [s]."""
+    """Refuse a reference trajectory with steps other than control periods; `times` are (N,) [s]."""
     steps = np.diff(times)
     if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
         raise InputError(

@@ -282,7 +282,7 @@ class GuidedEnv(DrakeGymEnv):
         return None
 
     def push(self, displacement: np.ndarray) -> None:
-        """Displace the robot, as an operator who pushes it between two control steps.
+        """Displace the robot, as a push by an operator between two control steps would.
 
         Args:
             displacement: Displacement of the pose, (O,).

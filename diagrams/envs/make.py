@@ -33,14 +33,14 @@ from guiderail.models.common.errors import InputError
 
 Built = TypeVar("Built")
 
-logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO, whose messages are for developers of Drake
+logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO
 
 
 class DiagramPool(Generic[Built]):
     """Pool of built diagrams, for reuse by later environments with the same configuration.
 
     A diagram that contains a LeafSystem written in Python is never freed: C++ holds references to the system's methods,
-    the methods hold the system, and no garbage collector sees this cycle. Reuse is safe because everything that changes
+    the methods hold the system, and no garbage collector finds this cycle. Reuse is safe because everything that changes
     during a simulation is in a context, and each environment creates its own.
     """
 
@@ -188,7 +188,7 @@ def _build(task: Task, render_mode: str | None) -> _Built:
 
 
 def _key(task: Task, render_mode: str | None) -> Hashable:
-    """Return a key that is equal for environments whose diagrams are the same."""
+    """Return a key that is equal for environments with equal diagrams."""
     config = task.config
     options = config.options
     options |= {name: tuple(sorted(value.items())) for name, value in options.items() if isinstance(value, dict)}

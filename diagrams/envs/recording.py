@@ -18,7 +18,7 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """Station whose commands come from a system with a (6,) output, are held for a control period, and recorded."""
+    """Station that is commanded by a system with a (6,) output, held for a control period, and recorded."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class DrivenStation:
 
         Args:
             station: Station; it becomes part of the diagram.
-            source: System whose first output is the desired pose, such as a trajectory, an input device or a policy.
+            source: System with the desired pose as first output, such as a trajectory, an input device or a policy.
             num_samples: Largest number of control periods to record.
             add_to_builder: Function of the builder and the station that is called before the diagram is built, to add
                 a camera or a visualizer.

@@ -32,7 +32,7 @@ PORTS = (
 
 
 def round_period(seconds: float) -> float:
-    """Return the nearest period, at most a picosecond away, whose multiples are exact in double precision.
+    """Return the nearest period, at most a picosecond away, with multiples that are exact in double precision.
 
     Drake triggers two events together only if their times are equal, and fl(10 k · 0.002), fl(0.02 + k · 0.02) and
     fl(k · 0.02) often differ in the last bit: the plant would then step once more or once less between two control

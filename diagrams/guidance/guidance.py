@@ -83,7 +83,7 @@ class Guidance(Diagram):
 
 
 def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, kind: str = "") -> None:
-    """Refuse a diagram whose ports do not fit a station.
+    """Refuse a diagram with ports that do not fit a station.
 
     Args:
         guidance: Diagram.

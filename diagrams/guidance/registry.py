@@ -99,7 +99,7 @@ def register_guidance(
 
 
 def possible_guidance(known: Collection[str]) -> list[str]:
-    """Return the names of all kinds of guidance whose requirements are among `known`."""
+    """Return the names of all kinds of guidance with requirements among `known`."""
     return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).missing_requirements(known)]
 
 

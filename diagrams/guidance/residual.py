@@ -27,7 +27,7 @@ class ResidualDescent(Guidance):
         """Construct the guidance.
 
         Args:
-            prior: Prior knowledge with an approach, and with a template whose active constraints are enforced. Its only
+            prior: Prior knowledge with an approach and with a template, for its active constraints. The template's only
                 object is the frame in which poses are given.
         """
         super().__init__()

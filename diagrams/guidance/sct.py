@@ -113,7 +113,7 @@ class SctGuidance(Guidance):
             template: Shared control template.
             frames: Poses X_WF of its objects by name; W is the frame of all poses.
             period: Control period [s].
-            input_mapping: Second template whose initial state maps the inputs instead of `template`. The active
+            input_mapping: Second template that maps the inputs, in its initial state, instead of `template`. The active
                 constraints are then a safety filter, for example for a plain end-effector velocity.
             active_constraints: False commands the requested pose without constraints.
             max_tracking_error: Distance between the robot and its command beyond which the command waits [m].

@@ -1,4 +1,4 @@
-"""Base class of insertion tasks: a workpiece in the tool and a fixture whose position is not exactly known."""
+"""Base class of insertion tasks: a workpiece in the tool and a fixture at an uncertain position."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ LARGEST_OFFSET = 4.0 * MM  # beyond it a plug does not stand on the rim of its s
 
 
 class FixtureOffsetOptions(Options):
-    """Options of a task whose fixture is offset from its nominal position."""
+    """Options of a task with a fixture that is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offset of the fixture: sampled per run, per episode, or none"

@@ -153,7 +153,7 @@ eval_set:
     assert list((lab.folder / "study").glob("*.csv"))
 
 
-def test_what_it_learned_is_a_plain_diagram(lab, trained):
+def test_learned_skill_is_a_plain_diagram(lab, trained):
     code = (
         "from pathlib import Path; import numpy as np; from pydrake.systems.analysis import Simulator\n"
         "from guiderail import make_skill; from guiderail.models.policy import Policy\n"
@@ -165,7 +165,7 @@ def test_what_it_learned_is_a_plain_diagram(lab, trained):
     assert lab("-c", code).split() == ["True"]
 
 
-def test_a_file_that_is_not_installed_serves_too(lab):
+def test_task_in_a_file_works_without_installation(lab):
     (lab.folder / "mine.py").write_text(
         "from guiderail import register_task\n"
         "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"

@@ -27,7 +27,7 @@ def policy(seen, moved):
 
 
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"])
-def test_another_difficulty_is_what_it_stands_for_and_keeps_what_was_chosen(task):
+def test_changed_difficulty_keeps_chosen_options(task):
     chosen = {"action_repeat": 3, "reward": "sparse"}
     standard, hard = (check_environment(task, chosen | more) for more in ({}, HARD))
     assert standard != hard | {"difficulty": "standard"}
@@ -55,7 +55,7 @@ def by_study(out):
     ],
     ids=["evaluate", "robustness", "study"],
 )
-def test_a_policy_is_judged_at_another_difficulty(ask, tmp_path, monkeypatch):
+def test_policy_is_evaluated_at_another_difficulty(ask, tmp_path, monkeypatch):
     def refuse(task, environment):
         raise _AskedFor(dict(environment))
 
@@ -96,7 +96,7 @@ def test_policy_is_refused_with_the_options_that_differ():
 
 
 @pytest.mark.parametrize("chosen", [{"difficulty": "hard"}, {"station": "arm", "action_repeat": 7}])
-def test_the_command_of_a_run_says_what_is_not_the_tasks_own(chosen):
+def test_command_of_a_run_names_options_beyond_defaults(chosen):
     words = command(configure("BncConnector", {"guidance": "kgrl", **chosen}), "out").split()
     given = [word for word in words if "=" in word]
     assert given == [f"{key}={value}" for key, value in chosen.items()]

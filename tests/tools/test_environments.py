@@ -6,14 +6,14 @@ from guiderail.tools.environments import changed_environment, check_environment,
 
 
 @pytest.mark.parametrize(("learned_on", "eval_set"), [("gantry", "mujoco"), ("gantry", "arm"), ("arm", "gantry")])
-def test_what_was_learned_on_one_station_is_judged_on_another(learned_on, eval_set):
+def test_run_of_one_station_is_evaluated_on_another(learned_on, eval_set):
     learned = check_environment("BncConnector", {"station": learned_on, "action_repeat": 3})
     there = check_environment("BncConnector", changed_environment("BncConnector", learned, {"station": eval_set}))
     assert (there["station"], there["action_repeat"]) == (eval_set, 3)
     assert there == check_environment("BncConnector", {"station": eval_set, "action_repeat": 3})
 
 
-def test_what_is_asked_for_and_the_other_station_does_not_have_is_refused():
+def test_option_that_the_other_station_lacks_is_refused():
     learned = check_environment("BncConnector", {"impedance_control": "cartesian"})
     assert changed_environment("BncConnector", learned, {}) == learned
     assert changed_environment("BncConnector", learned, {"station": "gantry"})["impedance_control"] == "cartesian"
@@ -27,7 +27,7 @@ def test_an_environment_of_no_station_takes_others():
     assert changed_environment("Bead", {"wall": 1.0}, {"station": "gantry"}) == {"wall": 1.0, "station": "gantry"}
 
 
-def test_a_file_is_run_once_as_long_as_it_stays_what_it_is(tmp_path, monkeypatch):
+def test_imported_file_runs_once_for_each_content(tmp_path, monkeypatch):
     monkeypatch.setitem(GUIDANCE._entries, "step_of_mine", None)  # no other test has this one
     file = tmp_path / "step_of_mine.py"
     declared = (

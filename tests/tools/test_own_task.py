@@ -92,7 +92,7 @@ def declare(of=Own, **attributes):
         ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
     ],
 )
-def test_a_declaration_of_the_wrong_kind_is_refused_where_it_is_made(attributes, says):
+def test_declaration_of_the_wrong_type_is_refused(attributes, says):
     with pytest.raises(InputError, match=says):
         declare(**attributes)
 
@@ -109,7 +109,7 @@ def test_a_declaration_of_the_wrong_kind_is_refused_where_it_is_made(attributes,
         ({"defaults": {"histroy": 5}}, "defaults of lab/Own sets no option 'histroy': did you mean history"),
     ],
 )
-def test_what_no_environment_can_be_made_of_is_a_sentence(attributes, says):
+def test_task_without_a_possible_environment_is_refused(attributes, says):
     declare(**attributes)
     with pytest.raises(InputError, match=says):
         EnvConfig.resolve("lab/Own", {})
@@ -120,7 +120,7 @@ def test_task_that_lacks_methods_is_refused_with_their_names():
         declare(of=Task, observation_terms=None, reward_terms=None, termination_terms=None)
 
 
-def test_settings_of_another_guidance_are_no_mistake():
+def test_settings_of_another_guidance_are_accepted():
     declare(difficulties={"standard": {}, "hard": {"history": 4}}, defaults={"guidance": "kmp"})
     assert EnvConfig.resolve("lab/Own", {"difficulty": "hard"}).options["guidance"] == "kmp"
 
@@ -142,7 +142,7 @@ def test_settings_of_another_guidance_are_no_mistake():
         ),
     ],
 )
-def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, says):
+def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
     declare(**attributes)
     with pytest.raises(InputError, match=says):
         first_step()
@@ -174,13 +174,13 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
         ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
     ],
 )
-def test_what_cannot_be_observed_is_refused_when_the_task_is_assembled(observed, says):
+def test_invalid_observation_term_is_refused(observed, says):
     declare(observation_terms=lambda self: observed)
     with pytest.raises(InputError, match=says):
         make_env("lab/Own", guidance="kmp")
 
 
-def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
+def test_observation_is_centred_and_scaled_by_entry():
     declare(observation_terms=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
     env = make_env("lab/Own", guidance="kmp")
     seen, _ = env.reset(seed=0)
@@ -189,21 +189,21 @@ def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
 
 
 @pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "desired_pose"])
-def test_no_reward_term_takes_the_place_of_a_safety_number(name):
+def test_reward_term_with_a_reserved_name_is_refused(name):
     declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
     with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):
         make_env("lab/Own", guidance="kmp")
 
 
 @pytest.mark.parametrize("name", INFO_KEYS)
-def test_nothing_that_a_reset_draws_takes_the_place_of_a_safety_number(name):
+def test_reset_value_with_a_reserved_name_is_refused(name):
     declare(reset=lambda self, *given: {name: -9.0})
     env = make_env("lab/Own", guidance="kmp")
     with pytest.raises(InputError, match=f"reset of lab/Own returns a value named {name!r}, which is reserved"):
         env.reset(seed=0)
 
 
-def test_a_term_can_have_the_name_of_what_only_this_guidance_has():
+def test_reward_term_may_have_the_name_of_a_guidance_port():
     declare(reward_terms=lambda self, num_actions: [RewardTerm("held_action", {"pose": 2}, self.reward)])
     env = make_env("lab/Own", guidance="kmp")
     env.reset(seed=0)
@@ -212,7 +212,7 @@ def test_a_term_can_have_the_name_of_what_only_this_guidance_has():
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number):
+def test_observation_that_is_not_finite_is_refused(number):
     def signals(self, builder, station):
         broken = builder.AddNamedSystem("broken", affine(np.eye(2), [0.0, number]))
         builder.Connect(station.get_pose_output_port(), broken.get_input_port())
@@ -227,7 +227,7 @@ def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number)
 
 
 @pytest.mark.parametrize("number", [0, None])
-def test_a_number_of_steps_that_a_constructor_gets_wrong_is_refused(number):
+def test_invalid_num_steps_of_a_constructor_is_refused(number):
     class Late(Own):
         def __init__(self, config):
             super().__init__(config)
@@ -238,7 +238,7 @@ def test_a_number_of_steps_that_a_constructor_gets_wrong_is_refused(number):
         make_env("lab/Own", guidance="kmp")
 
 
-def test_a_world_that_is_none_is_a_sentence():
+def test_workcell_that_is_none_is_refused():
     declare(workcell=lambda self: None)
     with pytest.raises(
         InputError, match=r"workcell\(\) of lab/Own returns nothing: let it return what station='plane'"
@@ -246,7 +246,7 @@ def test_a_world_that_is_none_is_a_sentence():
         make_env("lab/Own", guidance="kmp")
 
 
-def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
+def test_scope_is_training_without_held_out_conditions():
     declare()
     assert "conditions as in training" in evaluation_scope("lab/Own", {}, resample_offsets=False)
     words = describe_task_options("lab/Own")
@@ -257,7 +257,7 @@ def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
     assert describe_task_options("lab/Own")["reset: held_out"].startswith("sample held-out conditions")
 
 
-def test_collisions_are_counted_only_where_a_task_says_what_they_are():
+def test_collisions_are_counted_only_if_declared():
     declare()
     assert not _counts_collisions("lab/Own")
     declare(collision=Threshold("contact_force"))
@@ -265,7 +265,7 @@ def test_collisions_are_counted_only_where_a_task_says_what_they_are():
     assert all(map(_counts_collisions, ("BncConnector", "GridClamp", "Pouring", "NarrowPassage")))
 
 
-def test_a_task_of_ones_own_is_stressed_through_every_guidance_that_it_has():
+def test_own_task_is_fuzzed_with_every_guidance():
     declare()
     found = fuzz("lab/Own", episodes=3)
     assert found["failures"] == []
@@ -273,7 +273,7 @@ def test_a_task_of_ones_own_is_stressed_through_every_guidance_that_it_has():
     assert found["all"]["episodes"] == 3
 
 
-def test_a_file_finds_those_beside_it_and_what_fails_in_it_is_said(tmp_path):
+def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
     path = [*sys.path]
     (tmp_path / "beside_own.py").write_text("PERIOD = 3\n")
     good, wrong = tmp_path / "own_good.py", tmp_path / "own_wrong.py"

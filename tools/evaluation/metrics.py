@@ -358,7 +358,7 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
         rows: Table of episodes.
         names: Names of the statistics.
         prefix: Prefix of each name in the result.
-        task: Task of the episodes, whose own statistics may be named too.
+        task: Task of the episodes; its own statistics may be named too.
 
     Raises:
         InputError: If there is no statistic of a name, or the episodes lack a column that one is computed from.

@@ -1,4 +1,4 @@
-"""BncConnector: insert, align and lock a bayonet connector whose position is not exactly known (4.4.2, 5.4.2)."""
+"""BncConnector: insert, align and lock a bayonet connector at a position that is not exactly known (4.4.2, 5.4.2)."""
 
 from __future__ import annotations
 

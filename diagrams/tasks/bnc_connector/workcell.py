@@ -19,7 +19,7 @@ from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_
 from guiderail.models.objects.bnc_connector.surfaces import jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 
-# Pairs that cannot touch in a connector of these dimensions, or whose contact another surface carries.
+# Pairs that cannot touch in a connector of these dimensions, or with contact that another surface carries.
 FILTERED_PAIRS = [
     (("lug_0", "lug_1", "pad"), ("bore",)),
     (("barrel", "pad"), ("slots",)),

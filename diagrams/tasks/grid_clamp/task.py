@@ -40,7 +40,7 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-# [N] more than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m
+# [N] more than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm sideways, at 1500 N/m
 COLLISION_FORCE = 35.0
 START_HEIGHT = (0.015, 0.018)  # [m] the preceding skill hands over the clamp with its tips 3 to 6 mm above the table
 HEIGHTS = (0.013, 0.060)  # [m] range of start heights: above the table, and well inside the cuboid

@@ -91,7 +91,7 @@ class NarrowPassageOptions(Options):
 
 
 def avoids_obstacle_from(rows: Any, cost: float = 1.0, streak: int = 5) -> int | None:
-    """Return the first episode, from 1, that begins a streak of episodes whose obstacle cost is below `cost`, or None.
+    """Return the first episode, from 1, that begins a streak with obstacle costs below `cost`, or None.
 
     A path through the obstacle's middle costs about a hundred; a policy that explores touches its margin now and then.
 
@@ -266,7 +266,7 @@ class NarrowPassage(Task):
         return self._geometry.keep_out()
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """Return the phase and sampled obstacles, or the camera above the plane, whose image shows +y to the right."""
+        """Return the phase and sampled obstacles, or the camera above the plane, with +y to the right."""
         if self.config.observation == "state":
             offset = self.options.obstacle_beside
             obstacles = ObservationTerm("obstacles", self._geometry.obstacles.ravel(), offset or 1.0)

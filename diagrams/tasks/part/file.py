@@ -71,7 +71,7 @@ class Tolerance(Options):
     """Largest deviation of the plug from the target at success."""
 
     height: Number = Field(0.5 * MM, gt=0, description="along z [m]")
-    beside: Number = Field(1.0 * MM, gt=0, description="across z [m]")
+    lateral: Number = Field(1.0 * MM, gt=0, description="across z [m]")
     turn: Number = Field(4.0, gt=0, description="about z [degrees]")
     steps: int = Field(3, ge=1, description="consecutive control steps that count as success")
 

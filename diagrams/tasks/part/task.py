@@ -1,4 +1,4 @@
-"""Task of two meshes, whose folder declares every number."""
+"""Task of two meshes, with every number declared in its folder."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class PartInsertion(InsertionTask):
         tolerance = cls.file.tolerance
         return bool(
             abs(plug[2]) < tolerance.height
-            and np.hypot(plug[0], plug[1]) < tolerance.beside
+            and np.hypot(plug[0], plug[1]) < tolerance.lateral
             and abs(plug[5]) < tolerance.turn * DEGREE
         )
 

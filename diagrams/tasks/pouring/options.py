@@ -28,7 +28,7 @@ def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedCont
 def make_aimed_template(
     config: PouringConfig, input_speed: float, aim_speed: float, pour_speed: float
 ) -> SharedControlTemplate:
-    """The template whose Pour can be aimed; `aim_speed` and `pour_speed` are parts of the full speeds in Pour."""
+    """Return the template that can be aimed in Pour; `aim_speed` and `pour_speed` are fractions of its full speeds."""
     return _load("pouring_aimed", config, input_speed, aim_speed=aim_speed, pour_speed=pour_speed)
 
 
@@ -104,7 +104,7 @@ class PouringOptions(Options):
 
     @property
     def ball(self) -> Ball:
-        """Ball: a shell, whose mass grows with its surface."""
+        """Ball: a shell with a mass proportional to its surface."""
         default = Ball()
         return replace(
             default, diameter=self.ball_diameter, mass=default.mass * (self.ball_diameter / default.diameter) ** 2

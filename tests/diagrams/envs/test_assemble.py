@@ -35,7 +35,7 @@ def known(turn, station, period=PERIOD):
 
 
 @pytest.mark.parametrize("period", [0.01, 0.1])
-def test_a_motion_keeps_the_speed_at_which_it_was_demonstrated(period):
+def test_motion_of_another_period_is_refused(period):
     with pytest.raises(InputError, match="has another speed than was demonstrated"):
         known(1.0, GantryStation, period)
 
@@ -46,7 +46,7 @@ def test_a_clock_that_is_disturbed_is_no_other_demonstration():
 
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
-def test_a_half_turn_is_for_stations_whose_angles_do_not_jump(turn):
+def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
     """From −180° to 180° a measured angle jumps by a full turn, and a history of it would lead all the way round."""
     assert known(turn, GantryStation).demonstrations is not None
     for station in (ArmStation, HardwareStation):

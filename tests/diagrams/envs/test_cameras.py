@@ -18,7 +18,7 @@ env.step(env.action_space.sample())
 """
 
 
-def test_what_has_an_llvm_of_its_own_is_there_before_anything_is_rendered(tmp_path, monkeypatch):
+def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
     (tmp_path / "triton.py").write_text("")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "triton", raising=False)

@@ -98,7 +98,7 @@ def make(num_steps=20, **arguments):
     return env
 
 
-def test_info_says_everything_at_reset_and_at_every_step():
+def test_info_has_all_keys_at_reset_and_every_step():
     env = make()
     expected = {*INFO_KEYS, "double", "one"} - {"simulation_failure"}  # of an episode that is over
     _, info = env.reset(options={"start": 0.0})
@@ -110,7 +110,7 @@ def test_info_says_everything_at_reset_and_at_every_step():
     assert reward == pytest.approx(info["double"] + info["one"])
 
 
-def test_initialization_sees_the_new_episode():
+def test_initialization_reads_the_state_of_the_new_episode():
     env = make()
     env.reset(options={"start": 0.5})
     env.step([1.0])
@@ -167,7 +167,7 @@ def test_a_success_in_the_last_step_is_no_time_limit():
     assert (terminated, truncated, info["termination"], info["is_success"]) == (True, False, "success", True)
 
 
-def test_a_held_action_sums_the_reward_takes_the_worst_and_stops_early():
+def test_repeated_action_sums_rewards_and_stops_at_the_end():
     env = make(action_repeat=4)
     env.reset(options={"start": 0.0})
     _, reward, terminated, _, info = env.step([1.0])
@@ -214,7 +214,7 @@ def test_a_finite_action_is_clipped():
 
 
 @pytest.mark.parametrize("kind", [RuntimeError, ValueError, SystemExit, KeyboardInterrupt])
-def test_a_bug_in_the_wiring_is_not_mistaken_for_the_end_of_an_episode(kind):
+def test_wiring_error_is_raised_and_does_not_truncate(kind):
     env = make()
     env.reset()
     env.toy.error = kind("InputPort::Eval(): required InputPort[0] (u0) is not connected")
@@ -230,7 +230,7 @@ def test_a_bug_in_the_wiring_is_not_mistaken_for_the_end_of_an_episode(kind):
         SystemExit("Failure in SetPositionsAndVelocities(): condition 'AllFinite(q_v)' failed."),
     ],
 )
-def test_a_simulation_failure_truncates_with_the_last_sound_observation(error):
+def test_simulation_failure_truncates_with_the_last_observation(error):
     env = make()
     env.reset(options={"start": 0.0})
     before, *_ = env.step([1.0])
@@ -255,7 +255,7 @@ def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
     env.reset(options=None)
 
 
-def test_what_info_says_of_every_task_is_listed():
+def test_info_keys_are_listed():
     env = make(num_steps=2)
     _, info = env.reset()
     said = set(info) - set(env.drawn)
@@ -279,7 +279,7 @@ def test_stepping_on_after_the_end_is_refused():
         env.step([0.0])
 
 
-def test_metadata_is_nobody_elses():
+def test_metadata_is_not_shared_between_environments():
     before = dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)
     first, second = make(action_repeat=1), make(action_repeat=5)
     assert (dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)) == before
@@ -297,7 +297,7 @@ def test_metadata_is_nobody_elses():
         ({"action_repeat": True}, "action_repeat"),
     ],
 )
-def test_refuses_what_the_task_can_not_do(arguments, message):
+def test_env_refuses_unsupported_arguments(arguments, message):
     with pytest.raises(InputError, match=message):
         make(**arguments)
 

@@ -18,7 +18,7 @@ PAIRS = [(task, guidance) for task in OWN for guidance in GUIDANCE.names()]
 
 
 @pytest.mark.parametrize(("task", "guidance"), PAIRS)
-def test_a_pair_runs_or_says_what_is_missing(task, guidance):
+def test_pair_of_task_and_guidance_runs_or_names_what_is_missing(task, guidance):
     provides = TASKS.get(task).provides()
     if guidance not in possible_guidance(provides):
         with pytest.raises(InputError) as error:

@@ -31,7 +31,7 @@ def episode(env, seed):
 
 
 @pytest.mark.parametrize(("task", "options"), CASES)
-def test_an_episode_is_the_same_in_a_diagram_that_was_used_before(task, options):
+def test_episode_is_equal_in_a_reused_diagram(task, options):
     first = make_env(task, **options, action_repeat=2)
     diagram = first.task.diagram
     expected = episode(first, 3)
@@ -61,7 +61,7 @@ def test_two_environments_never_share_a_diagram():
         one.close()
 
 
-def test_a_diagram_whose_view_can_not_be_opened_is_free_again(monkeypatch):
+def test_diagram_is_given_back_when_its_view_cannot_open(monkeypatch):
     env = make_env("NarrowPassage")
     diagram = env.task.diagram
     env.close()
@@ -85,7 +85,7 @@ def test_a_closed_environment_stays_closed():
 
 
 @pytest.mark.parametrize(("render_mode", "close"), [(None, False), ("human", False), ("human", True)])
-def test_nothing_grows(close, render_mode):
+def test_memory_does_not_grow_with_environments(close, render_mode):
     process, after = psutil.Process(), []
     make_env("NarrowPassage", guidance="safe_residual").close()  # what the process starts once, and keeps
     before = held(process)
@@ -112,7 +112,7 @@ def held(process):
     return process.num_threads(), process.num_fds(), len(listening)
 
 
-def test_a_view_shows_the_scene_as_it_moves_and_changes_nothing():
+def test_view_follows_the_scene_without_side_effects():
     def motion(render_mode):
         env = make_env("NarrowPassage", guidance="safe_residual", render_mode=render_mode)
         env.simulator.set_target_realtime_rate(0.0)
@@ -134,7 +134,7 @@ def test_a_view_shows_the_scene_as_it_moves_and_changes_nothing():
     np.testing.assert_array_equal(poses, motion(None)[0])
 
 
-def test_pickling_says_what_to_do_instead():
+def test_pickling_is_refused_with_the_remedy():
     env = make_env("NarrowPassage")
     with pytest.raises(InputError, match=r"cannot be pickled: call gymnasium.make in the worker") as error:
         pickle.dumps(env)

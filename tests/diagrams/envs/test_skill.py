@@ -24,7 +24,7 @@ def policy(size):
 
 
 @pytest.mark.parametrize("task", CASES)
-def test_a_simulator_gives_bit_for_bit_what_the_environment_gives(task):
+def test_skill_diagram_matches_the_environment_bit_for_bit(task):
     env = make_env(task, **CASES[task])
     act = policy(env.action_space.shape[0])
     observation, _ = env.reset(seed=3)

@@ -25,7 +25,7 @@ def begun(task, options):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_a_reset_draws_reaches_a_diagram_that_is_used_again(case):
+def test_reset_values_reach_a_reused_diagram(case):
     first, expected = begun(*CASES[case])
     again, found = begun(*CASES[case])
     assert again is first

@@ -91,7 +91,7 @@ def test_the_command_does_not_jump_when_the_history_changes(skill):
     assert (np.linalg.norm(kgrl - commands, axis=1)[changes[:2]] > 1.1 * moved[changes[:2] - 1]).all()
 
 
-def test_constraints_hold_whatever_the_length(skill):
+def test_constraints_hold_for_every_history_length(skill):
     rng = np.random.default_rng(1)
     for _ in range(3):
         forces = 5.0 * (rng.random(STEPS) < 0.5)

@@ -73,7 +73,7 @@ def test_all_guidance_has_the_same_ports(skill, kind):
 
 
 @pytest.mark.parametrize("kind", PRIMITIVE_GUIDANCE)
-def test_doing_nothing_follows_the_demonstrations(skill, kind):
+def test_zero_action_follows_the_demonstrations(skill, kind):
     commands, fallback_steps = rollout(build(kind, skill), constant([0.0, 0.0]))
     means = skill.reference.means
     # Where the safe variants are not already avoiding what lies at x = 0.1.
@@ -95,7 +95,7 @@ def test_a_residual_is_alike_at_any_time_and_in_any_direction(skill):
     np.testing.assert_allclose(moved - still, constant(np.sqrt(3) * rms * np.array([1, -1])), atol=1e-12)
 
 
-def test_null_space_actions_go_as_far_as_the_demonstrations_varied(skill):
+def test_null_space_actions_scale_with_the_demonstrations(skill):
     free = replace(skill, constraints=LinearConstraints.none(2), keep_out=None)
     still, _ = rollout(build("kgrl", free), constant([0.0, 0.0]))
     moved, _ = rollout(build("kgrl", free), constant([1.0, 0.0]))
@@ -107,14 +107,14 @@ def test_null_space_actions_go_as_far_as_the_demonstrations_varied(skill):
 
 
 @pytest.mark.parametrize("kind", ["kgrl", "skgrl"])
-def test_null_space_guidance_keeps_the_constraints_whatever_the_action(skill, kind):
+def test_null_space_guidance_satisfies_constraints_always(skill, kind):
     rng = np.random.default_rng(0)
     for actions in (constant([1.0, 1.0]), rng.uniform(-1, 1, (STEPS, 2)), rng.choice([-1.0, 1.0], (STEPS, 2))):
         commands, _ = rollout(build(kind, skill), actions)
         assert commands[:, 0].max() <= 0.11 + 1e-9
 
 
-def test_the_safe_residual_stops_before_walls_and_says_so(skill):
+def test_safe_residual_stops_at_walls_and_reports_fallback(skill):
     commands, fallback_steps = rollout(build("safe_residual", skill), constant([1.0, 0.0]))
     unsafe, _ = rollout(build("residual", skill), constant([1.0, 0.0]))
     assert unsafe[:, 0].max() > 0.13
@@ -132,7 +132,7 @@ def test_smooth_guidance_starts_where_the_robot_is(skill):
     assert jump["skgrl"] < 0.005
 
 
-def test_a_measured_history_follows_the_robot_and_a_commanded_one_does_not(skill):
+def test_only_a_measured_history_follows_the_robot(skill):
     pushed = np.array([-0.05, 0.1])
 
     def command_after(source):
@@ -201,12 +201,12 @@ def test_nothing_is_computed_between_control_steps(skill):
         ("none", "'none' needs .*kmp"),
     ],
 )
-def test_a_pairing_that_makes_no_sense_is_refused_with_those_that_do(skill, kind, message):
+def test_impossible_guidance_is_refused_with_alternatives(skill, kind, message):
     with pytest.raises(InputError, match=message):
         build(kind, skill)
 
 
-def test_safe_residual_is_not_offered_where_nobody_wrote_down_what_to_avoid(skill):
+def test_safe_residual_is_not_offered_without_walls(skill):
     with pytest.raises(InputError, match=r"walls to keep out of, which BncConnector.*use kgrl, kmp, residual, skgrl"):
         build("safe_residual", replace(skill, keep_out=None), "BncConnector")
     assert check_guidance("kmp", ("demonstrations",)).label == "demonstration alone"

@@ -13,7 +13,7 @@ from guiderail.models.common.errors import InputError
 
 
 @pytest.mark.parametrize("size", [2, 3])
-def test_a_tasks_symmetry_is_not_one_of_actions_that_mean_something_else(size, monkeypatch):
+def test_symmetry_is_absent_when_actions_do_not_displace(size, monkeypatch):
     monkeypatch.setitem(GUIDANCE._entries, "of_mine", None)  # no other test has this one
 
     @register_guidance("of_mine")
@@ -27,7 +27,7 @@ def test_a_tasks_symmetry_is_not_one_of_actions_that_mean_something_else(size, m
     env.step(np.zeros(size))
 
 
-def test_where_an_action_displaces_the_explored_outputs_the_tasks_symmetry_holds():
+def test_symmetry_holds_when_actions_displace_outputs():
     displacing = {name for name in GUIDANCE.names() if GUIDANCE.get(name).displaces}
     assert displacing == {"kgrl", "skgrl", "residual", "safe_residual", "kmp"}
     env = make_env("BncConnector", guidance="kgrl")

@@ -66,7 +66,7 @@ def test_has_the_ports_of_all_guidance(template):
     check_guidance_ports(guidance, pose_size=6, wrench_size=6)
 
 
-def test_starts_where_the_robot_is_and_stays_there_without_an_input(template):
+def test_sct_stays_at_the_robots_pose_without_input(template):
     rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
     for _ in range(5):
         np.testing.assert_allclose(rig.step(np.zeros(3)), START, atol=1e-9)
@@ -81,7 +81,7 @@ def test_an_action_counts_from_the_next_instant_on_for_a_whole_period(template):
         np.testing.assert_allclose(moved[1], k * 0.15 * PERIOD, atol=1e-9)
 
 
-def test_goes_through_all_states_and_says_how_far_it_is(template):
+def test_sct_passes_all_states_and_reports_progress(template):
     rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
     states, progress, worst = [], [], 0.0
     for _ in range(600):
@@ -119,14 +119,14 @@ def test_objects_can_be_moved_at_a_reset(template):
     np.testing.assert_allclose(paths[0], paths[1], atol=1e-9)
 
 
-def test_without_active_constraints_it_does_what_it_is_asked(template):
+def test_sct_commands_the_request_without_constraints(template):
     rig = Rig(SctGuidance(template, MUG, PERIOD, active_constraints=False)).initialize()
     for _ in range(200):
         desired = rig.step(np.array([0.0, 0.0, -1.0]))
     assert desired[2] < 0.12 - 0.25  # through the table
 
 
-def test_a_velocity_is_filtered_like_anything_else(template):
+def test_velocity_input_is_filtered_by_the_constraints(template):
     velocity = load_template("end_effector_velocity")
     rig = Rig(SctGuidance(template, MUG, PERIOD, input_mapping=velocity)).initialize()
     rng = np.random.default_rng(0)

@@ -31,7 +31,7 @@ def test_every_solver_commands_the_same_and_keeps_the_constraint():
         assert violations.max() <= 1e-9
 
 
-def test_the_solver_is_chosen_from_the_shell_and_another_word_is_refused():
+def test_solver_option_is_parsed_and_unknown_ones_refused():
     assert check_environment("BncConnector", parse_environment(["solver=osqp"]))["solver"] == "osqp"
     with pytest.raises(InputError, match="there is no solver 'osq': did you mean osqp"):
         check_environment("NarrowPassage", parse_environment(["solver=osq"]))

@@ -80,7 +80,7 @@ def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
     assert rows["max_commanded_violation"].max() <= 1e-9
 
 
-def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
+def test_torque_search_finds_the_jack_in_any_episode(kgrl):
     rows = evaluate_policy(kgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
     assert rows["success"].sum() == 1
     assert rows["max_commanded_violation"].max() <= 1e-9
@@ -114,7 +114,7 @@ def felt(kmp):
     return felt
 
 
-def test_half_a_turn_of_everything_is_the_same_task(kmp, felt):
+def test_task_is_invariant_under_half_a_turn(kmp, felt):
     signs = np.diag(kmp.task.symmetry.observations[0])
     across = signs < 0
     seen, other = felt(1.0, 0.5), signs * felt(-1.0, -0.5)
@@ -169,7 +169,7 @@ def test_shaped_reward_adds_the_depth_gained():
     assert depth == pytest.approx(DEPTH_REWARD * (start - env.trace.measured[-1, 2]) / MM, abs=0.5)
 
 
-def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
+def test_aligned_reward_adds_distance_gained_to_the_jack():
     """From 2 mm beside the jack to where a constant action leads."""
     env = make_env("BncConnector", guidance="kgrl", reward="aligned", fixture_offset="none", action_repeat=10)
     env.reset(seed=0, options={"offset": (2.0 * MM, 0.0)})
@@ -179,7 +179,7 @@ def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
     assert gained == pytest.approx(ALIGNMENT_REWARD * nearer / MM, abs=0.5)
 
 
-def test_the_policy_of_the_rails_drives_the_arm_too():
+def test_policy_of_the_gantry_drives_the_arm():
     """The arm is slower to follow, and locks too."""
     env = make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode", station="arm")
     assert play(env, scripted_torque_search, seed=4, options={"offset": (0.0009, -0.0008)})[1]["is_success"]
@@ -256,7 +256,7 @@ def test_refuses_what_makes_no_sense(wrong):
         make_env("BncConnector", **wrong)
 
 
-def test_on_the_rim_a_quarter_turn_of_everything_feels_the_same(kmp, felt):
+def test_contact_on_the_rim_is_invariant_under_quarter_turns(kmp, felt):
     """Not exactly so: the demonstrations search the rim one way round."""
     near = kmp.task.near_symmetry
     assert len(near.actions) == 7

@@ -17,7 +17,7 @@ def drawn(uncertain, count, seed=0):
 
 
 @pytest.mark.parametrize("kind", ["per_run", "per_episode", "none"])
-def test_a_tilt_is_drawn_anew_within_its_bound_and_changes_nothing_else(kind):
+def test_tilt_is_sampled_within_bounds_without_side_effects(kind):
     straight, tilted = drawn(BncUncertainty(kind), 50), drawn(BncUncertainty(kind, grasp_angle=1.0), 50)
     assert np.shape(straight) == (50, 4)
     angles = np.linalg.norm(np.array(tilted)[:, 4:], axis=1)

@@ -34,7 +34,7 @@ def clamp():
 
 
 @pytest.mark.parametrize("task", HARD)
-def test_hard_is_what_its_numbers_say_and_each_can_be_given_by_itself(task):
+def test_hard_equals_its_options_given_one_by_one(task):
     standard, hard = (EnvConfig.resolve(task, {"difficulty": word}).options for word in ("standard", "hard"))
     assert {name for name in hard if hard[name] != standard[name]} == {"difficulty", *HARD[task]}
     assert {name: hard[name] for name in HARD[task]} == HARD[task]
@@ -44,7 +44,7 @@ def test_hard_is_what_its_numbers_say_and_each_can_be_given_by_itself(task):
 
 
 @pytest.mark.parametrize("task", HARD)
-def test_standard_is_what_it_was(task):
+def test_standard_is_unchanged(task):
     declared = EnvConfig.resolve(task, {}).make_task()
     drawn = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
     assert declared.workcell() == type(declared.workcell())(drawn)
@@ -59,7 +59,7 @@ def test_standard_is_what_it_was(task):
 JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.19223467197202893]  # [mm]
 
 
-def test_what_a_seed_draws_at_standard_is_what_it_drew():
+def test_samples_of_a_seed_at_standard_are_unchanged():
     """Of a generator, so the same everywhere."""
     fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(3)
     jack, plug = fixture_offset.draw(rng, InsertionReset())
@@ -93,14 +93,14 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("task", "wrong", "words"), WRONG)
-def test_what_is_out_of_range_is_refused_in_a_sentence(task, wrong, words):
+def test_options_out_of_range_are_refused(task, wrong, words):
     with pytest.raises(InputError) as refused:
         EnvConfig.resolve(task, wrong)
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_the_connector_at_its_hardest_is_searched_for_where_it_may_be(connector):
+def test_hard_demonstrations_search_the_offset_range(connector):
     declared = connector.unwrapped.task.declaration
     assert declared.workcell().dimensions.mouth_chamfer == 0.1 * MM
     assert declared.collision.above == 20.0
@@ -123,7 +123,7 @@ def test_a_turned_jack_is_turned():
     assert turn.angle() * turn.axis()[2] == pytest.approx(np.pi / 2 + info["jack_offset"][2])
 
 
-def test_the_lever_says_where_to_go(connector):
+def test_center_of_pressure_points_to_the_jack(connector):
     """Standing on the rim, the lever and the command lead to the jack."""
     observation, info = connector.reset(seed=4)
     while observation[9] < 0.15:
@@ -133,14 +133,14 @@ def test_the_lever_says_where_to_go(connector):
     assert lever @ info["jack_offset"] > 0.3 * np.linalg.norm(lever) * np.linalg.norm(info["jack_offset"])
 
 
-def test_at_its_hardest_the_rule_locks_and_the_demonstrations_do_not(connector):
+def test_scripted_policy_locks_at_hard_and_demonstrations_fail(connector):
     row = evaluate_policy(connector, scripted_center_of_pressure, episodes=1, **FRESH).iloc[0]
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
     assert not evaluate_policy(connector, zero_policy(connector), episodes=1, **FRESH)["success"].any()
 
 
-def test_at_its_hardest_the_rule_snaps_the_clamp_in_and_the_straight_descent_does_not(clamp):
+def test_gentle_search_succeeds_at_hard_and_descent_fails(clamp):
     assert evaluate_policy(clamp, scripted_gentle_search, episodes=1, **FRESH)["success"].all()
     assert not evaluate_policy(clamp, straight_descent, episodes=1, **FRESH)["success"].any()
 

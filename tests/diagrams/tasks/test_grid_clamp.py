@@ -62,7 +62,7 @@ def arm():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
+def test_straight_descent_inserts_without_offsets(known, seed):
     info, total, terms = play(known, lambda _: DOWN, seed=seed)
     assert info["termination"] == "success"
     assert known.trace.statistics()["peak_force"] <= 10.0
@@ -72,7 +72,7 @@ def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
     assert 300.0 * 0.014 < terms["shaping"] < 300.0 * 0.0185
 
 
-def test_an_aligned_reward_pays_what_comes_nearer_to_the_holes_and_costs_who_pushes_too_hard():
+def test_aligned_reward_pays_approach_and_costs_collisions():
     """Two millimetres beside, straight down onto the table, until it is too much."""
     env = make_env("GridClamp", reward="aligned", difficulty="hard")
     info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
@@ -84,14 +84,14 @@ def test_an_aligned_reward_pays_what_comes_nearer_to_the_holes_and_costs_who_pus
     assert sideways["alignment"] == pytest.approx(0.0, abs=1.5)
 
 
-def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
+def test_straight_descent_mostly_fails_with_offsets(env):
     """Pushed with 12 N for the whole 10 s."""
     rows = evaluate_policy(env, straight_descent, episodes=1, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 0
     assert rows["peak_force"].max() < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
-def test_the_searching_rule_inserts_where_the_straight_descent_fails(env):
+def test_search_inserts_where_the_descent_fails(env):
     rows = evaluate_policy(env, scripted_search, episodes=2, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 2
     assert rows["peak_force"].max() < 15.0

@@ -79,7 +79,7 @@ def test_both_env_checkers_pass_with_images(monkeypatch):
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
-def test_same_seed_same_episode_bit_for_bit_fresh_and_after_resets(guidance):
+def test_same_seed_repeats_an_episode_bit_for_bit(guidance):
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
 
@@ -108,7 +108,7 @@ def test_the_demonstrations_alone_pass_and_run_into_the_obstacle(guidance):
 
 
 @pytest.mark.parametrize(("guidance", "action_repeat", "first"), [("kgrl", 5, 0), ("skgrl", 1, 1)])
-def test_no_adversary_makes_null_space_guidance_violate_collide_or_fail(guidance, action_repeat, first):
+def test_null_space_guidance_withstands_adversaries(guidance, action_repeat, first):
     env = make(guidance, action_repeat=action_repeat)
     for policy in islice(adversaries(), first, None, 2):
         _, _, infos = play(env, policy)
@@ -124,7 +124,7 @@ def test_no_adversary_makes_null_space_guidance_violate_collide_or_fail(guidance
 
 
 @pytest.mark.parametrize("guidance", NULL_SPACE)
-def test_no_sequence_of_actions_at_all_leads_into_the_walls_of_the_gap(guidance):
+def test_no_action_sequence_leads_into_the_walls(guidance):
     """A bound instead of a sample: the sum of the absolute impulse responses, at hold 1 the worst that can be done."""
     lc_ns_kmp = make(guidance).task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("lc_ns_kmp")
     primitive, gain = lc_ns_kmp.primitive, lc_ns_kmp.gain
@@ -149,7 +149,7 @@ def test_no_sequence_of_actions_at_all_leads_into_the_walls_of_the_gap(guidance)
     assert (x + x_reach < WORLD.gap_x[1]).all()
 
 
-def test_a_residual_collides_gets_stuck_and_violates_but_never_tunnels():
+def test_residual_collides_and_violates_but_never_tunnels():
     env = make("residual", action_scale=3.0)
     lower, upper = WORLD.walls
     endings, collisions, violation = set(), 0, -np.inf
@@ -166,7 +166,7 @@ def test_a_residual_collides_gets_stuck_and_violates_but_never_tunnels():
     assert violation > 0.01
 
 
-def test_the_safe_residual_neither_collides_nor_violates_but_gets_stuck():
+def test_safe_residual_gets_stuck_without_collisions():
     endings = set()
     for first, action_scale in enumerate((1.0, 3.0)):
         env = make("safe_residual", action_scale=action_scale)
@@ -189,7 +189,7 @@ def test_smooth_guidance_jerks_far_less():
     assert jerk["skgrl"] < jerk["kgrl"] / 10
 
 
-def test_an_episode_lasts_as_long_as_the_thesis_says():
+def test_episode_has_the_length_of_the_thesis():
     env = make("kmp")
     _, observations, _ = play(env, still)
     assert observations[0] == -1.0
@@ -250,7 +250,7 @@ def test_a_robot_pushed_out_of_the_allowed_region_is_led_back():
     assert info["termination"] == ""
 
 
-def test_starts_where_it_is_told():
+def test_reset_option_start_sets_the_start():
     env = make("skgrl")
     _, info = env.reset(options={"start": (0.27, 0.07)})
     np.testing.assert_allclose(info["start"], [0.27, 0.07])
@@ -261,7 +261,7 @@ def test_starts_where_it_is_told():
             env.reset(options=options)
 
 
-def test_a_nan_in_the_plant_ends_the_episode_and_not_the_training():
+def test_nan_in_the_plant_truncates_the_episode():
     env = make("kmp")
     env.reset()
     observation, *_ = env.step(still(0))
@@ -276,7 +276,7 @@ def test_a_nan_in_the_plant_ends_the_episode_and_not_the_training():
     assert infos[-1]["is_success"]
 
 
-def test_made_in_one_go_hundreds_of_resets_do_not_grow(forks, tmp_path):
+def test_hundreds_of_resets_do_not_grow_memory(forks, tmp_path):
     # In a process of its own, elsewhere: what other tests leave behind is none of its business.
     script = """
 import gymnasium, guiderail
@@ -374,7 +374,7 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
         ({"gains": (1.0,)}, "one per output"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_sentence(arguments, message):
+def test_invalid_options_are_refused_in_one_sentence(arguments, message):
     with pytest.raises(InputError, match=message) as error:
         make(**arguments)
     assert "\n" not in str(error.value)

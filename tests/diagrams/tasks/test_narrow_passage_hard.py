@@ -61,7 +61,7 @@ def test_the_obstacles_are_drawn_where_they_are(env):
         np.testing.assert_allclose(X_WO.translation()[:2], obstacle, atol=1e-12)
 
 
-def test_the_standard_world_is_what_it_was():
+def test_standard_geometry_is_unchanged():
     assert NarrowPassageOptions().workcell() == PassageGeometry()
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)

@@ -5,7 +5,7 @@ import numpy as np
 from guiderail.diagrams.tasks.offsets import episode_stream
 
 
-def test_what_is_held_out_is_never_drawn_in_training_and_both_repeat_with_the_seed():
+def test_held_out_starts_differ_from_training_and_repeat():
     drawn = {
         held_out: np.array(
             [episode_stream(np.random.default_rng(seed), held_out).uniform(size=3) for seed in range(50)]

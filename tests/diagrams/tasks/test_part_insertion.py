@@ -61,7 +61,7 @@ def write(folder, **changes):
     return folder
 
 
-def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
+def test_bounds_by_phase_hold_at_every_step(tmp_path):
     folder = write(tmp_path / "by_phase", bounds=BY_PHASE)
     env = make_env(str(folder), action_repeat=10, horizon=4)
     env.reset(seed=0)
@@ -97,7 +97,7 @@ def with_row(changed):
         (BY_PHASE | {"lower": 3}, "tuple"),
     ],
 )
-def test_bounds_that_mean_nothing_are_refused(bounds, says):
+def test_invalid_bounds_are_refused(bounds, says):
     with pytest.raises(InputError, match=says):
         validate_options(Bounds, bounds, "here")
 
@@ -109,7 +109,7 @@ def test_a_bound_is_that_of_its_phase():
     assert [constraints.violation(corner, step) <= 0.0 for step in (0, 4, 5, 10)] == [True, True, False, False]
 
 
-def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
+def test_folder_is_the_same_task_until_a_file_changes(tmp_path):
     folder = write(tmp_path / "changed")
     tasks = [load_task_folder(folder)]
     for name in ("task.yaml", "demonstrations.npz", "plug.obj", "socket.obj"):
@@ -138,7 +138,7 @@ def test_missing_part_folder_is_named(tmp_path):
         import_modules([str(tmp_path / "gone")])
 
 
-def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp_path):
+def test_models_are_written_once_and_failures_are_refused(tmp_path):
     folder = write(tmp_path / "written")
     task = EnvConfig.resolve(str(folder), {}).make_task()
     assert task.workcell() is task.workcell()
@@ -150,7 +150,7 @@ def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp
         EnvConfig.resolve(str(folder), {}).make_task().workcell()
 
 
-def test_a_parts_mass_is_where_its_file_says(tmp_path):
+def test_mass_of_a_part_is_that_of_its_file(tmp_path):
     centre = [0.001, -0.002, 0.003]
     folder = write(tmp_path / "centred", plug=part("plug", centre=centre))
     plant = MultibodyPlant(0.0)
@@ -167,7 +167,7 @@ def test_it_starts_inside_its_bounds(tmp_path):
         assert start[2] == pytest.approx(0.015)
 
 
-def test_what_is_drawn_is_the_box_of_each_phase(tmp_path):
+def test_scene_has_the_box_of_each_phase(tmp_path):
     lower, upper = [[-0.001, -0.003], [0.0, -0.003]], [[0.002, 0.001], [0.0005, 0.001]]
     free = [None] * 4
     bounds = {"lower": [[*row, *free] for row in lower], "upper": [[*row, *free] for row in upper]}

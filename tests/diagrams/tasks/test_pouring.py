@@ -52,7 +52,7 @@ STARTS = [
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_a_persons_three_axes_pour_and_the_constraints_are_why(env, unconstrained, start):
+def test_scripted_policy_pours_because_of_the_constraints(env, unconstrained, start):
     info, total, actions = run(env, scripted_pour, seed=1, options={"start": start})
     assert info["termination"] == "success"
     assert total > 200.0
@@ -66,7 +66,7 @@ def test_a_persons_three_axes_pour_and_the_constraints_are_why(env, unconstraine
 
 
 @pytest.mark.parametrize("adversary", ADVERSARIES)
-def test_nobody_can_collide_or_leave_the_constraints(env, adversary):
+def test_adversaries_neither_collide_nor_leave_constraints(env, adversary):
     rng = np.random.default_rng([7, list(ADVERSARIES).index(adversary)])
     tilts, worst = [], []
 
@@ -84,7 +84,7 @@ def test_nobody_can_collide_or_leave_the_constraints(env, adversary):
     assert max((tilt for state, tilt in tilts if state == 0), default=0.0) < np.deg2rad(3.0)
 
 
-def test_a_velocity_without_a_template_can_do_anything():
+def test_unguided_velocity_reaches_collisions():
     env = make_env("Pouring", guidance="none", reward="hand_shaped")
     info, total, _ = run(env, lambda observation: np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0]), seed=0)
     assert info["termination"] in ("collision", "spill")
@@ -105,7 +105,7 @@ def test_the_constraints_are_a_safety_filter_behind_a_velocity():
     ("mug", "position"),
     [({"mug_inner_diameter": 0.10, "mug_depth": 0.075}, (0.03, -0.03)), ({"mug_inner_diameter": 0.07}, (-0.03, 0.02))],
 )
-def test_the_template_is_the_objects_not_the_episodes(mug, position):
+def test_template_follows_the_objects_of_each_episode(mug, position):
     env = make_env("Pouring", **mug)
     info, _, _ = run(env, scripted_pour, seed=1, options={"mug_position": position})
     assert info["termination"] == "success"
@@ -220,7 +220,7 @@ def test_refuses_reset_options_that_make_no_sense(env, options):
         env.reset(options=options)
 
 
-def test_a_start_that_the_arm_can_not_reach_is_drawn_again_and_one_that_was_asked_for_is_refused():
+def test_unreachable_start_is_resampled_or_refused_when_given():
     env = gymnasium.make("guiderail/Pouring-v0", guidance="sct", mug_offset=0.04)
     _, info = env.reset(seed=11)  # whose first draw is beyond a joint's limit
     far = {"start": [-0.15, -0.26, 0.19], "mug_position": [-0.04, -0.04]}

@@ -49,14 +49,14 @@ def test_balls_lie_in_the_thermos_and_not_in_each_other(number, diameter):
     assert np.abs(places[:, 0]).max() + diameter / 2 <= config.thermos.inner_diameter / 2 + 1e-9
 
 
-def test_what_does_not_go_together_is_refused():
+def test_options_that_do_not_go_together_are_refused():
     with pytest.raises(InputError, match="balls_in must be at most balls, which is 2, not 3"):
         EnvConfig.resolve("Pouring", {"balls_in": 3})
     with pytest.raises(InputError, match="6 balls of 0\\.04 m don't go into the thermos"):
         EnvConfig.resolve("Pouring", {"balls": 6})
 
 
-def test_who_aims_pours_enough_of_them():
+def test_aimed_policy_pours_enough_balls():
     env = make_env("Pouring", difficulty="hard", balls=6, balls_in=5, ball_diameter=0.026)
     observation, _ = env.reset(seed=1, options={"mug_error": (0.045, 0.0)})
     ended = False

@@ -31,7 +31,7 @@ def run(env, inputs, limit=60, **options):
     return drawn, info
 
 
-def test_who_looks_pours_and_who_does_not_spills(env):
+def test_aimed_policy_pours_and_blind_policy_spills(env):
     for inputs, ending in ((scripted_pour_aimed, "success"), (scripted_pour_blind, "spill")):
         drawn, info = run(env, inputs, mug_error=BESIDE)
         np.testing.assert_array_equal(drawn["mug_error"], BESIDE)
@@ -70,7 +70,7 @@ def test_no_command_ever_leaves_the_constraints(env, name):
     assert reached == {0, 1, 2}
 
 
-def test_the_arms_commands_are_inside_as_recomputed_at_every_step(env):
+def test_recomputed_commands_are_inside_the_constraints(env):
     """Also where the arm and the template's diagram take part, and at every control step, not only at decisions."""
     stepwise = make_env("Pouring", difficulty="hard", action_repeat=1)
     diagram, context = stepwise.task.diagram, stepwise.simulator.get_context()
@@ -99,7 +99,7 @@ def test_the_error_is_drawn_anew_in_its_ring_and_seen(env):
     assert len(np.unique(lengths)) == len(lengths)
 
 
-def test_the_standard_sees_and_draws_what_it_did():
+def test_observation_and_samples_at_standard_are_unchanged():
     standard = make_env("Pouring")
     assert standard.observation_space.shape == (6,)
     assert standard.task.num_steps == 1500

@@ -20,22 +20,22 @@ def episodes(successes="", **columns):
     ("successes", "episode"),
     [("1" * 10, 0), ("0" + "1" * 10, 1), ("1" * 9, None), ("1" * 9 + "0" + "1" * 12, 10), ("", None)],
 )
-def test_converged_after_is_how_many_came_before_ten_in_a_row(successes, episode):
+def test_episodes_to_convergence_precede_ten_successes(successes, episode):
     assert episodes_to_convergence(episodes(successes)) == episode
 
 
-def test_first_in_a_row_is_before_the_first_of_them():
+def test_find_streak_returns_the_index_of_the_first_streak():
     assert find_streak([0, 1, 1, 0, 1, 1, 1], 3) == 4
     assert find_streak([0, 1, 1], 3) is None
 
 
-def test_a_collision_and_an_episode_that_ends_in_one_are_two_numbers():
+def test_collisions_differ_from_episodes_ended_by_one():
     rows = episodes("00", collisions=[3, 1], termination=["time_limit", "collision"])
     found = summary(rows, ("collisions", "ended_in_collision"))
     assert found == {"collisions": 4, "ended_in_collision": 1}
 
 
-def test_what_is_no_number_does_not_hide_behind_what_is():
+def test_nan_is_not_hidden_by_a_maximum():
     rows = episodes("11", max_commanded_violation=[-1.0, np.nan], peak_force=[np.nan, 2.0])
     found = summary(rows, ("max_commanded_violation", "violating_episodes", "peak_force"))
     assert np.isnan(found["max_commanded_violation"])
@@ -44,7 +44,7 @@ def test_what_is_no_number_does_not_hide_behind_what_is():
 
 
 @pytest.mark.parametrize(("successes", "number"), [(0, 10), (7, 10), (10, 10), (98, 100)])
-def test_the_interval_is_wilsons(successes, number):
+def test_success_interval_is_that_of_wilson(successes, number):
     found = summary(episodes("1" * successes + "0" * (number - successes)), ("success_low", "success_high"))
     p, z = successes / number, 1.959963984540054
     middle = (p + z**2 / (2 * number)) / (1 + z**2 / number)
@@ -59,11 +59,11 @@ def test_summary_knows_the_statistics_of_the_task():
         summary(rows, ["avoids_obstacle_from"], task="GridClamp")
 
 
-def test_nothing_is_said_of_no_episodes():
+def test_summary_is_none_without_episodes():
     assert set(summary(episodes(), STATISTICS).values()) == {None}
 
 
-def test_every_number_has_a_name_of_its_own_and_words():
+def test_every_metric_has_a_unique_name_and_a_description():
     names = [column.name for column in COLUMNS]
     assert len(set(names)) == len(names)
     assert all(metric.description for metric in (*COLUMNS, *STATISTICS.values()))
@@ -105,7 +105,7 @@ def test_row_counts_what_happened_when_a_simulation_fails():
     assert row["saturated_steps"] == env.unwrapped.trace.signals["saturation"].any(axis=1).sum()
 
 
-def test_what_was_demonstrated_is_no_success_of_the_learner():
+def test_demonstration_is_no_success_of_the_learner():
     rows = episodes("1" * 12 + "00" + "1" * 10, is_demonstration=[1] * 12 + [0] * 12)
     assert episodes_to_convergence(rows) == 14
     assert episodes_to_convergence(episodes("1" * 12, is_demonstration=[1] * 12)) is None

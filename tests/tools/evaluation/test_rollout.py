@@ -24,7 +24,7 @@ class Diary(Callback):
         return {"decisions": len(self.said) - 2}
 
 
-def test_observers_see_an_episode_from_its_beginning_to_its_end():
+def test_callbacks_are_called_from_start_to_end():
     env, diary = make_environment("Bead", {"action_repeat": 2}), Diary()
     row = rollout(env, lambda observation: np.array([0.5, -1.0]), diary, index=7, seed=3)
     first, *decisions, last = diary.said
@@ -38,7 +38,7 @@ def test_observers_see_an_episode_from_its_beginning_to_its_end():
     assert row["episode"] == 7
 
 
-def test_the_same_seed_is_the_same_episode_and_held_out_ones_are_others():
+def test_seed_repeats_an_episode_and_held_out_differs():
     env = make_environment("Bead", {})
     rows = [
         rollout(env, lambda observation: np.zeros(2), seed=seed, held_out=held_out)["return"]
@@ -48,7 +48,7 @@ def test_the_same_seed_is_the_same_episode_and_held_out_ones_are_others():
     assert len(set(rows)) == 3
 
 
-def test_a_policy_that_watches_is_told_once():
+def test_policy_that_is_a_callback_is_called_once():
     env, told = make_environment("Bead", {}), []
 
     class Policy(Callback):
@@ -64,7 +64,7 @@ def test_a_policy_that_watches_is_told_once():
     assert told == ["begin", "begin"]
 
 
-def test_an_episode_whose_simulation_failed_has_a_row_too():
+def test_failed_simulation_has_a_row():
     class Failing(gymnasium.Wrapper):
         def step(self, action):
             observation, reward, *_, info = super().step(action)
@@ -97,7 +97,7 @@ def acted(policy: BaselinePolicy, episodes: int) -> np.ndarray:
     return np.array(actions)
 
 
-def test_null_policies_are_what_their_names_say():
+def test_baseline_policies_match_their_names():
     env = make_environment("Bead", {})
     zero, uniform_random, constant = (
         acted(BaselinePolicy(BASELINES[name], env, 3), 4) for name in ("zero", "uniform_random", "constant")

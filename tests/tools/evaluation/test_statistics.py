@@ -4,7 +4,7 @@ import pytest
 from guiderail.tools.evaluation.metrics import bootstrap_band, interquartile_mean, median_survival, survival, wilson
 
 
-def test_a_band_holds_the_mean_and_narrows_with_more_runs():
+def test_bootstrap_band_contains_the_mean_and_narrows():
     rng = np.random.default_rng(0)
     few, many = rng.normal(size=(3, 5)), rng.normal(size=(60, 5))
     for values in (few, many):
@@ -16,13 +16,13 @@ def test_a_band_holds_the_mean_and_narrows_with_more_runs():
     np.testing.assert_array_equal(bootstrap_band(few), bootstrap_band(few))
 
 
-def test_runs_that_are_all_the_same_have_no_width():
+def test_bootstrap_band_of_equal_runs_has_no_width():
     low, high = bootstrap_band(np.ones((4, 3)))
     np.testing.assert_array_equal(low, np.ones(3))
     np.testing.assert_array_equal(high, np.ones(3))
 
 
-def test_the_interquartile_mean_leaves_out_a_quarter_at_either_end():
+def test_interquartile_mean_omits_a_quarter_at_each_end():
     mean, interval = interquartile_mean([-100.0, 1.0, 3.0, 100.0])
     assert mean == 2.0
     assert interval is not None
@@ -30,7 +30,7 @@ def test_the_interquartile_mean_leaves_out_a_quarter_at_either_end():
     assert interquartile_mean([5.0]) == (5.0, None)
 
 
-def test_survival_counts_what_never_converged_as_what_is_known_of_it():
+def test_survival_censors_runs_that_never_converged():
     """By hand: of four runs one converges after 10; then of three one is over at 20, and of two one converges at 30."""
     steps, left = survival([10, 30, None, None], [60, 60, 30, 60])
     np.testing.assert_allclose(steps[steps <= 30], [0, 10, 20, 30])
@@ -39,7 +39,7 @@ def test_survival_counts_what_never_converged_as_what_is_known_of_it():
     assert median_survival(*survival([None, None], [20, 20])) is None
 
 
-def test_wilsons_interval_of_all_successes_does_not_end_at_one_hundred_percent():
+def test_wilson_interval_of_all_successes_has_a_lower_end():
     low, high = wilson(100, 100)
     assert low == pytest.approx(0.963, abs=1e-3)
     assert high == 1.0

@@ -22,7 +22,7 @@ def written(tmp_path_factory):
     return folder, rows, trace
 
 
-def test_it_has_every_control_step_and_agrees_with_the_episodes_table(written):
+def test_step_log_has_every_step_and_agrees_with_the_rows(written):
     folder, rows, trace = written
     step_log = read_step_log(folder)
     assert [len(group) for _, group in step_log.groupby("episode")] == [row["steps"] for row in rows]
@@ -43,13 +43,13 @@ def test_it_has_every_control_step_and_agrees_with_the_episodes_table(written):
     np.testing.assert_allclose(step_log["commanded_violation"], step_log["desired_pose_0"] - 0.6, atol=1e-12)
 
 
-def test_every_column_has_a_meaning(written):
+def test_every_step_log_column_has_a_meaning(written):
     for name in read_step_log(written[0]).columns:
         stem, _, end = name.rpartition("_")
         assert (f"{stem}_i" if end.isdigit() else name) in MEANINGS
 
 
-def test_a_collision_and_a_wrench_are_seen(tmp_path):
+def test_step_log_has_collisions_and_wrenches(tmp_path):
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 5})
     aside = np.array([1.0, 0.0])
     row = rollout(env, lambda observation: aside, StepLog(env, tmp_path), seed=0)
