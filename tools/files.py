@@ -1,4 +1,4 @@
-"""Files and folders that are either complete or not there, and whether they can be written."""
+"""Output files and folders: complete or absent, and checked before anything is computed for them."""
 
 import os
 import re
@@ -14,109 +14,108 @@ from guiderail.models.common.files import write_atomically as write_atomically
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 PAGES = (".html", ".htm")
 VIDEOS = (".webp", ".gif")
+LOCK = ".lock"  # lock file in a folder that one process at a time writes into
+_PARTIAL = re.compile(r"\..*\.(\d+)\.part")
 
 
-LOCK = ".lock"
-"""In a folder that one process at a time writes into."""
-_PART = re.compile(r"\..*\.(\d+)\.part")
+def remove_partial_files(folder: Path) -> None:
+    """Remove what killed calls of `write_atomically` and `atomic_folder` left in a folder and below it.
 
-
-def remove_parts(folder: Path) -> None:
-    """Removes what `write_atomically` and `whole_folder` left in a folder and below it where they were killed.
-
-    What another process is still writing stays, and so does all that is in a folder below with a lock of its own.
+    Files that another process is still writing stay, and so does everything in a subfolder with a lock of its own.
     """
-    for place, below, files in os.walk(folder):
-        left = [name for name in below if _is_left(name)]
-        below[:] = [name for name in below if not _PART.fullmatch(name) and not Path(place, name, LOCK).exists()]
+    for parent, subfolders, files in os.walk(folder):
+        left = [name for name in subfolders if _is_abandoned(name)]
+        subfolders[:] = [
+            name for name in subfolders if not _PARTIAL.fullmatch(name) and not Path(parent, name, LOCK).exists()
+        ]
         for name in left:
-            shutil.rmtree(Path(place, name), ignore_errors=True)
-        for name in filter(_is_left, files):
-            Path(place, name).unlink(missing_ok=True)
+            shutil.rmtree(Path(parent, name), ignore_errors=True)
+        for name in filter(_is_abandoned, files):
+            Path(parent, name).unlink(missing_ok=True)
 
 
-def _is_left(name: str) -> bool:
-    """Whether it is the name of a part whose writer is no process any more, or this one."""
-    part = _PART.fullmatch(name)
-    if part is None or int(part[1]) == os.getpid():
-        return part is not None
+def _is_abandoned(name: str) -> bool:
+    """Return True for the name of a partial file whose writer has ended or is this process."""
+    match = _PARTIAL.fullmatch(name)
+    if match is None or int(match[1]) == os.getpid():
+        return match is not None
     try:
-        os.kill(int(part[1]), 0)  # 0 is no signal: it asks
+        os.kill(int(match[1]), 0)  # signal 0 only tests whether the process exists
     except (ProcessLookupError, OverflowError):
         return True
-    except PermissionError:  # somebody else's
+    except PermissionError:  # the process exists and belongs to another user
         pass
     return False
 
 
 def check_picture(path: Path) -> None:
-    """Refuses a picture that cannot be written, before anything is run for it.
+    """Check that a picture can be written.
 
     Raises:
-        InputError: for an ending that is none of `PICTURES`, or a place where nothing can be written.
+        InputError: If the ending is none of `PICTURES`, or the file cannot be written.
     """
-    _check_named(path, "picture", PICTURES)
+    _check_ending(path, "picture", PICTURES)
 
 
 def check_video(path: Path) -> None:
-    """Refuse a video that cannot be written, before anything is run for it.
+    """Check that a video can be written.
 
     Raises:
-        InputError: For an ending that is none of `VIDEOS`, or a folder that cannot be written to.
+        InputError: If the ending is none of `VIDEOS`, or the file cannot be written.
     """
-    _check_named(path, "video", VIDEOS)
+    _check_ending(path, "video", VIDEOS)
 
 
 def check_page(path: Path) -> None:
-    """Refuses a page that cannot be written, or that nobody would name so, before anything is run for it.
+    """Check that an HTML page can be written.
 
     Raises:
-        InputError: for an ending that is none of `PAGES`, or a place where nothing can be written.
+        InputError: If the ending is none of `PAGES`, or the file cannot be written.
     """
-    _check_named(path, "page", PAGES)
+    _check_ending(path, "page", PAGES)
 
 
-def _check_named(path: Path, what: str, endings: tuple[str, ...]) -> None:
+def _check_ending(path: Path, kind: str, endings: tuple[str, ...]) -> None:
     if path.suffix.lower() not in endings:
-        raise InputError(f"{path} has the ending {path.suffix!r}: a {what} is {', '.join(endings)}")
+        raise InputError(f"{path} has the ending {path.suffix!r}: a {kind} is {', '.join(endings)}")
     check_writable(path)
 
 
 def check_writable(path: Path) -> None:
-    """Refuses a file, or a folder that is to be made, where nothing can be written, before anything is run for it.
+    """Check that a file, or a new folder, can be written.
 
     Raises:
-        InputError: for a folder that is there, a path below a file, in a folder that takes nothing, or with a name that
-            is too long.
+        InputError: If the path is an existing folder, is below a file or a folder without write permission, or is too
+            long.
     """
     try:
         if path.is_dir():
-            raise InputError(f"{path} is a folder that is already there: name another place")
-        above = next(one for one in path.absolute().parents if one.exists())
-        with tempfile.TemporaryFile(dir=above):  # rights alone don't say it: root has them all
+            raise InputError(f"{path} is a folder that already exists: name another path")
+        parent = next(one for one in path.absolute().parents if one.exists())
+        with tempfile.TemporaryFile(dir=parent):  # permission bits do not suffice: they do not bind root
             pass
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise _write_error(path, error) from error
 
 
 @contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into that becomes `out` in the end; if that fails there is none, so that one can try again.
+def atomic_folder(out: Path) -> Iterator[Path]:
+    """Yield a temporary folder that is renamed to `out` at the end, or removed after an error.
 
     Raises:
-        InputError: if it can't be written.
+        InputError: If the folder cannot be written.
     """
-    made = out.with_name(f".{out.name}.{os.getpid()}.part")
-    shutil.rmtree(made, ignore_errors=True)
+    temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
+    shutil.rmtree(temporary, ignore_errors=True)
     try:
-        made.mkdir(parents=True)
-        yield made
-        made.rename(out)
+        temporary.mkdir(parents=True)
+        yield temporary
+        temporary.rename(out)
     except OSError as error:
-        raise _unwritable(out, error) from error
+        raise _write_error(out, error) from error
     finally:
-        shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _unwritable(path: Path, error: OSError) -> InputError:
+def _write_error(path: Path, error: OSError) -> InputError:
     return InputError(f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write")

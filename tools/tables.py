@@ -1,4 +1,4 @@
-"""Tables: exact as CSV, readable as Markdown."""
+"""Tables: exact as CSV, and readable as Markdown."""
 
 import csv
 import re
@@ -12,25 +12,25 @@ import pandas as pd
 from guiderail.models.common.errors import InputError
 from guiderail.tools.files import write_atomically
 
-_WHOLE = re.compile(r"-?[0-9]{1,18}")
+_INTEGER = re.compile(r"-?[0-9]{1,18}")
 _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf|nan")
 
 Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[str, Any]]
 
 
 def table_text(rows: Rows) -> str:
-    """Rows as CSV, the columns' names first. Numbers are written so that reading them gives the same number."""
-    table = pd.DataFrame(rows, dtype=object)  # a whole number stays one in a column where some are unknown
+    """Return rows as CSV with a header; reading a number gives the same number, bit for bit."""
+    table = pd.DataFrame(rows, dtype=object)  # integers stay integers in a column with missing values
     return table.to_csv(index=False, lineterminator="\n") if len(table.columns) else ""
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """A CSV file; an empty cell is NaN in a column of numbers and an empty word in one of words.
+    """Read a CSV file.
 
-    A column of numbers holds nothing else, each to the last bit as Python reads it.
+    A column of numbers has only numbers and empty cells, which are NaN. In a column of text an empty cell is "".
 
     Raises:
-        InputError: if the file is missing or is no table: rows of one length below names that are all different.
+        InputError: If the file is missing, a row has another length than the header, or names are missing or repeated.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
@@ -38,16 +38,16 @@ def read_table(path: Path) -> pd.DataFrame:
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file, strict=True)
         if not all(header) or len({*header}) != len(header):
-            raise ValueError("names that are missing, or there twice")
+            raise ValueError("missing or repeated names")
         columns = zip(*rows, strict=True) if rows else ([] for _ in header)
-        return pd.DataFrame({name: _column(cells) for name, cells in zip(header, columns, strict=True)})
+        return pd.DataFrame({name: _parse_column(cells) for name, cells in zip(header, columns, strict=True)})
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is not a table of episodes: restore it, or train again") from error
 
 
-def _column(cells: Sequence[str]) -> pd.Series:
-    """What a column's cells say, all in the same way."""
-    if all(map(_WHOLE.fullmatch, cells)):
+def _parse_column(cells: Sequence[str]) -> pd.Series:
+    """Return the cells of a column as integers, floats, booleans or text, the same type for all."""
+    if all(map(_INTEGER.fullmatch, cells)):
         return pd.Series([*map(int, cells)], dtype=np.int64 if cells else object)
     if all(cell == "" or _NUMBER.fullmatch(cell) for cell in cells):
         return pd.Series([float(cell or "nan") for cell in cells])
@@ -57,7 +57,7 @@ def _column(cells: Sequence[str]) -> pd.Series:
 
 
 def write_table(path: Path, rows: Rows) -> Path:
-    """The same rows as `path`.csv and as `path`.md; returns the latter."""
+    """Write rows as `path`.csv and as `path`.md, and return the path of the latter."""
     table = pd.DataFrame(rows, dtype=object)
     write_atomically(path.with_suffix(".csv"), table_text(table).encode())
     lines = [[name.replace("_", " ") for name in table], ["---"] * len(table.columns)]
@@ -67,7 +67,7 @@ def write_table(path: Path, rows: Rows) -> Path:
 
 
 def cell(value: Any) -> str:
-    """A value as a person reads it."""
+    """Return a value as text of a readable table: four digits, and a dash for a missing value."""
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
     if value is None or value is pd.NA or (isinstance(value, float) and value != value):

@@ -1,4 +1,4 @@
-"""A place where nothing can be written is refused before anything is run for it."""
+"""Output paths that cannot be written are refused before anything is computed for them."""
 
 import os
 import subprocess
@@ -10,12 +10,12 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import check_seed
-from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_parts
+from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_partial_files
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
 
-def test_a_file_below_a_file_cannot_be_written(tmp_path):
+def test_check_refuses_a_path_below_a_file(tmp_path):
     (tmp_path / "file").touch()
     for name in ("file/x.png", "file/a/b/x.png"):
         with pytest.raises(InputError, match="cannot be written"):
@@ -24,12 +24,12 @@ def test_a_file_below_a_file_cannot_be_written(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_name_that_no_system_takes_is_refused(tmp_path):
+def test_check_refuses_a_name_that_is_too_long(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         check_writable(tmp_path / ("x" * 300) / "x.png")
 
 
-def test_a_folder_that_is_there_is_no_file_to_write(tmp_path):
+def test_check_refuses_an_existing_folder(tmp_path):
     (tmp_path / "page.html").mkdir()
     for refused in (check_writable, check_page):
         with pytest.raises(InputError, match="is a folder"):
@@ -37,13 +37,13 @@ def test_a_folder_that_is_there_is_no_file_to_write(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "config.yaml", "page", "."])
-def test_a_page_is_not_written_over_what_is_none(name, tmp_path):
+def test_check_page_refuses_another_ending(name, tmp_path):
     with pytest.raises(InputError, match=r"has the ending.*a page is \.html"):
         check_page(tmp_path / name)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31])
-def test_a_seed_that_no_environment_takes_is_refused(seed, bead_run, tmp_path):
+def test_seed_is_refused_when_out_of_range(seed, bead_run, tmp_path):
     for refused in (
         lambda: check_seed(seed),
         lambda: EpisodeSpec.of_run(bead_run, seed=seed),
@@ -53,39 +53,39 @@ def test_a_seed_that_no_environment_takes_is_refused(seed, bead_run, tmp_path):
             refused()
 
 
-def test_a_recording_is_refused_before_an_episode_is_run(bead_run, tmp_path, monkeypatch):
+def test_evaluate_checks_the_output_before_it_runs(bead_run, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("it goes on"))
+    monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("it continues"))
     with pytest.raises(InputError, match="cannot be written"):
         evaluate(bead_run, save=tmp_path / "file" / "x.npz")
 
 
 @pytest.fixture
-def gone():
-    """The number of a process that is over."""
+def ended_process():
+    """Return the id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
 
 
-def test_a_locked_folder_is_rid_of_the_files_and_folders_that_a_killed_process_left(gone, tmp_path):
+def test_lock_removes_partial_files_of_ended_processes(ended_process, tmp_path):
     (tmp_path / "checkpoint").mkdir()
-    for number in (gone, os.getpid(), 10**30):
+    for number in (ended_process, os.getpid(), 10**30):
         (tmp_path / "checkpoint" / f".state.safetensors.{number}.part").touch()
         (tmp_path / f".peg.{number}.part" / "parts").mkdir(parents=True)
-    (tmp_path / "checkpoint" / ".own.part").touch()  # of somebody who names things otherwise
+    (tmp_path / "checkpoint" / ".own.part").touch()  # not a name of `write_atomically`
     with RunFolder(tmp_path).locked():
         left = {path.name for path in tmp_path.rglob("*")}
     assert left == {"checkpoint", ".own.part", LOCK}
 
 
-def test_what_others_are_writing_stays(gone, tmp_path):
+def test_partial_files_of_running_processes_stay(ended_process, tmp_path):
     alive = os.getppid()
     another = tmp_path / "another_run"
-    kept = [tmp_path / f".report.html.{alive}.part", another / "checkpoint" / f".state.safetensors.{gone}.part"]
-    kept += [tmp_path / f".peg.{alive}.part" / f".part.yaml.{gone}.part", another / LOCK]
+    kept = [tmp_path / f".report.html.{alive}.part", another / "checkpoint" / f".state.safetensors.{ended_process}.part"]
+    kept += [tmp_path / f".peg.{alive}.part" / f".part.yaml.{ended_process}.part", another / LOCK]
     for path in kept:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    remove_parts(tmp_path)
+    remove_partial_files(tmp_path)
     assert all(path.exists() for path in kept)

@@ -37,19 +37,19 @@ def trained(config, tmp_path_factory):
     return folder
 
 
-def test_training_is_safe_from_the_first_episode_on(trained):
+def test_training_satisfies_the_constraints_throughout(trained):
     rows = trained.episodes()
     assert (rows["success"] == 1).all()
     assert (rows["collisions"] == 0).all()
     assert rows[["max_commanded_violation", "max_measured_violation"]].to_numpy().max() <= 1e-9
 
 
-def test_a_rows_terms_add_up_to_its_return(trained):
+def test_reward_terms_sum_to_the_return(trained):
     rows = trained.episodes()
     np.testing.assert_allclose(rows["return"], rows.filter(like="reward_").sum(axis=1), rtol=1e-9)
 
 
-def test_a_resumed_simulation_goes_on_bit_for_bit(trained, config, tmp_path):
+def test_run_resumes_bit_for_bit(trained, config, tmp_path):
     resumed = RunFolder(tmp_path / "run")
     run_training(resumed, replace(config, episodes=2))
     run_training(resumed, config, resume=True)
@@ -59,13 +59,13 @@ def test_a_resumed_simulation_goes_on_bit_for_bit(trained, config, tmp_path):
     assert all(np.array_equal(a[key], b[key]) for key in a)
 
 
-def test_evaluation_states_what_the_demonstration_alone_achieves(trained):
+def test_evaluation_includes_the_demonstration_alone(trained):
     result = evaluate(trained.path, episodes=2)
     assert result["demonstration_success_rate"] == 1.0
     assert result["max_commanded_violation"] <= 1e-9
 
 
-def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
+def test_held_out_starts_differ_and_follow_the_seed():
     env = make_environment("NarrowPassage", {"guidance": "kmp"})
     env.reset(seed=0)
     usual = env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy()
@@ -78,7 +78,7 @@ def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
     np.testing.assert_array_equal(starts[0], starts[2])
 
 
-def test_the_replay_is_one_page_that_needs_nothing_else(trained):
+def test_replay_is_one_self_contained_page(trained):
     write_page(default_page(trained.path, {}), EpisodeSpec.of_run(trained.path), episodes=1)
     page = (trained.path / "replay.html").read_text()
     assert "the constraint" in page
@@ -114,7 +114,7 @@ def test_video_is_an_animation_in_real_time(ending, trained, tmp_path):
     assert abs(1e-3 * sum(durations) - 0.02 * row["steps"]) < 0.2 * 0.02 * row["steps"]
 
 
-def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
+def test_visualization_refuses_wrong_input_and_writes_nothing(trained, tmp_path):
     with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
         write_page(tmp_path / "replay.html", EpisodeSpec.of_run(trained.path, {"station": "arm"}))
     with pytest.raises(InputError, match="a picture is"):
@@ -129,7 +129,7 @@ def test_saved_episodes_can_be_used_as_demonstrations(trained, tmp_path):
     assert validate_demonstrations(file)["demonstrations"] == 2
 
 
-def test_a_tube_keeps_its_radius_along_the_path():
+def test_tube_has_a_constant_radius():
     points = np.column_stack([np.linspace(0, 1, 31), np.sin(np.linspace(0, 3, 31)), np.zeros(31)])
     vertices, faces = tube(points, 0.01)
     kept = np.vstack([points[:-1:3], points[-1:]])

@@ -8,20 +8,20 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.tables import read_table, table_text, write_table
 
 
-def test_numbers_come_back_exactly(tmp_path):
+def test_rows_are_read_as_written(tmp_path):
     rows = [{"a": 0.1 + 0.2, "b": 3, "c": "blocked", "d": -math.inf}, {"a": 1e-300, "b": -1, "c": "", "d": 2.0}]
     (tmp_path / "t.csv").write_text(table_text(rows))
     assert read_table(tmp_path / "t.csv").to_dict("records") == rows
 
 
-def test_every_number_comes_back_exactly(tmp_path):
+def test_floats_are_read_bit_for_bit(tmp_path):
     numbers = np.random.default_rng(0).integers(0, 2**63, 2000, dtype=np.int64).view(float)
     numbers = numbers[np.isfinite(numbers)]
     (tmp_path / "t.csv").write_text(table_text(pd.DataFrame({"a": numbers})))
     np.testing.assert_array_equal(read_table(tmp_path / "t.csv")["a"], numbers)
 
 
-def test_what_is_unknown_is_an_empty_cell_and_makes_no_number_of_words(tmp_path):
+def test_missing_values_are_empty_cells(tmp_path):
     rows = [{"a": 3, "b": "kgrl, hold 1", "c": None}, {"a": None, "b": "nan", "c": None}]
     assert table_text(rows) == 'a,b,c\n3,"kgrl, hold 1",\n,nan,\n'
     (tmp_path / "t.csv").write_text(table_text(rows))
@@ -32,19 +32,19 @@ def test_what_is_unknown_is_an_empty_cell_and_makes_no_number_of_words(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["a,b\n1\n", "a,b\n1,2,3\n", ""])
-def test_a_torn_table_is_refused(tmp_path, text):
+def test_read_refuses_rows_of_another_length(tmp_path, text):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InputError, match="not a table"):
         read_table(tmp_path / "t.csv")
 
 
-def test_the_readable_table_says_the_same(tmp_path):
+def test_markdown_has_the_rows_of_the_csv(tmp_path):
     markdown = write_table(tmp_path / "t", pd.DataFrame({"a_b": [0.123456, 2], "c": ["x", None]}).astype(object))
     assert markdown.read_text().splitlines() == ["| a b | c |", "| --- | --- |", "| 0.1235 | x |", "| 2 | – |"]
     assert read_table(tmp_path / "t.csv")["a_b"].tolist() == [0.123456, 2]
 
 
-def test_a_column_is_of_numbers_only_if_python_reads_each_as_one(tmp_path):
+def test_column_is_numeric_when_all_cells_are_numbers(tmp_path):
     (tmp_path / "t.csv").write_text("a,b,c,d\n1,0x10,True,1e400\n,2,False,-inf\n", encoding="utf-8")
     table = read_table(tmp_path / "t.csv")
     assert table["a"].tolist()[0] == 1.0
@@ -55,7 +55,7 @@ def test_a_column_is_of_numbers_only_if_python_reads_each_as_one(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "a,a\n1,2\n", ",b\n1,2\n", "a,b\n1\n", 'a\n"1\n', "a\n" + "1" * 200_000 + "\n"])
-def test_what_is_no_table_is_refused(text, tmp_path):
+def test_read_refuses_an_invalid_table(text, tmp_path):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InputError, match="not a table"):
         read_table(tmp_path / "t.csv")

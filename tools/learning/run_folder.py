@@ -19,7 +19,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import check_environment, import_modules, task_content
 from guiderail.tools.evaluation.metrics import check_rows
-from guiderail.tools.files import LOCK, remove_parts, write_atomically
+from guiderail.tools.files import LOCK, remove_partial_files, write_atomically
 from guiderail.tools.learning.config import config_values, make_config
 from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
@@ -119,7 +119,7 @@ class RunFolder:
                 f"{self.path} cannot be written ({error.strerror}): choose a folder with room to write"
             ) from error
         try:
-            remove_parts(self.path)
+            remove_partial_files(self.path)
             yield
         finally:
             (self.path / LOCK).unlink(missing_ok=True)

@@ -28,7 +28,7 @@ from guiderail.models.parts.assembly_check import (
 from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces, to_arrays
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
 from guiderail.models.parts.symmetry import find_symmetries
-from guiderail.tools.files import check_writable, whole_folder
+from guiderail.tools.files import atomic_folder, check_writable
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 MODULI = (2e9, 1e10, 3e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
@@ -160,7 +160,7 @@ def create_task(
     snapping = _snapping(*parts, path)
     say(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
-    with whole_folder(out) as made:
+    with atomic_folder(out) as made:
         measured = _make(made, out.name, parts, path, clearance, snapping, force_limit, friction, scenario, say)
     return {"task": str(out), **measured, "page": str(out / "preview.html")}
 

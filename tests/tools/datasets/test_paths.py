@@ -5,7 +5,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.datasets.paths import check_new, is_there
 from guiderail.tools.datasets.record import record
-from guiderail.tools.files import whole_folder
+from guiderail.tools.files import atomic_folder
 
 
 def test_a_new_place_may_lie_in_folders_that_are_not_there_yet(tmp_path):
@@ -24,7 +24,7 @@ def test_below_a_file_nothing_can_be_written(place, tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match=r"cannot be written \(Not a directory\)"):
         check_new(tmp_path / place, "folder")
-    with pytest.raises(InputError, match=r"cannot be written \(Not a directory\)"), whole_folder(tmp_path / place):
+    with pytest.raises(InputError, match=r"cannot be written \(Not a directory\)"), atomic_folder(tmp_path / place):
         pass
 
 
@@ -34,7 +34,7 @@ def test_a_name_that_is_too_long_is_a_sentence(tmp_path):
 
 
 def fail_on_the_way(folder, error):
-    with whole_folder(folder) as made:
+    with atomic_folder(folder) as made:
         (made / "half").write_text("half")
         raise error
 
@@ -43,7 +43,7 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path):
     with pytest.raises(OverflowError):
         fail_on_the_way(tmp_path / "made", OverflowError())
     assert list(tmp_path.iterdir()) == []
-    with whole_folder(tmp_path / "made") as made:
+    with atomic_folder(tmp_path / "made") as made:
         (made / "all").write_text("all")
         assert not (tmp_path / "made").exists()
     assert [one.relative_to(tmp_path).as_posix() for one in tmp_path.rglob("*")] == ["made", "made/all"]

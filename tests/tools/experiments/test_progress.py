@@ -21,7 +21,7 @@ def begin(one, episodes, workers=1):
         (one.folder.path / "episodes.csv").write_text("episode\n" + "0\n" * episodes)
 
 
-def test_it_shows_what_runs_how_far_it_is_and_what_has_ended(tmp_path):
+def test_progress_shows_running_and_ended_jobs(tmp_path):
     jobs = {n: job(tmp_path, n) for n in range(5)}
     begin(jobs[4], 4)  # in an earlier study: it waits
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
@@ -43,7 +43,7 @@ def test_it_shows_what_runs_how_far_it_is_and_what_has_ended(tmp_path):
     assert "2 of 6 ended, 1 failed, 2 waiting" in shown
 
 
-def test_a_log_file_gets_a_line_for_each_that_ends(tmp_path):
+def test_progress_prints_a_line_per_ended_job_in_a_file(tmp_path):
     one, console = job(tmp_path, 0), Console(file=io.StringIO())
     with StudyProgress({0: one}, 1, console) as board:
         begin(one, 4, workers=2)

@@ -56,7 +56,7 @@ def written(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
-def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_path):
+def test_study_has_a_row_per_method_seed_number_and_eval_set(tmp_path):
     methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "uniform_random", "seeds": [9]}}
     judged = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
     rows = run(study(methods=methods, **{"eval_set": judged}), tmp_path)
@@ -72,7 +72,7 @@ def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_pat
     assert rows[rows["method"] == "nothing"]["training_success_rate"].isna().all()
 
 
-def test_a_finished_study_is_not_touched_and_one_that_was_stopped_goes_on_to_the_same_rows(tmp_path):
+def test_interrupted_study_resumes_to_the_same_rows(tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     expected = run(study(), whole)
     before = written(whole)
@@ -82,7 +82,7 @@ def test_a_finished_study_is_not_touched_and_one_that_was_stopped_goes_on_to_the
     assert without_clock(run(study(), parts)) == without_clock(expected)
 
 
-def test_a_run_that_fails_stops_no_other_and_is_named_at_the_end(tmp_path, capsys):
+def test_failed_job_is_listed_and_stops_no_other(tmp_path, capsys):
     file, out = tmp_path / "beads.yaml", tmp_path / "out"
     expected = run(study(), tmp_path / "undisturbed")
     run(study(after_episodes=[2]), out)
@@ -111,7 +111,7 @@ def test_a_run_that_fails_stops_no_other_and_is_named_at_the_end(tmp_path, capsy
     assert without_clock(run(study(), out)) == without_clock(expected)
 
 
-def test_a_study_names_what_registers_its_task(tmp_path):
+def test_study_imports_what_registers_its_task(tmp_path):
     file = tmp_path / "pearl.py"
     file.write_text(
         "import bead, gymnasium\n"
@@ -125,12 +125,12 @@ def test_a_study_names_what_registers_its_task(tmp_path):
     assert RunFolder(tmp_path / "out" / "learner-5").config().imports == (str(file),)
 
 
-def test_two_runs_never_share_a_folder(tmp_path):
+def test_study_refuses_two_runs_in_one_folder(tmp_path):
     with pytest.raises(InputError, match="both runs of learner, seed 5 and of learner, seed 6"):
         run(study(folder="{method}"), tmp_path)
 
 
-def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
+def test_earlier_policy_can_be_evaluated_later(tmp_path):
     run(study(**{"eval_set": []}), tmp_path)
     late, expected = run(study(), tmp_path), run(study(), tmp_path / "other")
     assert without_clock(late) == without_clock(expected)
@@ -142,7 +142,7 @@ def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
         run(study(**{"eval_set": [{"episodes": 4}]}), tmp_path)
 
 
-def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
+def test_evaluated_episodes_of_other_settings_are_not_used(tmp_path):
     methods = {"nothing": {"policy": "zero"}}
     near, far = (
         run(study(methods=methods, **{"eval_set": [{"episodes": 3, "env": {"wall": wall}}]}), tmp_path)
@@ -153,7 +153,7 @@ def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
     assert not other["mean_return"].isin(near["mean_return"]).any()
 
 
-def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
+def test_studies_in_one_folder_are_kept_apart(tmp_path):
     """By the seed where a folder's name doesn't say it, by the task, and by a sentence where a file's name is given."""
     (tmp_path / "pearl.py").write_text(
         "import bead, gymnasium\n"
@@ -192,14 +192,14 @@ def test_differences_are_grouped_by_method():
         assert any("checkpoint selection" in sentence for sentence in expected) == learns
 
 
-def test_where_a_method_breaks_lies_on_a_line_between_two_values():
+def test_breaking_point_is_interpolated():
     assert breaking_point([1.0, 2.0, 3.0], [1.0, 1.0, 0.8]) == pytest.approx(2.5)
     assert breaking_point([30.0, 20.0, 10.0], [1.0, 0.9, 0.0]) == pytest.approx(20.0)
     assert breaking_point([1.0, 2.0], [0.89, 1.0]) == AT_ONCE
     assert breaking_point([1.0, 2.0], [1.0, 0.9]) == NEVER
 
 
-def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
+def test_study_refuses_a_folder_with_another_run(tmp_path):
     run(study(seeds=[5], after_episodes=[2]), tmp_path)
     before = written(tmp_path)
     with pytest.raises(InputError, match="another learner"):
@@ -211,7 +211,7 @@ def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_pat
     assert before.items() <= written(tmp_path).items()
 
 
-def test_the_best_constant_is_the_best_of_its_grid(tmp_path):
+def test_best_constant_is_the_best_of_its_grid(tmp_path):
     rows = run(study(methods={"best": {"policy": "best_constant", "grid": [-1, 0, 1]}}, seeds=[1]), tmp_path)
     tried = read_table(next((tmp_path / "best-1").glob("best_constant-*.csv")))
     assert len(tried) == 9
@@ -222,7 +222,7 @@ def test_the_best_constant_is_the_best_of_its_grid(tmp_path):
     assert rows["mean_return"].tolist() == [expected["return"].mean()]
 
 
-def test_sampled_arguments_stay_in_their_range_and_change_every_few_episodes(tmp_path):
+def test_sampled_options_change_every_few_episodes(tmp_path):
     judged = [{"episodes": 5, "every": 2, "sampled": {"wall": [0.2, 0.3]}}]
     run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], **{"eval_set": judged}), tmp_path)
     (file,) = (tmp_path / "nothing-0").glob("*.csv")
@@ -232,7 +232,7 @@ def test_sampled_arguments_stay_in_their_range_and_change_every_few_episodes(tmp
     assert [group["episode"].tolist() for _, group in rows.groupby("wall", sort=False)] == [[0, 1], [2, 3], [4]]
 
 
-def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
+def test_process_engine_gives_the_rows_of_this_process(tmp_path):
     declared = Study.model_validate(
         {
             "name": "passage",
@@ -246,7 +246,7 @@ def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
     pd.testing.assert_frame_equal(one, two)
 
 
-def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
+def test_study_command_summarizes_each_seed(tmp_path, capsys):
     one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], after_episodes=[2])
     result = study_command(one, tmp_path, make_engine(processes=1))
     described = study_command(one, tmp_path, describe_differences=lambda config, *, learns=True: [config.task])
@@ -262,7 +262,7 @@ def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
     assert "2/2 learner, seed 6: held out" in err
 
 
-def test_a_ratio_is_of_sums_and_a_number_that_never_was_says_so():
+def test_ratio_is_per_seed_and_of_sums():
     rows = pd.DataFrame(
         {"method": ["a", "a", "b", "b"], "seed": [0, 1, 0, 1], "force": [1.0, 2.0, 4.0, 2.0], "after": [3, None, 1, 2]}
     )
@@ -315,7 +315,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("changed", "words"), WRONG, ids=[words for _, words in WRONG])
-def test_what_makes_no_sense_is_one_sentence_and_nothing_is_written(changed, words, tmp_path):
+def test_invalid_study_is_one_sentence_and_writes_nothing(changed, words, tmp_path):
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(BEAD | changed))
     with pytest.raises(InputError) as refused:
         run(load_study(tmp_path / "study.yaml"), tmp_path / "out")
@@ -324,7 +324,7 @@ def test_what_makes_no_sense_is_one_sentence_and_nothing_is_written(changed, wor
     assert not (tmp_path / "out").exists()
 
 
-def test_a_mark_that_only_some_methods_reach_is_of_these():
+def test_job_is_evaluated_after_the_numbers_that_it_reaches():
     methods = {"short": {"learner": {"episodes": 2}}, "long": {}, "nothing": {"policy": "zero"}}
     one = study(methods=methods)
     assert [Job(one, name, 5, None).after_episodes for name in methods] == [[2], [2, 4], [0]]
@@ -332,7 +332,7 @@ def test_a_mark_that_only_some_methods_reach_is_of_these():
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "\x00", "just words"])
-def test_what_is_no_study_is_one_sentence(text, tmp_path):
+def test_load_study_refuses_invalid_files(text, tmp_path):
     (tmp_path / "study.yaml").write_text(text)
     with pytest.raises(InputError) as refused:
         load_study(tmp_path / "study.yaml")
@@ -351,7 +351,7 @@ def test_load_study_refuses_a_missing_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", study_names())
-def test_every_study_that_comes_along_makes_sense(name, tmp_path):
+def test_study_of_research_is_valid(name, tmp_path):
     declared = load_study(study_path(name))
     assert declared.name == name
     import_modules(declared.imports)
@@ -362,7 +362,7 @@ def test_every_study_that_comes_along_makes_sense(name, tmp_path):
         assert {wanted.method, wanted.against} <= declared.methods.keys()
 
 
-def test_a_person_pours_and_the_constraints_are_why(tmp_path):
+def test_scripted_pour_succeeds_with_constraints_only(tmp_path):
     declared = load_study(study_path("pouring_mugs")).subset(["scripted_pour", "person_unconstrained"])
     declared = declared.model_copy(update={"eval_set": (EvalSet(episodes=1),)})
     bound, free = run(declared, tmp_path).to_dict("records")
@@ -372,21 +372,21 @@ def test_a_person_pours_and_the_constraints_are_why(tmp_path):
     assert bound["max_commanded_violation"] <= 1e-9
 
 
-def test_a_policy_learns_on_rails_wherever_it_is_judged(tmp_path):
+def test_policy_is_trained_on_the_gantry_for_any_station(tmp_path):
     declared = load_study(study_path("connector_on_arm"))
     config = Job(declared, "skgrl", 30, tmp_path).config(80)
     assert config.environment["station"] == "gantry"
     assert declared.eval_set[0].env == {"station": "arm"}
 
 
-def test_a_run_of_a_study_is_a_run(tmp_path):
+def test_run_of_a_study_is_a_run_folder(tmp_path):
     run(study(seeds=[5]), tmp_path)
     folder = RunFolder(tmp_path / "learner-5")
     assert folder.config().episodes == 4
     assert np.array_equal(folder.episodes()["episode"], range(4))
 
 
-def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
+def test_sweep_is_evaluated_at_each_value_and_drawn(tmp_path):
     """The wall of beads is where they start, or far away, where nothing succeeds."""
     walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
     methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "uniform_random"}}
@@ -401,7 +401,7 @@ def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
     assert run_study(one, tmp_path, make_engine(processes=1))["eval_set"].tolist() == rows["eval_set"].tolist()
 
 
-def test_a_policy_that_learned_longer_is_judged_by_itself_whatever_the_file_is_called(tmp_path):
+def test_longer_training_is_evaluated_by_itself(tmp_path):
     judged = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
     run(study(after_episodes=[2], seeds=[5], **{"eval_set": judged}), tmp_path)
     run(study(after_episodes=[4], seeds=[5], **{"eval_set": judged}), tmp_path)
@@ -412,7 +412,7 @@ def test_a_policy_that_learned_longer_is_judged_by_itself_whatever_the_file_is_c
         run(study(after_episodes=[6], seeds=[5], **{"eval_set": same}), tmp_path)
 
 
-def test_a_part_of_a_study_does_not_take_the_place_of_its_table(tmp_path):
+def test_subset_of_a_study_has_a_table_of_its_own(tmp_path):
     methods = {"learner": {}, "nothing": {"policy": "zero"}}
     (tmp_path / "beads.yaml").write_text(yaml.safe_dump(BEAD | {"methods": methods, "after_episodes": [2]}))
     for words, rows in (([], 4), (["--methods", "nothing"], 2), (["--seeds", "5"], 2)):

@@ -20,7 +20,7 @@ def work(job):
     return [{"success_rate": 1.0}]
 
 
-def test_who_took_a_job_and_what_became_of_it_is_in_its_log(tmp_path):
+def test_log_has_the_attempts_and_the_outcome(tmp_path):
     job, attempt = Job(tmp_path / "log.txt"), Attempt(work, installed_versions())
     assert count_attempts(job.log) == 0
     assert attempt(job).rows == ({"success_rate": 1.0},)
@@ -39,7 +39,7 @@ def test_who_took_a_job_and_what_became_of_it_is_in_its_log(tmp_path):
         (SystemExit("abort: Failure at plant.cc"), "SystemExit: abort: Failure at plant.cc (", True),
     ],
 )
-def test_whatever_happens_is_one_sentence(error, sentence, traced, tmp_path):
+def test_failure_of_any_kind_is_one_sentence(error, sentence, traced, tmp_path):
     job = Job(tmp_path / "log.txt", error)
     failure = Attempt(work, installed_versions())(job).failure
     assert failure.startswith(sentence)
@@ -47,14 +47,14 @@ def test_whatever_happens_is_one_sentence(error, sentence, traced, tmp_path):
     assert ("Traceback" in job.log.read_text()) == traced
 
 
-def test_a_worker_with_other_versions_does_nothing(tmp_path):
+def test_worker_with_other_versions_is_refused(tmp_path):
     job = Job(tmp_path / "log.txt")
     failure = Attempt(work, installed_versions() | {"numpy": "0.9"})(job).failure
     assert "instead of 0.9: install the same versions" in failure
     assert not job.log.exists()
 
 
-def test_a_worker_that_does_not_see_the_folder_does_nothing(tmp_path):
+def test_worker_without_the_folder_is_refused(tmp_path):
     failure = Attempt(work, installed_versions())(Job(tmp_path / "elsewhere" / "log.txt")).failure
     assert "--out must be a folder that all workers share" in failure
     assert not (tmp_path / "elsewhere").exists()

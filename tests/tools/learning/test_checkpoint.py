@@ -13,7 +13,7 @@ def checkpoint(tmp_path):
     return path
 
 
-def test_gives_back_what_was_saved(checkpoint):
+def test_checkpoint_is_read_as_written(checkpoint):
     arrays, values = load_checkpoint(checkpoint)
     np.testing.assert_array_equal(arrays["weights"], [[0, 1, 2], [3, 4, 5]])
     assert arrays["weights"].dtype == np.float32
@@ -21,18 +21,18 @@ def test_gives_back_what_was_saved(checkpoint):
     assert values == {"episodes": 3, "big": 2**100}
 
 
-def test_leaves_nothing_but_the_checkpoint(checkpoint):
+def test_save_checkpoint_leaves_no_other_file(checkpoint):
     assert [path.name for path in checkpoint.parent.iterdir()] == ["state.safetensors"]
 
 
 @pytest.mark.parametrize("kept", [0, 7, 100, -1])
-def test_refuses_a_truncated_file(checkpoint, kept):
+def test_load_checkpoint_refuses_a_truncated_file(checkpoint, kept):
     checkpoint.write_bytes(checkpoint.read_bytes()[:kept])
     with pytest.raises(InputError, match="damaged"):
         load_checkpoint(checkpoint)
 
 
-def test_refuses_a_file_in_which_one_bit_changed(checkpoint):
+def test_load_checkpoint_refuses_a_flipped_bit(checkpoint):
     content = bytearray(checkpoint.read_bytes())
     content[-2] ^= 1
     checkpoint.write_bytes(bytes(content))
@@ -40,6 +40,6 @@ def test_refuses_a_file_in_which_one_bit_changed(checkpoint):
         load_checkpoint(checkpoint)
 
 
-def test_a_missing_checkpoint_is_named(tmp_path):
+def test_load_checkpoint_names_a_missing_file(tmp_path):
     with pytest.raises(InputError, match=r"state\.safetensors"):
         load_checkpoint(tmp_path / "state.safetensors")

@@ -21,29 +21,29 @@ def selected(selection):
     return None if result is None else int(result["weight"])
 
 
-def test_nothing_is_selected_without_successes_on_both_sides():
+def test_selection_is_empty_without_successes_on_both_sides():
     assert selected(lived(CheckpointSelection(3), [1])) is None
     assert selected(lived(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
     assert selected(lived(CheckpointSelection(3), [0, 1, 1])) == 2
 
 
-def test_the_midst_of_the_longest_row_is_selected():
+def test_selection_takes_the_middle_of_the_longest_streak():
     #                                  0  1  2  3  4  5  6  7  8  9 10 11
     assert selected(lived(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
     assert selected(lived(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7  # two on each side
 
 
-def test_a_short_row_later_does_not_replace_a_long_one():
+def test_selection_keeps_a_long_streak_over_a_later_short_one():
     # The actor of episode 9 was followed by six that succeeded, but nothing before it did.
     assert selected(lived(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
 
 
-def test_among_those_with_successes_enough_the_latest_counts():
+def test_selection_takes_the_latest_beyond_the_window():
     assert selected(lived(CheckpointSelection(2), [1] * 9)) == 7
     assert selected(lived(CheckpointSelection(2), [1] * 9 + [0])) == 7
 
 
-def test_goes_on_as_it_would_have():
+def test_selection_continues_when_restored():
     first = lived(CheckpointSelection(3), [0, 1, 1, 0, 1])
     second = CheckpointSelection(3)
     second.restore(*first.state())
@@ -53,7 +53,7 @@ def test_goes_on_as_it_would_have():
     assert first.state()[1] == second.state()[1]
 
 
-def test_an_episode_that_is_left_out_is_as_if_it_had_not_been():
+def test_selection_ignores_an_excluded_episode():
     plain, left_out = lived(CheckpointSelection(3), [0, 1, 1]), lived(CheckpointSelection(3), [0, 1])
     left_out.begin(torch.nn.Linear(1, 1), 1)
     left_out.exclude()

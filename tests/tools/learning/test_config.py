@@ -12,13 +12,13 @@ from guiderail.tools.learning.config import resolve_preset
         ("learning_rate", "inf"), ("gamma", True), ("gradient_steps", 10**12), ("net_arch", ",".join(["8"] * 50)),
     ],
 )  # fmt: skip
-def test_what_no_machine_has_and_what_is_no_number_is_refused_in_a_short_sentence(setting, value):
+def test_config_refuses_values_out_of_range(setting, value):
     with pytest.raises(InputError, match=f"learner's {setting} cannot be") as error:
         resolve_preset("tqc_contact", "tqc", {setting: value})
     assert len(str(error.value)) < 300
 
 
-def test_large_networks_are_no_mistake():
+def test_config_accepts_large_networks():
     assert resolve_preset("tqc_contact", "tqc", {"net_arch": "4096,4096", "batch_size": "8192"}).net_arch == (
         4096,
         4096,

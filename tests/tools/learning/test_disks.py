@@ -37,7 +37,7 @@ def refused(words):
 
 
 @pytest.mark.parametrize("at", [0, 3])
-def test_a_run_whose_disk_is_full_goes_on_when_there_is_room(at, whole, module_config, tmp_path):
+def test_run_resumes_when_a_full_disk_has_room_again(at, whole, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     with ExitStack() as until_now, refused("cannot be written .*choose a folder with room"):
 
@@ -51,7 +51,7 @@ def test_a_run_whose_disk_is_full_goes_on_when_there_is_room(at, whole, module_c
     assert differences(whole, folder.path) == []
 
 
-def test_a_run_that_cannot_be_written_is_left_as_it_is(whole, module_config, tmp_path):
+def test_run_is_unchanged_when_its_folder_is_read_only(whole, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(module_config, episodes=3))
     before = content(folder)
@@ -70,7 +70,7 @@ def test_a_run_that_cannot_be_written_is_left_as_it_is(whole, module_config, tmp
 
 
 @pytest.mark.parametrize("lost", ["array", "value"])
-def test_a_checkpoint_of_another_version_is_left_as_it_is(lost, module_config, tmp_path):
+def test_run_is_unchanged_when_its_checkpoint_does_not_fit(lost, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(module_config, episodes=3))
     arrays, values = load_checkpoint(folder.checkpoint)
@@ -85,7 +85,7 @@ def test_a_checkpoint_of_another_version_is_left_as_it_is(lost, module_config, t
     assert content(folder) == before
 
 
-def test_a_run_killed_before_it_had_a_configuration_begins_anew(whole, module_config, tmp_path):
+def test_run_starts_again_when_killed_before_its_configuration(whole, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.path.mkdir()
     (folder.path / ".config.yaml.123.part").write_text("task: Be")

@@ -81,7 +81,7 @@ def passage(episodes, **environment):
     )  # fmt: skip
 
 
-def test_a_push_is_a_transition_and_becomes_via_points_that_the_next_episode_passes(tmp_path):
+def test_correction_becomes_transitions_and_via_points(tmp_path):
     folder = RunFolder(tmp_path / "run")
     rows = run_training(folder, passage(2), supervisor=Scripted({0: (10, 19, [0.5, 3.0])}))
     assert [row["interventions"] for row in rows] == [1, 0]
@@ -100,7 +100,7 @@ def test_a_push_is_a_transition_and_becomes_via_points_that_the_next_episode_pas
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
-def test_via_points_are_passed_and_forgotten_far_from_them():
+def test_via_points_change_the_reference_locally():
     t = 0.02 * np.arange(400)
     reference = ReferenceTrajectory(t, np.column_stack([np.sin(t), t]), np.tile(0.01 * np.eye(2), (400, 1, 1)))
     points = [200, 1.5, 3.9, 205, 1.5, 4.0]
@@ -113,7 +113,7 @@ def test_via_points_are_passed_and_forgotten_far_from_them():
             pass_through(reference, wrong, SquaredExponential(0.5))
 
 
-def test_whoever_has_not_let_go_at_the_end_means_the_rest_and_newer_pushes_replace_older_ones():
+def test_held_correction_applies_to_the_rest_of_the_motion():
     corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
     last = corrections._reference.num_steps - 1
     kept = np.reshape(corrections.with_offsets({20: np.array([0.1, 0.0])}, is_held=True), (-1, 3))
@@ -125,7 +125,7 @@ def test_whoever_has_not_let_go_at_the_end_means_the_rest_and_newer_pushes_repla
     assert (newer[newer[:, 0] > 34] == kept[kept[:, 0] > 34]).all()
 
 
-def test_what_a_person_says_ends_an_episode_and_is_worth_something(tmp_path):
+def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
     words = {0: (10, "success"), 1: (10, "failure"), 2: (10, "stop")}
     rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, words))
     assert [row["termination"] for row in rows] == ["success", "failure", "stop"]
@@ -138,7 +138,7 @@ def test_what_a_person_says_ends_an_episode_and_is_worth_something(tmp_path):
     )
 
 
-def test_a_run_that_was_stopped_goes_on_with_what_was_corrected(tmp_path):
+def test_supervised_run_resumes_with_its_corrections(tmp_path):
     pushes = {0: (10, 19, [0.5, 3.0]), 2: (4, 8, [-1.0, 0.0])}
     whole = run_training(RunFolder(tmp_path / "whole"), passage(4), supervisor=Scripted(pushes))
     run_training(RunFolder(tmp_path / "parts"), passage(2), supervisor=Scripted(pushes))
@@ -152,12 +152,12 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_corrected(tmp_path):
         run_training(folder, folder.config(), resume=True)
 
 
-def test_guidance_without_demonstrations_can_not_be_corrected():
+def test_corrections_are_refused_without_demonstrations():
     with pytest.raises(InputError, match="does not use"):
         ViaPointCorrections("Pouring", {})
 
 
-def test_five_millimetres_astray_a_person_rescues_it_with_a_push_or_two(tmp_path):
+def test_corrections_rescue_demonstrations_that_are_5_mm_off(tmp_path):
     """The connector's demonstrations led 5 mm beside the jack; a person who sees that pushes until it goes in."""
     environment = {
         "guidance": "kgrl",

@@ -52,7 +52,7 @@ def weights(learner):
     return torch.nn.utils.parameters_to_vector(learner.model.actor.parameters()).detach().numpy().copy()
 
 
-def test_presets_are_the_tables_of_the_thesis():
+def test_presets_have_the_values_of_the_thesis():
     simulation, robot = PRESETS["table_4_1_simulation"], PRESETS["table_4_1_robot"]
     for table, tau, gamma, entropy in ((simulation, 0.02, 0.99, "auto"), (robot, 0.01, 0.995, "auto_0.1")):
         assert (table.learning_rate, table.train_freq, table.gradient_steps) == (1e-3, 8, 8)
@@ -66,21 +66,21 @@ def test_presets_are_the_tables_of_the_thesis():
 
 @pytest.mark.parametrize("algorithm", ["sac", "tqc"])
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_makes_a_learner_of_every_algorithm(name, algorithm):
+def test_preset_makes_a_learner_of_every_algorithm(name, algorithm):
     learner = make(replace(resolve_preset(name, algorithm), net_arch=(4,)))
     assert learner.act(np.zeros(3, np.float32)).shape == (2,)
 
 
-def test_a_longer_hold_discounts_a_decision_more(preset):
+def test_gamma_per_control_step_depends_on_action_repeat(preset):
     assert make(preset, action_repeat=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
 
 
-def test_the_pouring_tables_discount_a_decision_whatever_its_hold():
+def test_gamma_per_action_is_independent_of_action_repeat():
     table = replace(resolve_preset("table_3_2_sara", "sac"), net_arch=(4,))
     assert make(table, action_repeat=10).model.gamma == make(table, action_repeat=1).model.gamma == 0.98
 
 
-def test_training_follows_the_count_of_decisions(preset):
+def test_training_follows_the_number_of_transitions(preset):
     learner = make(preset)
     make_baseline = weights(learner)
     live(learner, 7)
@@ -92,7 +92,7 @@ def test_training_follows_the_count_of_decisions(preset):
     assert learner.model._n_updates == 8
 
 
-def test_the_averaged_actor_lags_behind_the_learning_one(preset):
+def test_averaged_actor_lags_behind_the_actor(preset):
     learner = make(preset)
     start = weights(learner)
     live(learner, 40)
@@ -104,7 +104,7 @@ def test_the_averaged_actor_lags_behind_the_learning_one(preset):
     assert plain.actor() is plain.model.actor
 
 
-def test_a_time_limit_is_no_end_of_the_task(preset):
+def test_time_limit_is_bootstrapped(preset):
     learner = make(preset)
     seen = np.zeros(3, np.float32)
     for terminated, truncated in ((True, False), (False, True), (False, False)):
@@ -114,7 +114,7 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
     np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
 
 
-def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
+def test_replay_buffer_has_symmetric_copies(preset):
     half_turn = Symmetry.of_signs((-1.0, -1.0, 1.0), (-1.0, 1.0))
     learner = TqcLearner(preset, SpacesOnlyEnv(), action_repeat=1, seed=0, max_transitions=50, symmetry=half_turn)
     plain = TqcLearner(
@@ -138,7 +138,7 @@ def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
     assert (buffer.size(), buffer.full) == (50, False)
 
 
-def test_returns_of_several_steps_stop_where_an_episode_does(preset):
+def test_n_step_returns_end_with_the_episode(preset):
     learner = make(replace(preset, n_steps=3, gamma=0.5))
     zero = np.zeros(3, np.float32)
     for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
@@ -149,7 +149,7 @@ def test_returns_of_several_steps_stop_where_an_episode_does(preset):
     np.testing.assert_allclose(samples.discounts[2:, 0], 0.125)
 
 
-def test_a_restored_learner_goes_on_as_the_first_would_have(preset):
+def test_restored_learner_continues_bit_for_bit(preset):
     first = make(preset)
     live(first, 23)
     arrays, values = (part.copy() for part in first.state())
@@ -162,14 +162,14 @@ def test_a_restored_learner_goes_on_as_the_first_would_have(preset):
     np.testing.assert_array_equal(weights(second), expected)
 
 
-def test_a_checkpoint_of_another_network_does_not_fit(preset):
+def test_restore_refuses_the_state_of_another_network(preset):
     arrays, values = make(preset).state()
     with pytest.raises((KeyError, RuntimeError, ValueError)):
         make(replace(preset, net_arch=(16,))).restore(arrays, values)
 
 
 @pytest.mark.parametrize("settings", [{"gamma": 1.5}, {"net_arch": ""}, {"ent_coef": "much"}, {"batch_size": 2.5}])
-def test_refuses_what_no_learner_can_use(settings):
+def test_config_refuses_invalid_settings(settings):
     with pytest.raises(InputError):
         resolve_preset("tqc_contact", "tqc", settings)
 
@@ -183,14 +183,14 @@ def acted(learner, episodes, decisions=4):
     return np.array(actions)
 
 
-def test_constant_episodes_keep_to_one_action_each(preset):
+def test_constant_episodes_repeat_one_action(preset):
     actions = acted(make(replace(preset, constant_episodes=3)), 4)
     assert (actions[:3] == actions[:3, :1]).all()
     assert len(np.unique(actions[:3, 0], axis=0)) == 3
     assert len(np.unique(actions[3], axis=0)) == 4
 
 
-def test_greedy_episodes_do_what_the_policy_would(preset):
+def test_greedy_episodes_act_as_the_exported_policy(preset):
     learner = make(replace(preset, constant_episodes=0, greedy_episode_fraction=0.5))
     live(learner, 20)
     action_dims, greedy = acted(learner, 2)
@@ -200,7 +200,7 @@ def test_greedy_episodes_do_what_the_policy_would(preset):
     np.testing.assert_allclose(greedy[0], policy(np.ones(3, np.float32)), atol=1e-6)
 
 
-def test_so_many_episodes_are_greedy_as_asked_for(preset):
+def test_number_of_greedy_episodes_is_the_fraction(preset):
     for share in (0.0, 0.25, 0.75, 1.0):
         learner = make(replace(preset, constant_episodes=0, greedy_episode_fraction=share))
         live(learner, 20)
@@ -208,7 +208,7 @@ def test_so_many_episodes_are_greedy_as_asked_for(preset):
         assert sum(greedy) == 8 * share
 
 
-def test_no_episode_is_greedy_before_learning_has_begun(preset):
+def test_episodes_explore_until_learning_starts(preset):
     learner = make(
         replace(preset, constant_episodes=0, learning_starts=12, greedy_episode_fraction=1.0, selection_window=3)
     )
@@ -220,7 +220,7 @@ def test_no_episode_is_greedy_before_learning_has_begun(preset):
     assert learner.state()[1]["greedy_successes"] == 2
 
 
-def test_temporally_extended_actions_last_for_a_while_now_and_then(preset):
+def test_extended_actions_have_the_configured_length(preset):
     settled = replace(preset, constant_episodes=0, learning_starts=1, ez_greedy=0.2, ez_greedy_longest=5)
     learner = make(settled)
     live(learner, 20)
@@ -235,7 +235,7 @@ def test_temporally_extended_actions_last_for_a_while_now_and_then(preset):
     assert (actions == actions[0]).all()
 
 
-def test_extended_actions_end_once_greedy_episodes_succeed_and_come_back_when_they_fail(preset):
+def test_extended_actions_end_when_greedy_episodes_succeed(preset):
     settled = replace(
         preset, constant_episodes=0, learning_starts=1, greedy_episode_fraction=0.5, ez_greedy=1.0, ez_greedy_until=2
     )
@@ -253,7 +253,7 @@ def test_extended_actions_end_once_greedy_episodes_succeed_and_come_back_when_th
         learner.on_episode_start()
 
 
-def test_a_restored_learner_is_in_the_same_episode(preset):
+def test_restored_learner_is_in_the_same_episode(preset):
     first = make(replace(preset, constant_episodes=2, greedy_episode_fraction=0.5))
     live(first, 20)
     acted(first, 3)
@@ -265,7 +265,7 @@ def test_a_restored_learner_is_in_the_same_episode(preset):
     np.testing.assert_array_equal(acted(second, 3), expected)
 
 
-def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
+def test_result_is_the_selected_actor_also_when_restored(preset):
     first = make(
         replace(preset, constant_episodes=0, greedy_episode_fraction=1.0, selection_window=3, learning_starts=1)
     )
@@ -294,12 +294,12 @@ def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
         {"ez_greedy_until": -1},
     ],
 )
-def test_episodes_that_cannot_be_are_refused(settings):
+def test_config_refuses_invalid_numbers_of_episodes(settings):
     with pytest.raises(InputError):
         resolve_preset("tqc_contact", "tqc", settings)
 
 
-def test_an_algorithm_more_is_one_class(monkeypatch):
+def test_another_algorithm_is_one_class(monkeypatch):
     """One that is deterministic and has no entropy, to be as unlike the others as it can be."""
     monkeypatch.setattr(LEARNERS, "_entries", dict(LEARNERS._entries))
 
@@ -322,14 +322,14 @@ def test_an_algorithm_more_is_one_class(monkeypatch):
     assert not np.array_equal(learner.explore(seen), learner.explore(seen))
 
 
-def test_a_network_that_a_policy_cannot_hold_is_refused(preset):
+def test_export_refuses_unsupported_layers(preset):
     actor = make(preset).model.actor
     actor.latent_pi[1] = torch.nn.GELU()
     with pytest.raises(InputError, match="GELU"):
         export_policy(actor, {"observation_shape": [3]})
 
 
-def test_where_the_simulation_failed_nothing_followed(preset):
+def test_transition_is_not_stored_when_the_simulation_failed(preset):
     """No decision is remembered of it, and what came before is the episode's last, without being its end."""
     learner, seen = make(preset), np.zeros(3, np.float32)
     failed = Transition(seen, np.zeros(2), 0.0, seen, False, True, {"simulation_failure": "it diverged"})
@@ -342,7 +342,7 @@ def test_where_the_simulation_failed_nothing_followed(preset):
     assert (buffer.dones[0], buffer.timeouts[0]) == (1, 1)
 
 
-def test_where_a_person_pushed_nothing_is_said_of_the_policy(preset):
+def test_episode_with_interventions_is_not_selected(preset):
     learner = make(replace(preset, greedy_episode_fraction=1.0, constant_episodes=0, learning_starts=1))
     live(learner, 2)
     for interventions, row in ((0, 1), (2, 1), (0, 2)):
@@ -353,7 +353,7 @@ def test_where_a_person_pushed_nothing_is_said_of_the_policy(preset):
     assert len(learner.selection._open) == 2
 
 
-def test_what_a_person_pushed_has_no_other_sides():
+def test_symmetry_is_off_when_demonstrations_are_corrected():
     task = SimpleNamespace(symmetry="both", near_symmetry="all", num_steps=10)
     learner = SimpleNamespace(symmetry="near")
     for pushed, environment, sides in ((False, {}, "all"), (True, {}, None), (False, {"via_points": (1.0, 2.0)}, None)):

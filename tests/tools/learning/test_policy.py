@@ -40,7 +40,7 @@ def learner(request):
     )
 
 
-def test_does_what_stable_baselines_predicts(learner, tmp_path):
+def test_policy_acts_as_stable_baselines3_predicts(learner, tmp_path):
     space = learner.model.actor.action_space
     observations = [learner_observation(learner, seed) for seed in range(20)]
     policy = export_policy(learner.model.actor, {"observation_shape": list(observations[0].shape)})
@@ -58,13 +58,13 @@ def learner_observation(learner, seed):
     return random.normal(scale=3, size=STATE.shape).astype(np.float32)
 
 
-def test_refuses_an_observation_of_another_shape(learner):
+def test_policy_refuses_an_observation_of_another_shape(learner):
     policy = export_policy(learner.model.actor, {"observation_shape": list(learner_observation(learner, 0).shape)})
     with pytest.raises(ValueError, match="trained on observations"):
         policy(np.zeros(4))
 
 
-def test_a_truncated_policy_is_refused_in_a_sentence(learner, tmp_path):
+def test_load_refuses_a_truncated_policy(learner, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
     export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     weights = tmp_path / "policy.safetensors"
@@ -73,7 +73,7 @@ def test_a_truncated_policy_is_refused_in_a_sentence(learner, tmp_path):
         Policy.load(tmp_path)
 
 
-def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, tmp_path):
+def test_load_refuses_an_unknown_activation(learner, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
     export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
@@ -83,7 +83,7 @@ def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, t
 
 
 @pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
-def test_a_policy_in_which_one_bit_changed_is_refused_in_a_sentence(learner, file, tmp_path):
+def test_load_refuses_a_flipped_bit(learner, file, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
     export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     content = bytearray((tmp_path / file).read_bytes())
@@ -102,7 +102,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("entry", "value"), WRONG)
-def test_a_policy_whose_parts_do_not_fit_together_is_refused_in_a_sentence(entry, value, tmp_path):
+def test_policy_refuses_parts_that_do_not_fit(entry, value, tmp_path):
     layers = [(np.ones((4, 5), np.float32), np.zeros(4, np.float32)), (np.ones((2, 4), np.float32), np.zeros(2, "f4"))]
     values = {"observation_shape": [5], "action_low": [-1.0, -2.0], "action_high": [1.0, 3.0], "pool": 1}
     Policy(layers, values).save(tmp_path)
@@ -121,7 +121,7 @@ def test_a_policy_whose_parts_do_not_fit_together_is_refused_in_a_sentence(entry
 
 
 @pytest.mark.parametrize("lacking", ["observation_shape", "action_low", "action_high", "pool"])
-def test_a_policy_of_an_image_that_is_described_in_part_is_refused(lacking):
+def test_image_policy_refuses_an_incomplete_description(lacking):
     layers = [(np.ones((1, 3), np.float32), np.zeros(1, np.float32))]
     whole = {"observation_shape": [2, 2, 3], "action_low": [-1.0], "action_high": [1.0], "pool": 2}
     Policy(layers, whole)
@@ -129,6 +129,6 @@ def test_a_policy_of_an_image_that_is_described_in_part_is_refused(lacking):
         Policy(layers, {name: value for name, value in whole.items() if name != lacking})
 
 
-def test_a_missing_policy_is_refused_in_a_sentence(tmp_path):
+def test_load_names_a_missing_policy(tmp_path):
     with pytest.raises(InputError, match="holds no policy"):
         Policy.load(tmp_path)

@@ -7,13 +7,13 @@ from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 
 
-def test_a_configuration_comes_back_as_it_was_written(bead_config, tmp_path):
+def test_config_is_read_as_written(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(bead_config)
     assert folder.config() == bead_config
 
 
-def test_everything_that_decides_a_run_is_in_its_configuration(bead_config, tmp_path):
+def test_config_file_has_everything_that_decides_a_run(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(bead_config)
     text = (tmp_path / "run" / "config.yaml").read_text()
@@ -21,7 +21,7 @@ def test_everything_that_decides_a_run_is_in_its_configuration(bead_config, tmp_
         assert word in text
 
 
-def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(bead_config, tmp_path):
+def test_missing_setting_has_its_default_not_the_presets(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(replace(bead_config, preset="sac_gridclamp", learner=PRESETS["sac_gridclamp"]))
     file = tmp_path / "run" / "config.yaml"
@@ -30,7 +30,7 @@ def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(
     assert folder.config().learner == replace(PRESETS["sac_gridclamp"], ez_greedy_until=0)
 
 
-def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config, tmp_path):
+def test_missing_option_has_its_default(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     older = {key: value for key, value in bead_config.environment.items() if key != "observation"}
     folder.create(replace(bead_config, environment=older))
@@ -39,7 +39,7 @@ def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config
         folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"action_repeat": 2}))
 
 
-def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_path):
+def test_config_file_with_an_invalid_setting_is_refused(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(bead_config)
     file = tmp_path / "run" / "config.yaml"
@@ -64,7 +64,7 @@ def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_pat
         ("imports: []", f"imports: [{'[' * 99}"),
     ],
 )
-def test_a_configuration_that_says_something_else_is_refused(old, new, bead_config, tmp_path):
+def test_config_file_with_invalid_content_is_refused(old, new, bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(bead_config)
     file = tmp_path / "run" / "config.yaml"
@@ -85,7 +85,7 @@ TABLE = "episode,return,success,termination,steps\n0,-1.5,0,blocked,12\n1,2.5,1,
         (",1,success", ",7,success"), ("episode,", ","), ("return", "episode"), ("-1.5", '"'),
     ],
 )  # fmt: skip
-def test_a_table_of_episodes_that_holds_no_numbers_is_refused(old, new, tmp_path):
+def test_table_of_episodes_refuses_text_for_numbers(old, new, tmp_path):
     (tmp_path / "episodes.csv").write_text(TABLE, encoding="utf-8")
     assert RunFolder(tmp_path).episodes()["return"].tolist() == [-1.5, 2.5]
     (tmp_path / "episodes.csv").write_text(TABLE.replace(old, new, 1), encoding="utf-8")

@@ -50,7 +50,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_run_does_not_go_on_as_another_task(name, folder, tmp_path):
+def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, tmp_path):
     config = configure("parts/pin", {}, episodes=2, imports=[str(folder)])
     begun = RunFolder(tmp_path / "run")
     begun.create(config)
@@ -69,7 +69,7 @@ def test_a_run_does_not_go_on_as_another_task(name, folder, tmp_path):
     begun.refuse_another(config)
 
 
-def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_path):
+def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
     config = configure("parts/pin", {}, episodes=2)
     said = {"name": "pins", "task": "parts/pin", "methods": {"zero": {"policy": "zero"}}, "seeds": [0]}
     job = Job(Study.model_validate(said), "zero", 0, tmp_path)
@@ -85,5 +85,5 @@ def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_p
     assert all(one != other for one, other in zip(files(), before, strict=True))
 
 
-def test_a_task_that_is_code_has_no_files():
+def test_task_without_a_folder_has_no_content_digest():
     assert task_content("NarrowPassage", {}, ()) == task_content("Bead", {}, ()) == ""

@@ -64,7 +64,7 @@ def always_left(env):
     return lambda observation: env.action_space.low
 
 
-def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_config, tmp_path):
+def test_demonstrator_acts_in_the_first_episodes(bead_config, tmp_path):
     acted = []
 
     def watched(env):
@@ -81,7 +81,7 @@ def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_co
     assert len(rows) > 2
 
 
-def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+def test_demonstrated_run_resumes_bit_for_bit(bead_config, tmp_path):
     config = shown(bead_config, 2)
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
     run_training(undisturbed, config, demonstrator=always_left)
@@ -90,7 +90,7 @@ def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_con
     assert_same_run(undisturbed, stopped)
 
 
-def test_who_looks_at_what_is_not_there_demonstrates_nothing(bead_config, tmp_path):
+def test_demonstrator_of_other_observations_is_refused(bead_config, tmp_path):
     def later(env):
         return lambda seen: env.action_space.low if seen[0] < 0.5 else env.action_space.low * seen[99]
 
@@ -98,13 +98,13 @@ def test_who_looks_at_what_is_not_there_demonstrates_nothing(bead_config, tmp_pa
         run_training(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=later)
 
 
-def test_where_nobody_demonstrates_a_run_is_refused_before_it_begins(bead_config, tmp_path):
+def test_run_is_refused_when_a_demonstrator_is_missing(bead_config, tmp_path):
     with pytest.raises(InputError, match="demonstration_episodes"):
         run_training(RunFolder(tmp_path / "run"), shown(bead_config, 1))
     assert not (tmp_path / "run").exists()
 
 
-def test_who_moves_other_things_demonstrates_nothing(bead_config, tmp_path):
+def test_demonstrator_of_other_actions_is_refused(bead_config, tmp_path):
     with pytest.raises(InputError, match="actions of Bead's scripted policy differ"):
         run_training(
             RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=lambda env: lambda seen: np.zeros(7)
@@ -112,7 +112,7 @@ def test_who_moves_other_things_demonstrates_nothing(bead_config, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+def test_killed_run_resumes_bit_for_bit(bead_config, tmp_path):
     undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
     run_training(undisturbed, bead_config)
     code = CHILD.format(tests=str(Path(__file__).parents[1]), out=str(killed.path))
@@ -128,7 +128,7 @@ def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
     assert_same_run(undisturbed, killed)
 
 
-def test_the_same_seed_gives_the_same_run_and_another_another(bead_config, tmp_path):
+def test_seed_decides_the_run(bead_config, tmp_path):
     folders = [RunFolder(tmp_path / name) for name in "abc"]
     for folder, seed in zip(folders, (5, 5, 6), strict=True):
         run_training(folder, replace(bead_config, seed=seed))
@@ -136,7 +136,7 @@ def test_the_same_seed_gives_the_same_run_and_another_another(bead_config, tmp_p
     assert without_clock(folders[0].episodes()) != without_clock(folders[2].episodes())
 
 
-def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
+def test_finished_run_continues_with_more_episodes(bead_config, tmp_path):
     long, extended = RunFolder(tmp_path / "long"), RunFolder(tmp_path / "extended")
     run_training(long, bead_config)
     run_training(extended, replace(bead_config, episodes=3))
@@ -145,7 +145,7 @@ def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
     assert extended.config() == bead_config
 
 
-def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_config, tmp_path):
+def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
 
@@ -165,7 +165,7 @@ def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_c
     assert Policy.load(folder.path).description == before, "of a finished one nothing is removed"
 
 
-def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path, forkserver):
+def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
     """Whatever was not learned yet when it stopped is learned then."""
     plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
     config = replace(plain, learner=replace(plain.learner, pipelined=True))
@@ -188,7 +188,7 @@ def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_pat
     assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
 
 
-def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
+def test_run_is_locked_against_other_processes(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     holds = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
     holds += f"with RunFolder({str(folder.path)!r}).locked(): print('held', flush=True); sys.stdin.read()"
@@ -205,7 +205,7 @@ def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
     assert {path.name for path in folder.path.iterdir() if path.name.startswith(".")} == set()
 
 
-def test_a_step_log_that_was_turned_off_stays_off_when_a_run_resumes(bead_config, tmp_path):
+def test_step_log_stays_off_when_a_run_resumes(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2, step_log=False))
     assert not folder.steps.exists()
@@ -213,7 +213,7 @@ def test_a_step_log_that_was_turned_off_stays_off_when_a_run_resumes(bead_config
         start_or_resume(None, folder.path, environment={}, step_log=True, resume=True)
 
 
-def test_a_run_never_replaces_another(bead_config, tmp_path):
+def test_run_never_replaces_other_files(bead_config, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="already exists"):
         run_training(RunFolder(tmp_path), bead_config)
@@ -231,7 +231,7 @@ def test_a_run_never_replaces_another(bead_config, tmp_path):
     ],
     ids=["truncated checkpoint", "no checkpoint", "another table", "broken yaml", "incomplete yaml"],
 )
-def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
+def test_run_is_unchanged_when_it_is_damaged(bead_config, tmp_path, damage):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
     damage(folder)
@@ -241,7 +241,7 @@ def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
     assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
 
 
-def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tmp_path):
+def test_run_killed_between_checkpoint_and_table_is_complete(bead_config, tmp_path):
     whole, torn = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "torn")
     run_training(whole, bead_config)
     run_training(torn, replace(bead_config, episodes=4))
@@ -251,7 +251,7 @@ def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tm
     assert_same_run(whole, torn)
 
 
-def test_a_complete_run_whose_table_lacks_episodes_gets_them_from_its_checkpoint(bead_config, tmp_path):
+def test_table_is_completed_from_the_checkpoint(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, bead_config)
     table = folder.path / "episodes.csv"
@@ -275,7 +275,7 @@ def refused_in(episode):
     return demonstrator
 
 
-def test_a_run_that_is_refused_in_its_first_episode_leaves_nothing_in_the_way_of_the_next(bead_config, tmp_path):
+def test_folder_is_removed_when_the_first_episode_is_refused(bead_config, tmp_path):
     there = tmp_path / "there"
     there.mkdir()
     (there / ".of_somebody").write_text("")
@@ -287,7 +287,7 @@ def test_a_run_that_is_refused_in_its_first_episode_leaves_nothing_in_the_way_of
     run_training(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
 
 
-def test_a_run_that_is_refused_later_or_going_on_keeps_what_it_has(bead_config, tmp_path):
+def test_folder_is_kept_when_a_later_episode_is_refused(bead_config, tmp_path):
     config, later, begun = shown(bead_config, 3), RunFolder(tmp_path / "later"), RunFolder(tmp_path / "begun")
     with pytest.raises(InputError, match="this is wrong"):
         run_training(later, config, demonstrator=refused_in(1))
@@ -298,7 +298,7 @@ def test_a_run_that_is_refused_later_or_going_on_keeps_what_it_has(bead_config, 
     assert begun.config() == config
 
 
-def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_path):
+def test_run_starts_again_when_killed_before_a_checkpoint(bead_config, tmp_path):
     whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
     run_training(whole, bead_config)
     begun.create(bead_config)
@@ -306,7 +306,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_
     assert_same_run(whole, begun)
 
 
-def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
+def test_resume_refuses_other_settings(bead_config, tmp_path):
     run_training(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
     with pytest.raises(InputError, match="seed 5, not 7"):
         start_or_resume(None, tmp_path / "run", environment={}, seed=7, resume=True)
@@ -314,7 +314,7 @@ def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
         start_or_resume(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
 
 
-def test_a_run_of_another_version_is_left_as_it_is(bead_config, tmp_path):
+def test_resume_refuses_rows_with_other_columns(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     rows = run_training(folder, bead_config)
     arrays, values = load_checkpoint(folder.checkpoint)
@@ -327,7 +327,7 @@ def test_a_run_of_another_version_is_left_as_it_is(bead_config, tmp_path):
     assert (folder.path / "episodes.csv").read_bytes() == before
 
 
-def test_one_thread_does_the_sums():
+def test_environment_limits_threads_to_one():
     threadpoolctl.threadpool_limits(2)
     make_environment("Bead", {})
     assert {pool["num_threads"] for pool in threadpoolctl.threadpool_info()} == {1}
@@ -337,19 +337,19 @@ def test_one_thread_does_the_sums():
     ("task", "preset", "algorithm"),
     [("GridClamp", "sac_gridclamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "tqc_contact", "tqc")],
 )
-def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset, algorithm):
+def test_default_learner_is_the_tasks(task, preset, algorithm):
     config = configure(task, {}, **with_defaults(task, {"seed": 3}))
     assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
 
 
-def test_a_learner_that_was_asked_for_is_taken_whole():
+def test_chosen_learner_replaces_the_tasks():
     given = with_defaults("GridClamp", {"algorithm": "tqc"})
     assert given == {"algorithm": "tqc"}
     assert configure("GridClamp", {"guidance": "none"}, **given).preset == "tqc_contact"
 
 
 @pytest.mark.parametrize("pipelined", [False, True])
-def test_a_run_that_diverges_says_so_and_what_it_was_is_kept(pipelined, bead_config, tmp_path, forkserver):
+def test_diverged_run_is_reported_and_kept(pipelined, bead_config, tmp_path, forkserver):
     learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0, pipelined=pipelined)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(InputError, match="diverged"):
@@ -358,7 +358,7 @@ def test_a_run_that_diverges_says_so_and_what_it_was_is_kept(pipelined, bead_con
     assert not (folder.path / "policy.json").exists()
 
 
-def test_more_than_fits_into_memory_is_refused_before_a_run_begins(bead_config, tmp_path, monkeypatch):
+def test_run_is_refused_when_memory_does_not_suffice(bead_config, tmp_path, monkeypatch):
     def vast(*given, **named):
         raise MemoryError("no 44 GiB")
 
@@ -370,7 +370,7 @@ def test_more_than_fits_into_memory_is_refused_before_a_run_begins(bead_config, 
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp_path, caplog):
+def test_resume_accepts_the_same_options_and_notes_versions(tmp_path, caplog):
     words = {"environment": {"guidance": "kgrl", "action_dims": "0,1"}, "settings": {"net_arch": "8"}}
     out = tmp_path / "run"
     start_or_resume("NarrowPassage", out, episodes=1, **words)
@@ -395,7 +395,7 @@ def one_more(folder, package, kind, register, name):
     return file
 
 
-def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monkeypatch):
+def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
     monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # no other test has this one
     kinds = "narrow_passage.task.NarrowPassage", "registry.register_task"
     file = one_more(tmp_path, "guiderail.diagrams.tasks", *kinds, "changes/Passage")
@@ -410,7 +410,7 @@ def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monke
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
 
 
-def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, forkserver, monkeypatch):
+def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
     monkeypatch.setitem(LEARNERS._entries, "sac_of_mine", None)  # no other test has this one
     kinds = "off_policy.SacLearner", "learner.register_learner"
     file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
@@ -422,12 +422,12 @@ def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, for
     assert done.summary["episodes"] == 2
 
 
-def test_a_demonstrated_episode_is_marked(bead_config, tmp_path):
+def test_demonstrated_episodes_are_marked(bead_config, tmp_path):
     rows = run_training(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
     assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
 
 
-def test_a_folder_that_cannot_be_one_is_refused(tmp_path):
+def test_run_folder_refuses_an_impossible_path(tmp_path):
     folder = RunFolder(tmp_path / ("n" * 300))
     with pytest.raises(InputError, match="folder"):
         folder.refuse_existing()

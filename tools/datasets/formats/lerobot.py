@@ -11,7 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.datasets.formats.recorded import Recorded, choose_signal, from_zero
-from guiderail.tools.files import whole_folder
+from guiderail.tools.files import atomic_folder
 
 VERSION = "v3.0"
 INFO = Path("meta") / "info.json"
@@ -161,7 +161,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         "video_path": None,
         "features": features,
     }
-    with whole_folder(folder) as made:
+    with atomic_folder(folder) as made:
         for path, table in (
             (DATA_PATH.format(chunk_index=0, file_index=0), columns),
             ("meta/episodes/chunk-000/file-000.parquet", describe_options),

@@ -19,7 +19,7 @@ from guiderail.tools.datasets.formats.recorded import (
     rotations_of,
 )
 from guiderail.tools.datasets.paths import in_order
-from guiderail.tools.files import whole_folder
+from guiderail.tools.files import atomic_folder
 
 # Where a pose is in a message of each type that robots commonly publish.
 POSES = {
@@ -203,7 +203,7 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
     )
     dims = [dimension(label=name, size=1, stride=1) for name in demonstrations.names]
     stamps, notes = _stamps(demonstrations)
-    with whole_folder(path) as made:
+    with atomic_folder(path) as made:
         for number, (clock, outputs) in enumerate(zip(stamps, demonstrations.outputs, strict=True)):
             with Writer(made / f"demonstration_{number}", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 connection = writer.add_connection(TOPIC, DATA, typestore=store)

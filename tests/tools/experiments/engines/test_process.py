@@ -35,7 +35,7 @@ def gone(process):
     return False
 
 
-def test_every_job_is_done_by_some_worker_with_one_thread_and_none_is_left():
+def test_process_engine_runs_every_job_and_ends_its_workers():
     rows = {key: outcome.rows[0] for key, outcome in run(work, {n: n for n in range(7)}).items()}
     assert {key: row["square"] for key, row in rows.items()} == {n: n * n for n in range(7)}
     assert {row["threads"] for row in rows.values()} == {"1"}
@@ -44,18 +44,18 @@ def test_every_job_is_done_by_some_worker_with_one_thread_and_none_is_left():
     assert all(map(gone, workers))
 
 
-def test_one_process_alone_is_this_one(monkeypatch):
+def test_single_process_is_this_one(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert run(work, {0: 3}, processes=1)[0].rows[0]["process"] == os.getpid()
 
 
-def test_a_job_whose_worker_is_killed_is_done_by_another(tmp_path):
+def test_job_of_a_killed_worker_is_run_by_another(tmp_path):
     found = run(work, {0: tmp_path / "once", 1: 5})
     assert found[0].rows[0] == {"found": str(tmp_path / "once")}
     assert found[1].rows[0]["square"] == 25
 
 
-def test_a_job_that_kills_every_worker_is_given_up_and_the_others_are_done():
+def test_job_that_kills_its_workers_is_given_up():
     found = run(die, {n: n for n in range(4)})
     assert [found[n].rows[0]["square"] for n in (0, 2)] == [0, 4]
     for n in (1, 3):
@@ -63,7 +63,7 @@ def test_a_job_that_kills_every_worker_is_given_up_and_the_others_are_done():
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_no_worker_outlives_a_study_however_it_ends(how, tmp_path):
+def test_workers_end_when_the_study_is_killed(how, tmp_path):
     (tmp_path / "parent.py").write_text(PARENT)
     paths = os.pathsep.join([str(Path(__file__).parents[3]), *filter(None, sys.path)])
     with subprocess.Popen(
@@ -85,7 +85,7 @@ def test_no_worker_outlives_a_study_however_it_ends(how, tmp_path):
         assert parent.returncode == -how
 
 
-def test_an_engine_refuses_what_it_has_no_use_for():
+def test_engine_refuses_unsupported_arguments():
     assert {"process", "ray"} <= set(ENGINES.names())
     with pytest.raises(InputError, match="did you mean process"):
         make_engine("proces")

@@ -11,20 +11,20 @@ from guiderail.tools.experiments.engines.engine import make_engine
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is an extra: pip install 'guiderail[ray]'")
 
 
-def test_without_ray_it_is_one_sentence(monkeypatch):
+def test_ray_engine_names_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'guiderail\[ray\]'"):
         make_engine("ray")
 
 
 @needs_ray
-def test_a_cluster_says_how_many_run_side_by_side():
+def test_ray_cluster_refuses_a_number_of_processes():
     with pytest.raises(InputError, match="leave --processes out"):
         make_engine("ray", 2, "127.0.0.1:6379")
 
 
 @needs_ray
-def test_an_address_where_nobody_is_is_one_sentence():
+def test_ray_engine_reports_an_unreachable_address():
     with (
         pytest.raises(InputError, match=r"there is no Ray at 127.0.0.1:9 \(.*refused\)"),
         make_engine("ray", None, "127.0.0.1:9"),
@@ -33,7 +33,7 @@ def test_an_address_where_nobody_is_is_one_sentence():
 
 
 @needs_ray
-def test_a_cluster_that_loses_a_worker_and_a_machine_gives_what_processes_give(tmp_path):
+def test_ray_cluster_gives_the_same_study_after_losses(tmp_path):
     script = Path(__file__).with_name("ray_study.py")
     done = subprocess.run([sys.executable, script, "--bead", "--out", tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

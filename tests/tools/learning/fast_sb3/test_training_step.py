@@ -78,7 +78,7 @@ def same(plain, ensemble, tolerance):
     ("preset", "settings"),
     [("tqc_contact", {}), ("tqc_fast", {"n_steps": 3}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
 )
-def test_it_is_the_gradient_step_of_stable_baselines3(plain, ensemble, preset, settings):
+def test_fast_step_equals_that_of_stable_baselines3(plain, ensemble, preset, settings):
     expected, found = make(plain, preset, **settings), make(ensemble, preset, **settings)
     same(expected, found, 0.0)
     for seed in range(2):
@@ -91,13 +91,13 @@ def test_it_is_the_gradient_step_of_stable_baselines3(plain, ensemble, preset, s
 
 
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
-def test_images_are_averaged_and_scaled_as_there(plain, ensemble):
+def test_fast_step_on_images_equals_stable_baselines3(plain, ensemble):
     expected, found = make(plain, env=Image), make(ensemble, env=Image)
     train_both(expected, found)
     same(expected, found, 2e-6)
 
 
-def test_the_gradient_of_the_critics_is_that_of_the_quantile_huber_loss():
+def test_tqc_critic_gradient_is_that_of_its_loss():
     learner = make(TqcLearner)
     generator = torch.Generator().manual_seed(0)
     values = (2 * torch.randn(2, BATCH, 25, generator=generator)).requires_grad_()
@@ -109,7 +109,7 @@ def test_the_gradient_of_the_critics_is_that_of_the_quantile_huber_loss():
 
 
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
-def test_a_checkpoint_of_stable_baselines3s_own_step_goes_on(plain, ensemble):
+def test_fast_step_continues_stable_baselines3_state(plain, ensemble):
     expected, found = make(plain), make(ensemble)
     train_both(expected, make(ensemble))
     arrays, values = expected.state()
@@ -119,7 +119,7 @@ def test_a_checkpoint_of_stable_baselines3s_own_step_goes_on(plain, ensemble):
     same(expected, found, 2e-6)
 
 
-def test_moments_of_other_networks_do_not_fit():
+def test_flat_adam_refuses_moments_of_other_shapes():
     optimizer = make(SacLearner).model.actor.optimizer
     optimizer.step()
     stored = optimizer.state_dict()["state"]
@@ -129,7 +129,7 @@ def test_moments_of_other_networks_do_not_fit():
         optimizer.load_state_dict({"state": {0: stored[0]}})
 
 
-def test_layers_whose_gradient_is_not_written_out_are_refused():
+def test_fast_step_refuses_unsupported_activations():
     class Other(FastTrainingStep, SAC):
         pass
 
@@ -137,7 +137,7 @@ def test_layers_whose_gradient_is_not_written_out_are_refused():
         Other("MlpPolicy", Vector(), policy_kwargs={"activation_fn": torch.nn.GELU})
 
 
-def test_learning_does_not_wait_for_pytorchs_compiler(forks):
+def test_learning_does_not_import_pytorchs_compiler(forks):
     code = """
 import sys
 from guiderail.tools.learning.fast_sb3.training_step import FastSac, FastTqc
