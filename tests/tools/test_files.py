@@ -82,7 +82,10 @@ def test_lock_removes_partial_files_of_ended_processes(ended_process, tmp_path):
 def test_partial_files_of_running_processes_stay(ended_process, tmp_path):
     alive = os.getppid()
     another = tmp_path / "another_run"
-    kept = [tmp_path / f".report.html.{alive}.part", another / "checkpoint" / f".state.safetensors.{ended_process}.part"]
+    kept = [
+        tmp_path / f".report.html.{alive}.part",
+        another / "checkpoint" / f".state.safetensors.{ended_process}.part",
+    ]
     kept += [tmp_path / f".peg.{alive}.part" / f".part.yaml.{ended_process}.part", another / LOCK]
     for path in kept:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The tools on a task of guiderail's own, from training to what a run leaves behind."""
+"""Tools on the task NarrowPassage, from training to the files of a run."""
 
 from dataclasses import replace
 

@@ -212,8 +212,8 @@ def _refuse_lost_policy(job: Job, episodes: int) -> None:
     table = job.folder.path / "episodes.csv"
     if table.exists() and len(job.folder.episodes()) > episodes and not job.policy_folder(episodes).exists():
         raise InputError(
-            f"the run in {job.folder.path} was trained for more than {episodes} episodes, and its policy after {episodes} "
-            f"is lost: leave {episodes} out of after_episodes, or train again in another folder"
+            f"the run in {job.folder.path} was trained for more than {episodes} episodes, and its policy after "
+            f"{episodes} is lost: leave {episodes} out of after_episodes, or train again in another folder"
         )
 
 

@@ -21,8 +21,8 @@ NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
 def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
     """Draw a panel for each sweep: the success rate of all seeds against the quantity.
 
-    The band spans the seeds' own 95 % intervals. Harder values are to the right. A cross marks where a method that began
-    above `BREAKING_SUCCESS` falls below it.
+    The band spans the seeds' own 95 % intervals. Harder values are to the right. A cross marks where a method that
+    began above `BREAKING_SUCCESS` falls below it.
 
     Args:
         study: Study of the sweeps.

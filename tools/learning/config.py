@@ -1,7 +1,7 @@
 """Configuration of learners: the settings, named presets, and their validation.
 
-A learner names its configuration class as `Learner.Config`, a pydantic dataclass derived from `LearnerConfig`. A setting
-of the command, `--set name=value`, is validated against that class.
+A learner names its configuration class as `Learner.Config`, a pydantic dataclass derived from `LearnerConfig`. A
+setting of the command, `--set name=value`, is validated against that class.
 """
 
 import math
@@ -90,8 +90,8 @@ _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_c
 
 # The measurements behind each preset are in docs/experiments.md.
 PRESETS = {
-    # Contact makes learning oscillate. Small batches, a moderate learning rate and normalized layers reduce that, greedy
-    # episodes tell the critic the value of the mean action, and checkpoint selection takes an actor that lasts.
+    # Contact makes learning oscillate. Small batches, a moderate learning rate and normalized layers reduce that,
+    # greedy episodes tell the critic the value of the mean action, and checkpoint selection takes an actor that lasts.
     "tqc_contact": OffPolicyConfig(
         learning_rate=3e-4,
         train_freq=4,
@@ -104,8 +104,8 @@ PRESETS = {
         selection_window=8,
         actor_ema=0.003,
     ),
-    # The force cost is observed long before the first success. A large entropy and temporally extended actions lead back
-    # to contact; they end once greedy episodes succeed, because they push hardest.
+    # The force cost is observed long before the first success. A large entropy and temporally extended actions lead
+    # back to contact; they end once greedy episodes succeed, because they push hardest.
     "sac_gridclamp": OffPolicyConfig(
         algorithm="sac",
         learning_rate=7e-4,

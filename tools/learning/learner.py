@@ -41,7 +41,8 @@ class LearnerConfig:
 
     Attributes:
         algorithm: Registered name of the learner.
-        demonstration_episodes: Number of first episodes in which a demonstrator acts; their transitions are learned from.
+        demonstration_episodes: Number of first episodes in which a demonstrator acts; their transitions are learned
+            from.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
         pipelined: Learn in a second process while the next episode is simulated, with weights that are one episode
             older. Deterministic as well.

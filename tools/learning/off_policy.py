@@ -208,8 +208,8 @@ class OffPolicyLearner(Learner):
     def on_step(self, transition: Transition) -> None:
         """Store a transition and train if it is due.
 
-        A transition in which the simulation failed has no next observation and is not stored. The one before becomes the
-        episode's last, as at a time limit.
+        A transition in which the simulation failed has no next observation and is not stored. The one before becomes
+        the episode's last, as at a time limit.
         """
         if "simulation_failure" in transition.info:
             if self._has_transition:

@@ -39,9 +39,9 @@ def run_training(
 ) -> list[dict[str, Any]]:
     """Train a run to its last episode and write its folder.
 
-    A run that was killed and resumed gives bit for bit the result of an undisturbed one: a checkpoint is taken at the end
-    of an episode and holds every number and every random generator that the rest depends on. The step log is written
-    before it; what is beyond the checkpoint is written again.
+    A run that was killed and resumed gives bit for bit the result of an undisturbed one: a checkpoint is taken at the
+    end of an episode and holds every number and every random generator that the rest depends on. The step log is
+    written before it; what is beyond the checkpoint is written again.
 
     Args:
         folder: Folder of the run; with `resume`, that of the run to continue.

@@ -58,10 +58,10 @@ def written(folder):
 
 def test_study_has_a_row_per_method_seed_number_and_eval_set(tmp_path):
     methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "uniform_random", "seeds": [9]}}
-    judged = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
-    rows = run(study(methods=methods, **{"eval_set": judged}), tmp_path)
+    eval_set = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
+    rows = run(study(methods=methods, eval_set=eval_set), tmp_path)
     expected = [
-        *(("learner", seed, mark, name) for seed in (5, 6) for mark in (2, 4) for name in ("held out", "far away")),
+        *(("learner", seed, number, name) for seed in (5, 6) for number in (2, 4) for name in ("held out", "far away")),
         *(("nothing", seed, 0, name) for seed in (5, 6) for name in ("held out", "far away")),
         *(("anything", 9, 0, name) for name in ("held out", "far away")),
     ]
@@ -93,20 +93,20 @@ def test_failed_job_is_listed_and_stops_no_other(tmp_path, capsys):
     command = ["study", str(file), "--out", str(out), "--processes", "1", "--json"]
     with pytest.raises(SystemExit) as end:
         main(command)
-    said = capsys.readouterr()
+    output = capsys.readouterr()
     assert end.value.code == 1
     sentence = f"learner, seed 5, failed: the checkpoint {checkpoint} is damaged"
-    assert said.err.splitlines()[-1].startswith(f"guiderail: {sentence}")
-    assert json.loads(said.out)["failed"][0].startswith(sentence)
+    assert output.err.splitlines()[-1].startswith(f"guiderail: {sentence}")
+    assert json.loads(output.out)["failed"][0].startswith(sentence)
     assert read_table(out / "beads.csv")["seed"].tolist() == [6, 6]
     assert "damaged" in (out / "logs" / "beads-learner-5.txt").read_text()
-    (judged,) = (out / "learner-6").glob("held_out-4-*.csv")
-    table = judged.read_bytes()
-    judged.write_text("a,b\n1\n")
+    (file_of_episodes,) = (out / "learner-6").glob("held_out-4-*.csv")
+    table = file_of_episodes.read_bytes()
+    file_of_episodes.write_text("a,b\n1\n")
     with pytest.raises(RunsFailedError) as failed:
         run(study(), out)
     assert [sentence.partition(",")[2][:7] for sentence in failed.value.sentences] == [" seed 5", " seed 6"]
-    judged.write_bytes(table)
+    file_of_episodes.write_bytes(table)
     checkpoint.write_bytes(whole)
     assert without_clock(run(study(), out)) == without_clock(expected)
 
@@ -131,22 +131,21 @@ def test_study_refuses_two_runs_in_one_folder(tmp_path):
 
 
 def test_earlier_policy_can_be_evaluated_later(tmp_path):
-    run(study(**{"eval_set": []}), tmp_path)
+    run(study(eval_set=[]), tmp_path)
     late, expected = run(study(), tmp_path), run(study(), tmp_path / "other")
     assert without_clock(late) == without_clock(expected)
-    for mark in (tmp_path / "learner-5" / "after_episodes").iterdir():
-        for file in mark.iterdir():
+    for folder in (tmp_path / "learner-5" / "after_episodes").iterdir():
+        for file in folder.iterdir():
             file.unlink()
-        mark.rmdir()
+        folder.rmdir()
     with pytest.raises(InputError, match="is lost"):
-        run(study(**{"eval_set": [{"episodes": 4}]}), tmp_path)
+        run(study(eval_set=[{"episodes": 4}]), tmp_path)
 
 
 def test_evaluated_episodes_of_other_settings_are_not_used(tmp_path):
     methods = {"nothing": {"policy": "zero"}}
     near, far = (
-        run(study(methods=methods, **{"eval_set": [{"episodes": 3, "env": {"wall": wall}}]}), tmp_path)
-        for wall in (1.0, -0.5)
+        run(study(methods=methods, eval_set=[{"episodes": 3, "env": {"wall": wall}}]), tmp_path) for wall in (1.0, -0.5)
     )
     assert near["mean_return"].gt(far["mean_return"]).all()
     other = run(study(methods={"nothing": {"policy": "constant"}}), tmp_path)
@@ -154,7 +153,7 @@ def test_evaluated_episodes_of_other_settings_are_not_used(tmp_path):
 
 
 def test_studies_in_one_folder_are_kept_apart(tmp_path):
-    """By the seed where a folder's name doesn't say it, by the task, and by a sentence where a file's name is given."""
+    """The digest has the seed if the folder's name has not, and the task; a file name without a digest is refused."""
     (tmp_path / "pearl.py").write_text(
         "import bead, gymnasium\n"
         "if 'guiderail/Twin-v0' not in gymnasium.registry:\n"
@@ -223,8 +222,8 @@ def test_best_constant_is_the_best_of_its_grid(tmp_path):
 
 
 def test_sampled_options_change_every_few_episodes(tmp_path):
-    judged = [{"episodes": 5, "every": 2, "sampled": {"wall": [0.2, 0.3]}}]
-    run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], **{"eval_set": judged}), tmp_path)
+    eval_set = [{"episodes": 5, "every": 2, "sampled": {"wall": [0.2, 0.3]}}]
+    run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], eval_set=eval_set), tmp_path)
     (file,) = (tmp_path / "nothing-0").glob("*.csv")
     rows = read_table(file)
     assert rows["episode"].tolist() == [0, 1, 2, 3, 4]
@@ -253,8 +252,8 @@ def test_study_command_summarizes_each_seed(tmp_path, capsys):
     assert described["differences"] == {"all methods": ["Bead"]}
     rows = read_table(tmp_path / "beads.csv")
     assert len(rows) == 2
-    said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
-    assert result["learner after 2 episodes, held out, success of each seed"] == said
+    rates = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
+    assert result["learner after 2 episodes, held out, success of each seed"] == rates
     assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
     assert "differences" not in result
     err = capsys.readouterr().err
@@ -387,10 +386,10 @@ def test_run_of_a_study_is_a_run_folder(tmp_path):
 
 
 def test_sweep_is_evaluated_at_each_value_and_drawn(tmp_path):
-    """The wall of beads is where they start, or far away, where nothing succeeds."""
+    """The wall is at the start of the bead, or so far away that nothing succeeds."""
     walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
     methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "uniform_random"}}
-    one = study(methods=methods, sweeps=[walls], **{"eval_set": []})
+    one = study(methods=methods, sweeps=[walls], eval_set=[])
     found = study_command(one, tmp_path, make_engine(processes=1))
     rows = read_table(tmp_path / "beads.csv")
     assert rows["eval_set"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
@@ -402,14 +401,14 @@ def test_sweep_is_evaluated_at_each_value_and_drawn(tmp_path):
 
 
 def test_longer_training_is_evaluated_by_itself(tmp_path):
-    judged = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
-    run(study(after_episodes=[2], seeds=[5], **{"eval_set": judged}), tmp_path)
-    run(study(after_episodes=[4], seeds=[5], **{"eval_set": judged}), tmp_path)
+    eval_set = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
+    run(study(after_episodes=[2], seeds=[5], eval_set=eval_set), tmp_path)
+    run(study(after_episodes=[4], seeds=[5], eval_set=eval_set), tmp_path)
     assert len(list((tmp_path / "learner-5").glob("held_out-2-*.csv"))) == 2
     same = [{"episodes": 2, "file": "held_out.csv"}]
-    run(study(after_episodes=[4], seeds=[5], **{"eval_set": same}), tmp_path)
+    run(study(after_episodes=[4], seeds=[5], eval_set=same), tmp_path)
     with pytest.raises(InputError, match="after other training"):
-        run(study(after_episodes=[6], seeds=[5], **{"eval_set": same}), tmp_path)
+        run(study(after_episodes=[6], seeds=[5], eval_set=same), tmp_path)
 
 
 def test_subset_of_a_study_has_a_table_of_its_own(tmp_path):

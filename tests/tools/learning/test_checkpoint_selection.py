@@ -1,12 +1,12 @@
-"""The result of a run is an actor in the midst of success."""
+"""Selection of an actor in the middle of a streak of successes."""
 
 import torch
 
 from guiderail.tools.learning.checkpoint import CheckpointSelection
 
 
-def lived(selection, outcomes, first=0, row=0):
-    """Greedy episodes with these outcomes, acted by actors whose one weight is the episode's number."""
+def run_greedy_episodes(selection, outcomes, first=0, row=0):
+    """Run greedy episodes with these outcomes; the weight of each actor is the number of its episode."""
     for number, success in enumerate(outcomes, first):
         actor = torch.nn.Linear(1, 1)
         torch.nn.init.constant_(actor.weight, number)
@@ -22,41 +22,44 @@ def selected(selection):
 
 
 def test_selection_is_empty_without_successes_on_both_sides():
-    assert selected(lived(CheckpointSelection(3), [1])) is None
-    assert selected(lived(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
-    assert selected(lived(CheckpointSelection(3), [0, 1, 1])) == 2
+    assert selected(run_greedy_episodes(CheckpointSelection(3), [1])) is None
+    assert selected(run_greedy_episodes(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
+    assert selected(run_greedy_episodes(CheckpointSelection(3), [0, 1, 1])) == 2
 
 
 def test_selection_takes_the_middle_of_the_longest_streak():
     #                                  0  1  2  3  4  5  6  7  8  9 10 11
-    assert selected(lived(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
-    assert selected(lived(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7  # two on each side
+    assert selected(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
+    assert selected(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7  # two on each side
 
 
 def test_selection_keeps_a_long_streak_over_a_later_short_one():
     # The actor of episode 9 was followed by six that succeeded, but nothing before it did.
-    assert selected(lived(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
+    assert selected(run_greedy_episodes(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
 
 
 def test_selection_takes_the_latest_beyond_the_window():
-    assert selected(lived(CheckpointSelection(2), [1] * 9)) == 7
-    assert selected(lived(CheckpointSelection(2), [1] * 9 + [0])) == 7
+    assert selected(run_greedy_episodes(CheckpointSelection(2), [1] * 9)) == 7
+    assert selected(run_greedy_episodes(CheckpointSelection(2), [1] * 9 + [0])) == 7
 
 
 def test_selection_continues_when_restored():
-    first = lived(CheckpointSelection(3), [0, 1, 1, 0, 1])
+    first = run_greedy_episodes(CheckpointSelection(3), [0, 1, 1, 0, 1])
     second = CheckpointSelection(3)
     second.restore(*first.state())
     for one in (first, second):
-        lived(one, [1, 1, 1, 1, 1], first=5, row=1)
+        run_greedy_episodes(one, [1, 1, 1, 1, 1], first=5, row=1)
     assert selected(first) == selected(second) == 7
     assert first.state()[1] == second.state()[1]
 
 
 def test_selection_ignores_an_excluded_episode():
-    plain, left_out = lived(CheckpointSelection(3), [0, 1, 1]), lived(CheckpointSelection(3), [0, 1])
-    left_out.begin(torch.nn.Linear(1, 1), 1)
-    left_out.exclude()
-    lived(left_out, [1], first=2, row=1)
-    assert selected(left_out) == selected(plain) == 2
-    assert left_out.state()[1] == plain.state()[1]
+    plain, excluded = (
+        run_greedy_episodes(CheckpointSelection(3), [0, 1, 1]),
+        run_greedy_episodes(CheckpointSelection(3), [0, 1]),
+    )
+    excluded.begin(torch.nn.Linear(1, 1), 1)
+    excluded.exclude()
+    run_greedy_episodes(excluded, [1], first=2, row=1)
+    assert selected(excluded) == selected(plain) == 2
+    assert excluded.state()[1] == plain.state()[1]

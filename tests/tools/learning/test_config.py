@@ -7,7 +7,8 @@ from guiderail.tools.learning.config import resolve_preset
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("ent_coef", "inf"), ("ent_coef", "auto_nan"), ("ent_coef", "-1"), ("net_arch", "1000000,1000000"), ("net_arch", ""),
+        ("ent_coef", "inf"), ("ent_coef", "auto_nan"), ("ent_coef", "-1"), ("net_arch", "1000000,1000000"),
+        ("net_arch", ""),
         ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("layer_norm", "7"),
         ("learning_rate", "inf"), ("gamma", True), ("gradient_steps", 10**12), ("net_arch", ",".join(["8"] * 50)),
     ],

@@ -1,4 +1,4 @@
-"""A disk that is full, a folder that cannot be written, a checkpoint of another version: one sentence, nothing lost."""
+"""Full disks, read-only folders and checkpoints of other versions: one sentence, and nothing is lost."""
 
 from contextlib import ExitStack
 from dataclasses import replace

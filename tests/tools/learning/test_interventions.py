@@ -1,4 +1,4 @@
-"""A person beside a run that learns: what a push, a word and a stop become, and that they are part of the run."""
+"""Human-in-the-loop training: corrections, labels and stops, and that they are part of the run."""
 
 import numpy as np
 import pytest
@@ -14,18 +14,18 @@ from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import run_training
 
 
-class Still(Learner):
-    """Knows what it was shown, and learns nothing: every action is zero."""
+class ZeroLearner(Learner):
+    """Learner that records transitions and always returns the action zero."""
 
     def __init__(self, preset, env, **_):
         self.env, self.seen = env, []
-        made.append(self)
+        learners.append(self)
 
     def act(self, observation):
         return np.zeros(self.env.action_space.shape, np.float32)
 
-    def on_step(self, decision):
-        self.seen.append(decision)
+    def on_step(self, transition):
+        self.seen.append(transition)
 
     def policy(self, description):
         space = self.env.action_space
@@ -44,19 +44,19 @@ class Still(Learner):
         pass
 
 
-made = []
+learners = []
 
 
 @pytest.fixture(autouse=True)
 def still():
-    LEARNERS.register("still", Still)
+    LEARNERS.register("still", ZeroLearner)
     yield
-    made.clear()
+    learners.clear()
     del LEARNERS._entries["still"]
 
 
 class Scripted(Supervisor):
-    """Pushes in some episodes from one control step to another, and says a word at one."""
+    """Supervisor with corrections (first step, last step, offset) and labels (step, label) by episode."""
 
     def __init__(self, pushes, words=None):
         self.pushes, self.words, self.episode = pushes, words or {}, -1
@@ -85,7 +85,7 @@ def test_correction_becomes_transitions_and_via_points(tmp_path):
     folder = RunFolder(tmp_path / "run")
     rows = run_training(folder, passage(2), supervisor=Scripted({0: (10, 19, [0.5, 3.0])}))
     assert [row["interventions"] for row in rows] == [1, 0]
-    actions = np.array([decision.action for decision in made[0].seen])
+    actions = np.array([transition.action for transition in learners[0].seen])
     pushed = (actions != 0).any(axis=1)
     np.testing.assert_array_equal(actions[pushed], np.tile([0.5, 1.0], (pushed.sum(), 1)))  # as far as actions reach
     np.testing.assert_array_equal(np.flatnonzero(pushed), [5, 6, 7, 8, 9])  # remembered where they were done
@@ -130,11 +130,11 @@ def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
     rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, words))
     assert [row["termination"] for row in rows] == ["success", "failure", "stop"]
     assert [row["success"] for row in rows] == [1, 0, 0]
-    lasts = [decision for decision in made[0].seen if decision.is_last]
-    assert [decision.terminated for decision in lasts] == [True, True, False]
-    same = lasts[2].reward
+    last = [transition for transition in learners[0].seen if transition.is_last]
+    assert [transition.terminated for transition in last] == [True, True, False]
+    unlabeled = last[2].reward
     np.testing.assert_allclose(
-        [one.reward - same for one in lasts], [LABEL_REWARDS["success"], LABEL_REWARDS["failure"], 0.0], atol=5.0
+        [one.reward - unlabeled for one in last], [LABEL_REWARDS["success"], LABEL_REWARDS["failure"], 0.0], atol=5.0
     )
 
 
@@ -158,7 +158,7 @@ def test_corrections_are_refused_without_demonstrations():
 
 
 def test_corrections_rescue_demonstrations_that_are_5_mm_off(tmp_path):
-    """The connector's demonstrations led 5 mm beside the jack; a person who sees that pushes until it goes in."""
+    """The connector's demonstrations lead 5 mm past the jack; the supervisor corrects until the plug is inserted."""
     environment = {
         "guidance": "kgrl",
         "fixture_offset": "none",

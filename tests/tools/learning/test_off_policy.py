@@ -25,26 +25,26 @@ SETTINGS = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq"
 
 
 @pytest.fixture
-def preset():
+def config():
     return resolve_preset("tqc_contact", "tqc", SETTINGS)
 
 
-def make(preset, action_repeat=1, seed=0):
-    return LEARNERS.get(preset.algorithm)(
-        preset, SpacesOnlyEnv(), action_repeat=action_repeat, seed=seed, max_transitions=50
+def make(config, action_repeat=1, seed=0):
+    return LEARNERS.get(config.algorithm)(
+        config, SpacesOnlyEnv(), action_repeat=action_repeat, seed=seed, max_transitions=50
     )
 
 
-def decision(observation, action, reward, following, terminated=False, truncated=False):
+def transition(observation, action, reward, following, terminated=False, truncated=False):
     return Transition(observation, action, reward, following, terminated, truncated, {})
 
 
-def live(learner, decisions, seed=0):
-    """So many decisions of random experience."""
+def learn_from_random_transitions(learner, number, seed=0):
+    """So many number of random experience."""
     random = np.random.default_rng(seed)
-    for _ in range(decisions):
+    for _ in range(number):
         observation, following = random.uniform(-1, 1, (2, 3)).astype(np.float32)
-        learner.store(decision(observation, learner.act(observation), random.normal(), following))
+        learner.store(transition(observation, learner.act(observation), random.normal(), following))
         learner.learn()
 
 
@@ -71,8 +71,8 @@ def test_preset_makes_a_learner_of_every_algorithm(name, algorithm):
     assert learner.act(np.zeros(3, np.float32)).shape == (2,)
 
 
-def test_gamma_per_control_step_depends_on_action_repeat(preset):
-    assert make(preset, action_repeat=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
+def test_gamma_per_control_step_depends_on_action_repeat(config):
+    assert make(config, action_repeat=5).model.gamma == pytest.approx(make(config).model.gamma ** 5)
 
 
 def test_gamma_per_action_is_independent_of_action_repeat():
@@ -80,45 +80,45 @@ def test_gamma_per_action_is_independent_of_action_repeat():
     assert make(table, action_repeat=10).model.gamma == make(table, action_repeat=1).model.gamma == 0.98
 
 
-def test_training_follows_the_number_of_transitions(preset):
-    learner = make(preset)
-    make_baseline = weights(learner)
-    live(learner, 7)
-    np.testing.assert_array_equal(weights(learner), make_baseline)
-    live(learner, 1)
-    assert not np.array_equal(weights(learner), make_baseline)
+def test_training_follows_the_number_of_transitions(config):
+    learner = make(config)
+    before = weights(learner)
+    learn_from_random_transitions(learner, 7)
+    np.testing.assert_array_equal(weights(learner), before)
+    learn_from_random_transitions(learner, 1)
+    assert not np.array_equal(weights(learner), before)
     assert learner.model._n_updates == 2
-    live(learner, 12)
+    learn_from_random_transitions(learner, 12)
     assert learner.model._n_updates == 8
 
 
-def test_averaged_actor_lags_behind_the_actor(preset):
-    learner = make(preset)
+def test_averaged_actor_lags_behind_the_actor(config):
+    learner = make(config)
     start = weights(learner)
-    live(learner, 40)
+    learn_from_random_transitions(learner, 40)
     averaged = torch.nn.utils.parameters_to_vector(learner.averaged.parameters()).detach().numpy()
     moved = np.linalg.norm(averaged - start)
     assert 0 < moved < np.linalg.norm(weights(learner) - start)
     assert learner.actor() is learner.averaged
-    plain = make(replace(preset, actor_ema=0.0))
+    plain = make(replace(config, actor_ema=0.0))
     assert plain.actor() is plain.model.actor
 
 
-def test_time_limit_is_bootstrapped(preset):
-    learner = make(preset)
+def test_time_limit_is_bootstrapped(config):
+    learner = make(config)
     seen = np.zeros(3, np.float32)
     for terminated, truncated in ((True, False), (False, True), (False, False)):
-        learner.store(decision(seen, np.zeros(2), 0.0, seen, terminated, truncated))
+        learner.store(transition(seen, np.zeros(2), 0.0, seen, terminated, truncated))
     buffer = learner.model.replay_buffer
     bootstrapped = buffer.dones[:3, 0] * (1 - buffer.timeouts[:3, 0])
     np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
 
 
-def test_replay_buffer_has_symmetric_copies(preset):
+def test_replay_buffer_has_symmetric_copies(config):
     half_turn = Symmetry.of_signs((-1.0, -1.0, 1.0), (-1.0, 1.0))
-    learner = TqcLearner(preset, SpacesOnlyEnv(), action_repeat=1, seed=0, max_transitions=50, symmetry=half_turn)
+    learner = TqcLearner(config, SpacesOnlyEnv(), action_repeat=1, seed=0, max_transitions=50, symmetry=half_turn)
     plain = TqcLearner(
-        replace(preset, symmetry=False),
+        replace(config, symmetry=False),
         SpacesOnlyEnv(),
         action_repeat=1,
         seed=0,
@@ -126,7 +126,7 @@ def test_replay_buffer_has_symmetric_copies(preset):
         symmetry=half_turn,
     )
     for one in (learner, plain):
-        one.store(decision(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
+        one.store(transition(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
     buffer = learner.model.replay_buffer
     assert (buffer.size(), plain.model.replay_buffer.n_envs, learner.transitions) == (1, 1, 1)
     np.testing.assert_array_equal(buffer.observations[0], [[1, 2, 3], [-1, -2, 3]])
@@ -134,38 +134,38 @@ def test_replay_buffer_has_symmetric_copies(preset):
     np.testing.assert_array_equal(buffer.actions[0], [[0.5, 0.25], [-0.5, 0.25]])
     np.testing.assert_array_equal(buffer.rewards[0], [7, 7])
     np.testing.assert_array_equal(buffer.dones[0], [1, 1])
-    live(learner, 49)  # and the buffer has room for all of it
+    learn_from_random_transitions(learner, 49)  # and the buffer has room for all of it
     assert (buffer.size(), buffer.full) == (50, False)
 
 
-def test_n_step_returns_end_with_the_episode(preset):
-    learner = make(replace(preset, n_steps=3, gamma=0.5))
+def test_n_step_returns_end_with_the_episode(config):
+    learner = make(replace(config, n_steps=3, gamma=0.5))
     zero = np.zeros(3, np.float32)
     for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
-        learner.store(decision(zero, np.zeros(2), reward, zero, terminated))
+        learner.store(transition(zero, np.zeros(2), reward, zero, terminated))
     samples = learner.model.replay_buffer._get_samples(np.arange(4))
     np.testing.assert_allclose(samples.rewards[:, 0], [1 + 2 / 2, 2, 4 + 8 / 2 + 16 / 4, 8 + 16 / 2 + 32 / 4])
     np.testing.assert_array_equal(samples.dones[:, 0], [1, 1, 0, 0])
     np.testing.assert_allclose(samples.discounts[2:, 0], 0.125)
 
 
-def test_restored_learner_continues_bit_for_bit(preset):
-    first = make(preset)
-    live(first, 23)
+def test_restored_learner_continues_bit_for_bit(config):
+    first = make(config)
+    learn_from_random_transitions(first, 23)
     arrays, values = (part.copy() for part in first.state())
     arrays = {key: value.copy() for key, value in arrays.items()}
-    live(first, 17, seed=1)
+    learn_from_random_transitions(first, 17, seed=1)
     expected = weights(first)
-    second = make(preset, seed=99)
+    second = make(config, seed=99)
     second.restore(arrays, values)
-    live(second, 17, seed=1)
+    learn_from_random_transitions(second, 17, seed=1)
     np.testing.assert_array_equal(weights(second), expected)
 
 
-def test_restore_refuses_the_state_of_another_network(preset):
-    arrays, values = make(preset).state()
+def test_restore_refuses_the_state_of_another_network(config):
+    arrays, values = make(config).state()
     with pytest.raises((KeyError, RuntimeError, ValueError)):
-        make(replace(preset, net_arch=(16,))).restore(arrays, values)
+        make(replace(config, net_arch=(16,))).restore(arrays, values)
 
 
 @pytest.mark.parametrize("settings", [{"gamma": 1.5}, {"net_arch": ""}, {"ent_coef": "much"}, {"batch_size": 2.5}])
@@ -174,106 +174,106 @@ def test_config_refuses_invalid_settings(settings):
         resolve_preset("tqc_contact", "tqc", settings)
 
 
-def acted(learner, episodes, decisions=4):
-    """The actions of so many episodes at one and the same observation, (episodes, decisions, 2)."""
+def actions_of(learner, episodes, number=4):
+    """Return the actions of a number of episodes at one observation, (episodes, number, 2)."""
     actions = []
     for _ in range(episodes):
         learner.on_episode_start()
-        actions.append([learner.act(np.ones(3, np.float32)) for _ in range(decisions)])
+        actions.append([learner.act(np.ones(3, np.float32)) for _ in range(number)])
     return np.array(actions)
 
 
-def test_constant_episodes_repeat_one_action(preset):
-    actions = acted(make(replace(preset, constant_episodes=3)), 4)
+def test_constant_episodes_repeat_one_action(config):
+    actions = actions_of(make(replace(config, constant_episodes=3)), 4)
     assert (actions[:3] == actions[:3, :1]).all()
     assert len(np.unique(actions[:3, 0], axis=0)) == 3
     assert len(np.unique(actions[3], axis=0)) == 4
 
 
-def test_greedy_episodes_act_as_the_exported_policy(preset):
-    learner = make(replace(preset, constant_episodes=0, greedy_episode_fraction=0.5))
-    live(learner, 20)
-    action_dims, greedy = acted(learner, 2)
+def test_greedy_episodes_act_as_the_exported_policy(config):
+    learner = make(replace(config, constant_episodes=0, greedy_episode_fraction=0.5))
+    learn_from_random_transitions(learner, 20)
+    action_dims, greedy = actions_of(learner, 2)
     assert len(np.unique(action_dims, axis=0)) == 4
     assert (greedy == greedy[0]).all()
     policy = export_policy(learner.actor(), {"observation_shape": [3]})
     np.testing.assert_allclose(greedy[0], policy(np.ones(3, np.float32)), atol=1e-6)
 
 
-def test_number_of_greedy_episodes_is_the_fraction(preset):
+def test_number_of_greedy_episodes_is_the_fraction(config):
     for share in (0.0, 0.25, 0.75, 1.0):
-        learner = make(replace(preset, constant_episodes=0, greedy_episode_fraction=share))
-        live(learner, 20)
-        greedy = [len(np.unique(actions, axis=0)) == 1 for actions in acted(learner, 8)]
+        learner = make(replace(config, constant_episodes=0, greedy_episode_fraction=share))
+        learn_from_random_transitions(learner, 20)
+        greedy = [len(np.unique(actions, axis=0)) == 1 for actions in actions_of(learner, 8)]
         assert sum(greedy) == 8 * share
 
 
-def test_episodes_explore_until_learning_starts(preset):
+def test_episodes_explore_until_learning_starts(config):
     learner = make(
-        replace(preset, constant_episodes=0, learning_starts=12, greedy_episode_fraction=1.0, selection_window=3)
+        replace(config, constant_episodes=0, learning_starts=12, greedy_episode_fraction=1.0, selection_window=3)
     )
-    for begun in (False, False, True, True):  # an episode has eight decisions: the second is still an exploring one
+    for begun in (False, False, True, True):  # an episode has eight number: the second is still an exploring one
         learner.on_episode_start()
         assert learner.is_learning() is begun
-        live(learner, 8)
+        learn_from_random_transitions(learner, 8)
         learner.on_episode_end({"success": 1})
     assert learner.state()[1]["greedy_successes"] == 2
 
 
-def test_extended_actions_have_the_configured_length(preset):
-    settled = replace(preset, constant_episodes=0, learning_starts=1, ez_greedy=0.2, ez_greedy_longest=5)
+def test_extended_actions_have_the_configured_length(config):
+    settled = replace(config, constant_episodes=0, learning_starts=1, ez_greedy=0.2, ez_greedy_longest=5)
     learner = make(settled)
-    live(learner, 20)
-    exploring = acted(learner, 1, decisions=400)[0]
+    learn_from_random_transitions(learner, 20)
+    exploring = actions_of(learner, 1, number=400)[0]
     repeated = (np.diff(exploring, axis=0) == 0.0).all(axis=1)
     runs = [len(run) for run in "".join("r" if r else " " for r in repeated).split()]
-    assert max(runs) == settled.ez_greedy_longest - 1  # an action that lasts n decisions comes again n − 1 times
-    assert 0.2 < repeated.mean() < 0.5  # 0.2 begin and last 3 decisions on average: two of eight and a bit
+    assert max(runs) == settled.ez_greedy_longest - 1  # an action that lasts n number comes again n − 1 times
+    assert 0.2 < repeated.mean() < 0.5  # 0.2 begin and last 3 number on average: two of eight and a bit
     greedy = make(replace(settled, greedy_episode_fraction=1.0))
-    live(greedy, 20)
-    actions = acted(greedy, 1, decisions=50)[0]
+    learn_from_random_transitions(greedy, 20)
+    actions = actions_of(greedy, 1, number=50)[0]
     assert (actions == actions[0]).all()
 
 
-def test_extended_actions_end_when_greedy_episodes_succeed(preset):
+def test_extended_actions_end_when_greedy_episodes_succeed(config):
     settled = replace(
-        preset, constant_episodes=0, learning_starts=1, greedy_episode_fraction=0.5, ez_greedy=1.0, ez_greedy_until=2
+        config, constant_episodes=0, learning_starts=1, greedy_episode_fraction=0.5, ez_greedy=1.0, ez_greedy_until=2
     )
     learner = make(settled)
-    live(learner, 20)
+    learn_from_random_transitions(learner, 20)
     for success, extended in ((None, True), (True, True), (True, False), (True, False), (False, True)):
         if success is not None:
             learner.on_episode_end({"success": int(success)})  # the greedy episode
         again = make(settled, seed=9)
         again.restore(*learner.state())
         for one in (again, learner):
-            exploring = acted(one, 1, decisions=30)[0]
+            exploring = actions_of(one, 1, number=30)[0]
             assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is extended
         learner.on_episode_end({"success": 0})  # an exploring episode counts for nothing
         learner.on_episode_start()
 
 
-def test_restored_learner_is_in_the_same_episode(preset):
-    first = make(replace(preset, constant_episodes=2, greedy_episode_fraction=0.5))
-    live(first, 20)
-    acted(first, 3)
+def test_restored_learner_is_in_the_same_episode(config):
+    first = make(replace(config, constant_episodes=2, greedy_episode_fraction=0.5))
+    learn_from_random_transitions(first, 20)
+    actions_of(first, 3)
     arrays, values = first.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
-    expected = acted(first, 3)
+    expected = actions_of(first, 3)
     second = make(first.config, seed=9)
     second.restore(arrays, values)
-    np.testing.assert_array_equal(acted(second, 3), expected)
+    np.testing.assert_array_equal(actions_of(second, 3), expected)
 
 
-def test_result_is_the_selected_actor_also_when_restored(preset):
+def test_result_is_the_selected_actor_also_when_restored(config):
     first = make(
-        replace(preset, constant_episodes=0, greedy_episode_fraction=1.0, selection_window=3, learning_starts=1)
+        replace(config, constant_episodes=0, greedy_episode_fraction=1.0, selection_window=3, learning_starts=1)
     )
     greedy = []
     for episode, success in enumerate([True, True, True, False]):
         first.on_episode_start()
         greedy.append(first.actor().state_dict()["mu.weight"].clone())
-        live(first, 8, seed=episode)
+        learn_from_random_transitions(first, 8, seed=episode)
         first.on_episode_end({"success": int(success)})
     arrays, values = first.state()
     second = make(first.config, seed=9)
@@ -300,7 +300,7 @@ def test_config_refuses_invalid_numbers_of_episodes(settings):
 
 
 def test_another_algorithm_is_one_class(monkeypatch):
-    """One that is deterministic and has no entropy, to be as unlike the others as it can be."""
+    """TD3 is deterministic and has no entropy coefficient, unlike SAC and TQC."""
     monkeypatch.setattr(LEARNERS, "_entries", dict(LEARNERS._entries))
 
     @register_learner("td3")
@@ -311,7 +311,7 @@ def test_another_algorithm_is_one_class(monkeypatch):
             return np.clip(super().explore(observation) + 0.1 * self.random.standard_normal(2), -1, 1)
 
     learner = make(resolve_preset("tqc_contact", "td3", SETTINGS))
-    live(learner, 24)
+    learn_from_random_transitions(learner, 24)
     arrays, values = learner.state()
     again = make(learner.config, seed=9)
     again.restore({key: value.copy() for key, value in arrays.items()}, values)
@@ -322,18 +322,18 @@ def test_another_algorithm_is_one_class(monkeypatch):
     assert not np.array_equal(learner.explore(seen), learner.explore(seen))
 
 
-def test_export_refuses_unsupported_layers(preset):
-    actor = make(preset).model.actor
+def test_export_refuses_unsupported_layers(config):
+    actor = make(config).model.actor
     actor.latent_pi[1] = torch.nn.GELU()
     with pytest.raises(InputError, match="GELU"):
         export_policy(actor, {"observation_shape": [3]})
 
 
-def test_transition_is_not_stored_when_the_simulation_failed(preset):
-    """No decision is remembered of it, and what came before is the episode's last, without being its end."""
-    learner, seen = make(preset), np.zeros(3, np.float32)
+def test_transition_is_not_stored_when_the_simulation_failed(config):
+    """The transition before it becomes the last of the episode, and is bootstrapped."""
+    learner, seen = make(config), np.zeros(3, np.float32)
     failed = Transition(seen, np.zeros(2), 0.0, seen, False, True, {"simulation_failure": "it diverged"})
-    for following in ((failed,), (decision(seen, np.zeros(2), 1.0, seen), failed)):
+    for following in ((failed,), (transition(seen, np.zeros(2), 1.0, seen), failed)):
         learner.on_episode_start()
         for one in following:
             learner.on_step(one)
@@ -342,9 +342,9 @@ def test_transition_is_not_stored_when_the_simulation_failed(preset):
     assert (buffer.dones[0], buffer.timeouts[0]) == (1, 1)
 
 
-def test_episode_with_interventions_is_not_selected(preset):
-    learner = make(replace(preset, greedy_episode_fraction=1.0, constant_episodes=0, learning_starts=1))
-    live(learner, 2)
+def test_episode_with_interventions_is_not_selected(config):
+    learner = make(replace(config, greedy_episode_fraction=1.0, constant_episodes=0, learning_starts=1))
+    learn_from_random_transitions(learner, 2)
     for interventions, row in ((0, 1), (2, 1), (0, 2)):
         learner.on_episode_start()
         assert learner._is_greedy

@@ -1,4 +1,4 @@
-"""Learning in a process of its own, beside acting."""
+"""Learning in a second process."""
 
 import gymnasium
 import numpy as np
@@ -14,7 +14,7 @@ from guiderail.tools.learning.pipelined import PipelinedLearner, _write
 
 
 def made(**more):
-    """A student of two numbers, its learner, and what its process is told."""
+    """Return a pipelined learner with two actions, and its acting learner."""
     space = gymnasium.Env()
     space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
     space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -14,7 +14,7 @@ from guiderail.tools.learning.off_policy import export_policy
 
 
 class SpacesOnlyEnv(gymnasium.Env):
-    """Nothing but the two spaces that a learner asks for."""
+    """Environment with spaces only."""
 
     def __init__(self, observation_space, action_space):
         self.observation_space, self.action_space = observation_space, action_space

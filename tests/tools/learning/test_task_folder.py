@@ -1,4 +1,4 @@
-"""A run of a task folder is of the files that were there when it began."""
+"""Runs of a task folder depend on its files at the start of the run."""
 
 import shutil
 from dataclasses import replace
@@ -71,8 +71,8 @@ def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, tmp_path)
 
 def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
     config = configure("parts/pin", {}, episodes=2)
-    said = {"name": "pins", "task": "parts/pin", "methods": {"zero": {"policy": "zero"}}, "seeds": [0]}
-    job = Job(Study.model_validate(said), "zero", 0, tmp_path)
+    declaration = {"name": "pins", "task": "parts/pin", "methods": {"zero": {"policy": "zero"}}, "seeds": [0]}
+    job = Job(Study.model_validate(declaration), "zero", 0, tmp_path)
 
     def files():
         kept = episodes_file(tmp_path, "uniform_random", config, config.environment, episodes=2)

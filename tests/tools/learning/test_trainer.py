@@ -23,7 +23,7 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, start_or_resume, with_defaults
 from guiderail.tools.learning.trainer import run_training
 
-# Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
+# Trains the run of the fixture and prints the number of each finished episode; the parent kills it then.
 CHILD = """
 import sys
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_demonstrator_acts_in_the_first_episodes(bead_config, tmp_path):
         return act
 
     rows = run_training(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
-    assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first was asked before anything moved
+    assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first call checks the compatibility
     assert len(rows) > 2
 
 
@@ -166,7 +166,7 @@ def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
 
 
 def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
-    """Whatever was not learned yet when it stopped is learned then."""
+    """The episode that was pending at the stop is learned after it."""
     plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
     config = replace(plain, learner=replace(plain.learner, pipelined=True))
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
@@ -183,7 +183,7 @@ def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
         run_training(stopped, config, report=stop)
     run_training(stopped, config, resume=True)
     assert_same_run(undisturbed, stopped)
-    # Another run than one that learns between its episodes: what is known is an episode older.
+    # Without a pipeline the weights are one episode newer: another run.
     run_training(RunFolder(tmp_path / "other"), plain)
     assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
 
@@ -197,7 +197,7 @@ def test_run_is_locked_against_other_processes(bead_config, tmp_path):
         other.stdout.readline()
         with pytest.raises(InputError, match="another process writes into"):
             run_training(folder, bead_config)
-        other.kill()  # its lock file stays, and holds nobody back
+        other.kill()  # its lock file stays, without effect
     (folder.path / f".episodes.csv.{other.pid}.part").write_text("from a process that was killed while writing")
     with folder.locked():
         pass
@@ -263,12 +263,12 @@ def test_table_is_completed_from_the_checkpoint(bead_config, tmp_path):
 
 
 def refused_in(episode):
-    """Demonstrates until the episode of that number, in which something is wrong."""
+    """Return a demonstrator that raises an InputError in the episode of that number."""
     asked = []
 
     def demonstrator(env):
         asked.append(env)
-        if len(asked) == episode + 2:  # the first was asked before anything moved
+        if len(asked) == episode + 2:  # the first call checks the compatibility
             raise InputError("this is wrong")
         return always_left(env)
 
@@ -385,7 +385,7 @@ def test_resume_accepts_the_same_options_and_notes_versions(tmp_path, caplog):
 
 
 def one_more(folder, package, kind, register, name):
-    """A file that registers a class like one of a package's under a name of its own."""
+    """Write a file that registers a subclass of one of the package's classes under another name."""
     (module, _, like), (registry, _, decorator) = kind.rpartition("."), register.partition(".")
     file = folder / "mine.py"
     file.write_text(
@@ -416,8 +416,8 @@ def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
     file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
     settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
     done = start_or_resume(
-        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20}, algorithm="sac_of_mine",
-        settings=settings, episodes=2, imports=[str(file)],
+        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20},
+        algorithm="sac_of_mine", settings=settings, episodes=2, imports=[str(file)],
     )  # fmt: skip
     assert done.summary["episodes"] == 2
 

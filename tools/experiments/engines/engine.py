@@ -34,8 +34,8 @@ Work: TypeAlias = Callable[[Any], Outcome]
 class Engine(AbstractContextManager[Any]):
     """Engine that runs jobs on workers, one at a time per worker and with one thread.
 
-    Use it as a context: entering it finds or prepares the workers, and leaving it ends all that it started, also after an
-    error. A job resumes from its folder, so the job of a lost worker is given to another one.
+    Use it as a context: entering it finds or prepares the workers, and leaving it ends all that it started, also after
+    an error. A job resumes from its folder, so the job of a lost worker is given to another one.
 
     Attributes:
         processes: Number of jobs that run at once; None if the engine does not decide it.

@@ -28,8 +28,8 @@ class RayEngine(Engine):
 
         Args:
             processes: Number of jobs that run at once without a cluster; 2 by default.
-            address: Address of a cluster, as `ray.init` takes it; the variable RAY_ADDRESS by default. Without either, a
-                local Ray is started.
+            address: Address of a cluster, as `ray.init` takes it; the variable RAY_ADDRESS by default. Without either,
+                a local Ray is started.
 
         Raises:
             InputError: If Ray is not installed, or both arguments are given.

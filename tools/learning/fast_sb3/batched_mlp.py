@@ -84,7 +84,8 @@ class BatchedMLP:
         """Construct the networks.
 
         Args:
-            layers: Layers from input to output. A layer of one network is shared by all networks of the layers after it.
+            layers: Layers from input to output. A layer of one network is shared by all networks of the layers after
+                it.
             layer_norm: Normalize hidden layers, without learned parameters, before they are rectified.
         """
         self._layers = list(layers)

@@ -26,7 +26,8 @@ def _parts(flat: torch.Tensor, shapes: Iterable[torch.Size]) -> list[torch.Tenso
 class FlatAdam:
     """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with the state dictionary of `torch.optim.Adam`.
 
-    It is not derived from `torch.optim.Optimizer`, because creating one imports PyTorch's compiler, which takes seconds.
+    It is not derived from `torch.optim.Optimizer`, because creating one imports PyTorch's compiler, which takes
+    seconds.
 
     Attributes:
         values: All parameters, (P,); each parameter is a view of it.

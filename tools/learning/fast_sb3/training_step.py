@@ -1,9 +1,10 @@
 """SAC and TQC of Stable-Baselines3 with a faster training step: the same update in a fraction of the calls.
 
 `FastTrainingStep` is a mixin that replaces `train` of a Stable-Baselines3 algorithm. All critics are evaluated as one
-batched network, both batches of an update pass the actor at once, the parameters of a network are in one buffer, and the
-gradients are written out, so that no unused gradient is computed. `FastSac` and `FastTqc` are the two algorithms with
-it. `python -m research.benchmarks learner` compares the duration with Stable-Baselines3's; a test compares the parameters.
+batched network, both batches of an update pass the actor at once, the parameters of a network are in one buffer, and
+the gradients are written out, so that no unused gradient is computed. `FastSac` and `FastTqc` are the two algorithms
+with it. `python -m research.benchmarks learner` compares the duration with Stable-Baselines3's; a test compares the
+parameters.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Runs a study of eight runs on two processes, and on a Ray cluster of two machines of which one is lost meanwhile.
+"""Run a study of eight runs on two processes, and on a Ray cluster of two machines of which one is lost.
 
     python tests/tools.experiments.engines/ray_study.py --out FOLDER         # the narrow passage
     python tests/tools.experiments.engines/ray_study.py --out FOLDER --bead  # half a minute
@@ -45,7 +45,7 @@ PATIENCE = 600.0  # s
 
 
 def write_study(folder: Path, bead: bool) -> Path:
-    """The study's file in a folder."""
+    """Write the study's file into a folder and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "register_bead.py").write_text(REGISTER)
     study = {**BEAD, "imports": [str(folder / "register_bead.py")]} if bead else STUDY
@@ -54,13 +54,13 @@ def write_study(folder: Path, bead: bool) -> Path:
 
 
 def command(file: Path, out: Path, *more: str) -> list[str]:
-    """The study's command line."""
+    """Return the study's command line."""
     program = "from guiderail.tools.cli.main import main; main()"
     return [sys.executable, "-c", program, "study", str(file), "--out", str(out), "--json", *more]
 
 
 def running(out: Path, episodes: int) -> Iterator[tuple[str, int]]:
-    """Jobs that have so many episodes and are not done, and the process that has each."""
+    """Yield running jobs with at least a number of episodes, and the process of each."""
     for log in sorted((out / "logs").glob("*.txt")):
         last = log.read_text().splitlines()[-1]
         table = out / log.stem.removeprefix("eight-") / "episodes.csv"
@@ -69,7 +69,7 @@ def running(out: Path, episodes: int) -> Iterator[tuple[str, int]]:
 
 
 def wait_for(found: Callable[[], Any], study: subprocess.Popen) -> Any:
-    """The first thing that is found, while a study goes on."""
+    """Return the first result of `found` that is not None while the study runs."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         if (what := found()) is not None:
@@ -81,13 +81,13 @@ def wait_for(found: Callable[[], Any], study: subprocess.Popen) -> Any:
 
 
 def is_on(process: int, machine: Any) -> bool:
-    """Whether a worker was started by a machine's Ray."""
+    """Return True if the worker was started by the machine's Ray."""
     parent = int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
     return any(one.process.pid == parent for one in machine.all_processes["raylet"])
 
 
 def on_cluster(file: Path, out: Path, episodes: int) -> tuple[int, str, list[str]]:
-    """Exit code and output of the study on a cluster of two machines, and what was killed."""
+    """Return exit code and output of the study on a cluster of two machines, and what was killed."""
     from ray.cluster_utils import Cluster
 
     machine = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 100 * 1024**2}
@@ -113,7 +113,7 @@ def on_cluster(file: Path, out: Path, episodes: int) -> tuple[int, str, list[str
 
 
 def compare(folder: Path, bead: bool) -> dict[str, object]:
-    """What became of both studies."""
+    """Run both studies and return their comparison."""
     file, seconds = write_study(folder, bead), time.perf_counter()
     subprocess.run(command(file, folder / "process"), check=True, capture_output=True, timeout=PATIENCE)
     seconds = time.perf_counter() - seconds
@@ -130,7 +130,7 @@ def compare(folder: Path, bead: bool) -> dict[str, object]:
 
 
 def main() -> None:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--bead", action="store_true", help="the tests' smallest environment")

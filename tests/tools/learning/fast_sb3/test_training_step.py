@@ -1,4 +1,4 @@
-"""The gradient step against Stable-Baselines3's own, from the same parameters, batches and random draws."""
+"""Fast training step compared with Stable-Baselines3's, on the same parameters, batches and random numbers."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def make(kind, preset="tqc_contact", env=Vector, **settings):
 
 
 def train_both(plain, ensemble, seed=0):
-    """On the same batches: Stable-Baselines3 draws them one by one, and ours all at once."""
+    """Train both on the same batches: Stable-Baselines3 samples one by one, the fast step all at once."""
     np.random.seed(seed)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     batches = plain.model.replay_buffer.sample(STEPS * BATCH)
     each = iter(zip(*[of_all.split(BATCH) for of_all in batches], strict=True))
