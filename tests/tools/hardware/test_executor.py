@@ -173,11 +173,11 @@ def test_deploy_exits_with_2_when_there_is_no_run(capsys, tmp_path):
     assert "not a run" in capsys.readouterr().err
 
 
-def test_evaluate_refuses_policy_without_hardware(capsys):
+def test_deploy_exits_with_2_when_given_another_policy(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["evaluate", "runs/none", "--policy", "scripted"])
+        main(["deploy", "runs/none", "--policy", "scripted"])
     assert end.value.code == 2
-    assert "--station hardware" in capsys.readouterr().err
+    assert "--policy" in capsys.readouterr().err
 
 
 def test_confirm_checks_raises_when_a_check_fails():
