@@ -235,8 +235,8 @@ class ArmStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of plant and controller [s]; `PLANT_PERIOD` by default, half of it with a gripper,
-                whose fingers would penetrate the workpiece.
+            time_step: Time step of plant and controller [s]; `PLANT_PERIOD` by default, half of it with a gripper:
+                its fingers would penetrate the workpiece.
             wrench_time_constant: Time constant of the wrench sensor's low-pass filter [s].
             robot: The arm, or its name: see `robot_names()`.
             end_effector: The tool, or its name: see `end_effector_names()`.

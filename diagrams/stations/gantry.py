@@ -84,7 +84,7 @@ class GantryStation(Station):
 
     Each joint has a spring, a damper and a limit; the joint positions are the pose. Springs and dampers are the plant's
     actuator gains, solved implicitly with the contact: stable at any stiffness and time step. Or they are those of a
-    `CartesianImpedanceController`, whose forces are computed explicitly at each step of the plant, as on a real robot,
+    `CartesianImpedanceController`. Its forces are computed explicitly at each step of the plant, as on a real robot,
     which needs shorter steps. There is no gravity, as on a robot with gravity compensation.
     """
 

@@ -49,7 +49,7 @@ class MujocoContact:
         time_constant: Time constant of a contact [s]; the smallest that the engine integrates is two time steps.
         impedance: Constraint impedance of a contact, between 0 and 1.
         friction_ratio: Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
-        spring_step: Natural frequency times time step of a spring, whose body is heavy enough for explicit integration.
+        spring_step: Natural frequency times time step of a spring; its body is heavy enough for explicit integration.
     """
 
     time_step: float = 0.001
@@ -250,7 +250,7 @@ def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Work
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     workcell.add_fixture(plant)
     if plant.num_bodies() != 2:  # with the world
-        raise InputError(f"station='mujoco' knows a fixture of one body, and {type(workcell).__name__} adds another")
+        raise InputError(f"station='mujoco' has a fixture of one body, and {type(workcell).__name__} adds another")
     fixture = plant.get_body(BodyIndex(1))
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     model = plant.AddModelInstance("gantry")

@@ -52,7 +52,7 @@ class PouringConfig:
         num_balls: Number of balls.
         p_WStand: Point of the table's surface under the nominal mug [m].
         stand_height: Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
-        grip: Distance of the thermos's axis from the flange, to whose axis it is perpendicular [m].
+        grip: Distance of the thermos's axis from the flange [m]; both axes are perpendicular.
         grip_height: Distance of the grip from the thermos's tip [m].
         plant_period: Time step of the plant [s].
         substeps: Plant steps per control step.
@@ -271,7 +271,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
 
 
 def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:
-    """Add a cylinder from the flange to the thermos's wall, whose contact counts as the thermos's."""
+    """Add a cylinder from the flange to the thermos's wall; its contact counts as the thermos's."""
     length = config.grip - config.thermos.outer_radius
     X_PFlange = config.X_FlangeP.inverse()
     X_PG = X_PFlange @ RigidTransform([0.0, 0.0, length / 2])
@@ -279,7 +279,7 @@ def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) 
 
 
 def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
-    """Add the stand under the mug, which moves with it, and whose contact counts as the mug's."""
+    """Add the stand under the mug, which moves with it; its contact counts as the mug's."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
         add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)

@@ -23,7 +23,7 @@ class StationKind:
         world: Kind of world that it works on, such as "workcell" for a workpiece and a fixture.
         options: Model of its environment options; None if it has none.
         description: Summary in one line.
-        is_simulated: True for a simulation, whose state a reset can set.
+        is_simulated: True for a simulation: a reset can set its state.
     """
 
     name: str

@@ -62,7 +62,7 @@ MAX_HALVINGS = 7
 
 
 class ContactOptions(Options):
-    """Options of a station whose plant simulates the contact of an insertion."""
+    """Options of a station that simulates the contact of an insertion."""
 
     time_step: Number | None = Field(
         None, gt=0, description="time step of the plant [s]: the control period, or half, a quarter, an eighth … of it"

@@ -36,7 +36,7 @@ class Workcell(Protocol):
 
 @runtime_checkable
 class ConvexWorkcell(Protocol):
-    """Interface of a workcell whose contact other engines than Drake can compute too."""
+    """Interface of a workcell with contact that other engines than Drake can compute too."""
 
     def fixture_surfaces(self) -> list[Surface]:
         """Return the contact surfaces of the fixture, in its body's frame."""
@@ -46,7 +46,7 @@ class ConvexWorkcell(Protocol):
 
 
 def movable_frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:
-    """Return a frame whose pose in its parent can be set in the context; bodies welded to it follow."""
+    """Return a frame with a pose in its parent that can be set in the context; bodies welded to it follow."""
     frame = plant.GetFrameByName(name)
     assert isinstance(frame, FixedOffsetFrame)
     return frame

@@ -35,7 +35,7 @@ Log = Callable[[str], None]
 def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen[Any]]:
     """Run Python code in a child process that exits when its parent does, even if the parent is killed.
 
-    The child's standard input is a pipe, whose other end the operating system closes with the parent.
+    The child's standard input is a pipe; the operating system closes its other end with the parent.
 
     Args:
         code: Program of the child.

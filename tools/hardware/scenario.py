@@ -27,7 +27,7 @@ class PandaDriver:
 
 @dataclass
 class Scenario:
-    """Robot, its bus and its surroundings, with the fields of Drake's `hardware_sim`, whose files can be read.
+    """Robot, its bus and its surroundings, with the fields of Drake's `hardware_sim`.
 
     Attributes:
         station: "simulation" for a simulated driver, or "hardware".

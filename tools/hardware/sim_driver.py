@@ -100,7 +100,7 @@ def run_safety_monitor(url: str, robot: str, task: str, *, log: Callable[[str], 
     Args:
         url: Address of the robot's driver; LCM's default if empty.
         robot: Name of the arm.
-        task: Name of the insertion task whose workpiece the arm carries.
+        task: Name of the insertion task with the workpiece that the arm carries.
         log: Function that shows a message.
 
     Raises:

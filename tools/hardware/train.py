@@ -45,7 +45,7 @@ def train_on_robot(
     """Train a policy on a robot, and leave a run folder.
 
     Args:
-        task: Name of an insertion task whose success a robot can observe.
+        task: Name of an insertion task with a success that a robot can observe.
         out: Run folder.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.

@@ -98,7 +98,7 @@ class MessageCounter:
 
 
 class LcmDriver(Driver):
-    """Driver whose statuses and commands are LCM messages.
+    """Driver with LCM messages as statuses and commands.
 
     Attributes:
         status_channel: Channel of the statuses.

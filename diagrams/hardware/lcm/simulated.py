@@ -244,7 +244,7 @@ def serve_in_real_time(
 ) -> None:
     """Simulate an arm by the wall clock, as a real robot, which does not wait for commands.
 
-    Contact makes the simulation slower. If it falls so far behind that its statuses count as old, a message says so
+    Contact makes the simulation slower. If it falls so far behind that its statuses count as old, this is reported
     once, because the commanding program is not at fault then.
 
     Args:
@@ -267,7 +267,7 @@ def serve_in_real_time(
         delay = (time.monotonic() - start) * rate - step * period
         if delay > max_delay and not is_reported:
             log(
-                f"this machine is too slow, or too busy, for a simulated robot whose clock goes at {rate:g} of the "
+                f"this machine is too slow, or too busy, for a simulated robot with a clock at {rate:g} of the "
                 f"wall's: it is {delay:.2f} s behind; give a smaller --rate, or --synchronous"
             )
             is_reported = True

@@ -220,8 +220,10 @@ def test_serve_ignores_a_malformed_acknowledgement():
     assert serve_in_lockstep(simulator, within, lcm, 2 * STATUS_PERIOD, 0.01) == 0.0
 
 
-@pytest.mark.parametrize(("periods", "says"), [(MAX_MISSED_MESSAGES - 1, False), (MAX_MISSED_MESSAGES + 1, True)])
-def test_serve_in_real_time_reports_a_delay_once(monkeypatch, periods, says):
+@pytest.mark.parametrize(
+    ("periods", "is_reported"), [(MAX_MISSED_MESSAGES - 1, False), (MAX_MISSED_MESSAGES + 1, True)]
+)
+def test_serve_in_real_time_reports_a_delay_once(monkeypatch, periods, is_reported):
     sent, wall = [], [0.0]
     monkeypatch.setattr("guiderail.diagrams.hardware.lcm.simulated.time.monotonic", lambda: wall[0])
 
@@ -233,6 +235,6 @@ def test_serve_in_real_time_reports_a_delay_once(monkeypatch, periods, says):
     simulator = Simulator(ConstantVectorSource([0.0]))
     serve_in_real_time(simulator, 3 * STATUS_PERIOD, attend, 1.0, sent.append)
     assert len(attended) == 3
-    assert bool(sent) == says
+    assert bool(sent) == is_reported
     assert len(sent) <= 1
     assert all("give a smaller --rate" in acknowledgements for acknowledgements in sent)

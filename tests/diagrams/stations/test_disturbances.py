@@ -118,7 +118,7 @@ def test_payload_lowers_the_tool_of_an_arm():
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"payload": 0.5}, "station=arm"),
         ({"control_period": 0.0123}, "whole number"),
@@ -127,8 +127,8 @@ def test_payload_lowers_the_tool_of_an_arm():
         ({"lost_commands": 1.0}, "less than 1"),
     ],
 )
-def test_environment_raises_when_a_disturbance_is_invalid(options, words):
-    with pytest.raises(InputError, match=words):
+def test_environment_raises_when_a_disturbance_is_invalid(options, message):
+    with pytest.raises(InputError, match=message):
         make_env("GridClamp", **options)
 
 

@@ -74,9 +74,9 @@ def test_pegs_do_not_tunnel_through_the_table_at_60_n(xy_mm, tilt_deg):
     X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
     d = WORKCELL.dimensions
     tips = X @ np.column_stack([d.peg_positions, np.zeros(5)]).T
-    beside = np.hypot(*(tips[:2] - d.peg_positions.T)) > MAX_OFFSET
-    assert (tips[2][beside] > SURFACE - 0.2 * MM).all()
-    assert beside.all() or tilt_deg != 0.0
+    is_outside = np.hypot(*(tips[:2] - d.peg_positions.T)) > MAX_OFFSET
+    assert (tips[2][is_outside] > SURFACE - 0.2 * MM).all()
+    assert is_outside.all() or tilt_deg != 0.0
 
 
 def test_seated_clamp_does_not_tunnel_sideways_at_60_n():

@@ -45,22 +45,22 @@ def workpiece_in_fixture(driven, workpiece, fixture):
 @pytest.fixture(scope="module")
 def locked_and_pulled():
     """Lock the plug on a moved jack, then command a pull beyond the effort limit."""
-    beside = np.array([3.0 * MM, -2.0 * MM, 1.0 * MM])
+    offset = np.array([3.0 * MM, -2.0 * MM, 1.0 * MM])
     times, motion = insert_and_lock()
     pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
-    motion = np.concatenate([motion, [pull, pull]]) + np.array([*beside, 0.0, 0.0, 0.0])
+    motion = np.concatenate([motion, [pull, pull]]) + np.array([*offset, 0.0, 0.0, 0.0])
 
     def move(plant, context):
-        CONNECTOR.set_jack_offset(plant, context, RigidTransform(beside))
+        CONNECTOR.set_jack_offset(plant, context, RigidTransform(offset))
 
     driven, recording = drive(CONNECTOR, np.concatenate([times, times[-1] + [1.0, 1.5]]), motion, move)
-    return driven, recording, beside
+    return driven, recording, offset
 
 
 def test_plug_locks_at_the_nominal_pose(locked_and_pulled):
-    _, recording, beside = locked_and_pulled
+    _, recording, offset = locked_and_pulled
     final = recording["pose"][LOCKED - 1]
-    assert np.abs(final[:3] - beside).max() < 0.3 * MM
+    assert np.abs(final[:3] - offset).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
     assert recording["contact_force"][:LOCKED].max() < 15.0
     assert not recording["saturation"][1:LOCKED].any()  # from the first command on
@@ -77,10 +77,10 @@ def test_wrench_equals_the_force_of_the_impedance(locked_and_pulled):
 
 
 def test_locked_plug_resists_a_pull(locked_and_pulled):
-    driven, recording, beside = locked_and_pulled
+    driven, recording, offset = locked_and_pulled
     assert recording["saturation"][-1, 0] == 1.0
     assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
-    assert recording["pose"][-1, 2] - beside[2] < 0.5 * MM
+    assert recording["pose"][-1, 2] - offset[2] < 0.5 * MM
     assert CONNECTOR.is_locked(CONNECTOR.X_JT.inverse() @ workpiece_in_fixture(driven, "plug", "jack"))
 
 

@@ -224,15 +224,15 @@ def test_monitor_check_fails_without_a_heartbeat(make_executor):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "words"),
+    ("wrong", "message"),
     [
         ({"synchronous": True}, "does not wait"),
         ({"sim": True, "robot": "panda"}, "only the"),
         ({"rate": 0.0}, "rate"),
     ],
 )
-def test_connection_raises_when_options_contradict(wrong, words):
-    with pytest.raises(InputError, match=words):
+def test_connection_raises_when_options_contradict(wrong, message):
+    with pytest.raises(InputError, match=message):
         RobotConnection(**wrong)
 
 

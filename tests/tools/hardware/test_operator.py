@@ -19,7 +19,7 @@ def terminal(monkeypatch):
     keyboard, screen = pty.openpty()
     with os.fdopen(screen, "r") as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
-        yield lambda words: os.write(keyboard, words)
+        yield lambda text: os.write(keyboard, text)
     os.close(keyboard)
 
 
@@ -38,7 +38,7 @@ def test_keys_stop_by_enter_and_pause_by_p(terminal):
 def test_describe_omits_enter_when_input_is_a_pipe(terminal, monkeypatch):
     assert OperatorKeys().describe() == "Enter or Ctrl-C stops the arm"
     assert "p and Enter pauses" in OperatorKeys().describe(has_pauses=True)
-    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))  # a pipe, whose input stops nothing
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))  # the input of a pipe stops nothing
     keys = OperatorKeys()
     assert not keys.is_stop_requested()
     assert keys.describe(has_pauses=True) == "Ctrl-C stops the arm"

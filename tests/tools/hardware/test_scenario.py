@@ -49,7 +49,7 @@ def test_shipped_scenario_has_a_simulated_driver():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("station: both\n", "hardware or simulation"),
         ("{}\n", "exactly one robot"),
@@ -63,19 +63,19 @@ def test_shipped_scenario_has_a_simulated_driver():
         (BUS + OF_BUS % "desired_kp_gains: [1, 2]", "desired_kp_gains"),
     ],
 )
-def test_load_raises_one_sentence_when_invalid(written, text, words):
-    with pytest.raises(InputError, match=words) as refused:
+def test_load_raises_one_sentence_when_invalid(written, text, message):
+    with pytest.raises(InputError, match=message) as refused:
         load_scenario(written(text))
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("given", "message"),
     [({"robot": "panda"}, "--robot panda"), ({"lcm_url": "udpm://239.255.76.67:7777?ttl=0"}, "--lcm-url udpm")],
 )
-def test_connection_raises_when_options_contradict_the_file(written, given, words):
+def test_connection_raises_when_options_contradict_the_file(written, given, message):
     file = written(f"station: hardware\n{BUS}{DRIVER}")
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         RobotConnection.from_scenario(file, **given)
     same = RobotConnection.from_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
     assert same == RobotConnection.from_scenario(file)
@@ -83,11 +83,11 @@ def test_connection_raises_when_options_contradict_the_file(written, given, word
 
 def test_deploy_uses_robot_of_scenario_and_refuses_another(written, capsys):
     file = written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")
-    for more, words in (([], "not a run"), (["--robot", "iiwa14"], "--robot iiwa14")):
+    for more, message in (([], "not a run"), (["--robot", "iiwa14"], "--robot iiwa14")):
         with pytest.raises(SystemExit) as end:
             main(["deploy", str(file.parent), "--scenario", str(file), *more])
         assert end.value.code == 2
-        assert words in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
 def test_directives_add_surroundings_to_simulated_robot(written, tmp_path):

@@ -259,8 +259,8 @@ def test_resume_works_a_minute_after_the_stop(monkeypatch):
     env = make(monkeypatch, START)
     env.clock.clock = 100.0
 
-    def think(words):
-        env.asked.append(words)
+    def think(message):
+        env.asked.append(message)
         env.clock.clock += 60.0
 
     env._confirm_resume = think
@@ -343,14 +343,14 @@ def test_pull_tells_a_locked_workpiece_from_a_loose_one(env, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("task", "options", "words"),
+    ("task", "options", "message"),
     [
         ("GridClamp", {}, "has no success that a robot can observe"),
         ("BncConnector", {"reward": "aligned"}, "needs simulation state"),
     ],
 )
-def test_train_raises_when_success_is_not_observable(task, options, words, tmp_path):
-    with pytest.raises(InputError, match=words):
+def test_train_raises_when_success_is_not_observable(task, options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
         train_on_robot(
             task, tmp_path / "run", RobotConnection(sim=True), environment={"station": "hardware"} | options, given={}
         )

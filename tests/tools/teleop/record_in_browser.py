@@ -1,4 +1,4 @@
-"""Demonstrations by a scripted operator, who presses the keys of a real page in headless Chromium.
+"""Demonstrations by a scripted operator that presses the keys of a real page in headless Chromium.
 
 `python tests/tools/teleop/record_in_browser.py TASK OUT.npz [SCREENSHOT.png]`; it needs chromium and websockets.
 """

@@ -11,7 +11,7 @@ from guiderail.tools.teleop.teleoperator import GAMEPAD_AXES, KEY_PAIRS
 @pytest.mark.filterwarnings("ignore:.*nothing to render")
 def test_scripted_policy_and_network_run_the_same_episode():
     assert run_episode(make_env("Pouring", action_repeat=50), scripted_pour) == "success"
-    zero = (np.zeros((3, 6), np.float32), np.zeros(3, np.float32))  # a layer whose output is zero
+    zero = (np.zeros((3, 6), np.float32), np.zeros(3, np.float32))  # a layer with zero output
     shapes = {"observation_shape": [6], "action_low": [-1.0] * 3, "action_high": [1.0] * 3}
     policy = Policy([zero], shapes | {"activation": "relu", "pool": 1})
     assert run_episode(make_env("Pouring", action_repeat=50, time_limit=3.0), policy) == "time_limit"
