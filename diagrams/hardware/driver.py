@@ -30,9 +30,9 @@ CommandCallback = Callable[[np.ndarray], None]
 class Driver(ABC):
     """Connection to the program that drives a robot with joint torque control.
 
-    A driver of another robot or transport implements `read` and `write` and is registered with `register_driver`. If the
-    robot's program repeats the last torque when commands stop, a `SafetyMonitor` is needed, and the driver implements
-    `add_listener`, `read_heartbeat` and `write_heartbeat` as well.
+    A driver of another robot or transport implements `read` and `write` and is registered with `register_driver`. If
+    the robot's program repeats the last torque when commands stop, a `SafetyMonitor` is needed, and the driver
+    implements `add_listener`, `read_heartbeat` and `write_heartbeat` as well.
 
     Attributes:
         name: Prefix of the joint ports of a hardware station, as in Drake's own stations.
