@@ -662,14 +662,14 @@ def errors() -> str:
 
 
 def examples() -> str:
-    """Return the page of examples, each under its question."""
-    page = "# How do I …?\n\nEach answer is a file in `examples/` that the tests run.\n\n"
+    """Return the page of examples, each under its task."""
+    page = "# Examples\n\nEach example is a file in `examples/` that the tests run.\n\n"
     for path in sorted((Path(__file__).parents[1] / "examples").glob("*.py")):
         source = path.read_text(encoding="utf-8")
         doc = ast.get_docstring(ast.parse(source)) or ""
-        question, _, answer = doc.partition("? ")
+        title, _, description = doc.partition(": ")
         body = source.split('"""', 2)[2].strip()
-        page += f"## {question}?\n\n{prose(answer)}\n\n`examples/{path.name}`\n\n```python\n{body}\n```\n\n"
+        page += f"## {title}\n\n{prose(description)}\n\n`examples/{path.name}`\n\n```python\n{body}\n```\n\n"
     return page
 
 

@@ -1,4 +1,4 @@
-"""How do I use it with my own learner? As a Gymnasium environment; what was safe about it is in `info`."""
+"""Use an environment with your own learner: it is a Gymnasium environment, with safety numbers in `info`."""
 
 import gymnasium
 import numpy as np

@@ -1,4 +1,4 @@
-"""How does guidance of my own remember? In discrete state, which a reset restores as it does everything else's.
+"""Write guidance with memory: its discrete state is restored by a reset.
 
 This one adds each action to its last command, not to where the robot is.
 """
@@ -57,4 +57,4 @@ for episode in range(2):
     env.reset(seed=0)
     for _ in range(4):
         env.step(np.array([0.0, 0.5]))
-    print("episode", episode, "commands", env.trace.commanded[-1].round(3), "m at last: a reset forgets")
+    print("episode", episode, "commands", env.trace.commanded[-1].round(3), "m at last: after a reset")

@@ -1,4 +1,4 @@
-"""How do I run a learned skill without Gymnasium? As a plain Drake diagram: observation → policy → guidance → station.
+"""Run a learned skill without Gymnasium: it is a Drake diagram, observation → policy → guidance → station.
 
 Give a run's folder as an argument to run what was learned there; without one, a policy that does nothing stands in.
 """

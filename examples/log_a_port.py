@@ -1,4 +1,4 @@
-"""How do I log a signal from inside? Any port of an environment's diagram can be looked at, at any time."""
+"""Log a signal: any port of an environment's diagram can be evaluated at any time."""
 
 import numpy as np
 

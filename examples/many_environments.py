@@ -1,4 +1,4 @@
-"""How do I step many environments at once? Gymnasium's own vector environment, a process each: as many as cores."""
+"""Step many environments at once: Gymnasium's vector environment runs one process each, best one per core."""
 
 import multiprocessing
 
@@ -12,7 +12,7 @@ if __name__ == "__main__":  # each process imports this file first
         "guiderail/NarrowPassage-v0",
         num_envs=2,
         vectorization_mode="async",
-        # Forks of a process that is begun anew: forks of this one would share its threads' locks.
+        # Forks of a fresh process: forks of this one would share its threads' locks.
         vector_kwargs={"context": "forkserver"},
         guidance="skgrl",
         action_repeat=5,

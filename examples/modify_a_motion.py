@@ -1,4 +1,4 @@
-"""How do I modify a whole motion at once? By null-space actions at some of its points; the rest follows smoothly."""
+"""Modify a whole motion at once: null-space actions at some of its points change the rest smoothly."""
 
 import numpy as np
 

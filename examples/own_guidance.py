@@ -1,4 +1,4 @@
-"""How do I compose guidance of my own? From the systems, with the ports that all guidance has.
+"""Compose your own guidance: build it from the systems, with the ports of all guidance.
 
 This one is KGRL with a single action: a policy chooses how far to go along one direction, and nothing across it.
 """
@@ -14,7 +14,7 @@ from guiderail.diagrams.guidance.primitive import KgrlGuidance
 
 
 class AlongOptions(Options):
-    """Of the guidance; `gymnasium.make` and `--env` take them."""
+    """Options of the guidance, for `gymnasium.make` and `--env`."""
 
     angle: float = Field(0.0, ge=-180, le=180, description="of the direction in the plane [degrees]")
 

@@ -1,4 +1,4 @@
-"""How do I change the reward of a task? By deriving from it; terms name signals, and each has a column of its own."""
+"""Change the reward of a task: derive from it; terms name signals, and each has a column of its own."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How do I make a task of my own? By declaring it; this one is another plane with another gap and another goal."""
+"""Make your own task: declare it; this one is a plane with another gap and another goal."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,14 +16,14 @@ STEPS, PERIOD = 80, 0.02
 
 @gr.register_task("examples/WideGap")
 class WideGap(gr.Task):
-    """Through a wide gap to a goal beside the demonstrations."""
+    """Pass a wide gap to a goal next to the demonstrations."""
 
     workcell_kind, num_steps, clip = "plane", STEPS, 1.0
 
     def workcell(self) -> PassageGeometry:
         return WORLD
 
-    def reference(self) -> gr.ReferenceTrajectory:  # known: so kmp, residual, kgrl and skgrl can guide
+    def reference(self) -> gr.ReferenceTrajectory:  # for kmp, residual, kgrl and skgrl
         means = np.column_stack([np.full(STEPS, 0.35), np.linspace(0.1, 0.9, STEPS)])
         return gr.ReferenceTrajectory(PERIOD * np.arange(STEPS), means, np.tile(0.04**2 * np.eye(2), (STEPS, 1, 1)))
 

@@ -1,4 +1,4 @@
-"""How do I learn a motion in space? Poses become six outputs without jumps, in the frame of what is aimed at."""
+"""Learn a motion in space: poses become six outputs without jumps, in the frame of the target."""
 
 import numpy as np
 from pydrake.math import RollPitchYaw

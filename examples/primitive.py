@@ -1,4 +1,4 @@
-"""How do I use the primitive alone? It is NumPy: demonstrations in, a constrained and modulated motion out."""
+"""Use the primitive alone: it maps demonstrations to a constrained and modulated motion with NumPy."""
 
 import numpy as np
 

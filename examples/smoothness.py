@@ -1,4 +1,4 @@
-"""How do I compare how smoothly two ways explore? At the same RMS: to move less is to be smoother, and no better."""
+"""Compare the smoothness of two kinds of exploration: at the same RMS, because smaller motions are smoother."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How do I use a shared control template alone? As guidance in a diagram, here with inputs that someone holds."""
+"""Use a shared control template alone: it is guidance in a diagram, here with constant inputs."""
 
 import numpy as np
 from pydrake.math import RigidTransform

@@ -1,4 +1,4 @@
-"""How do I make a motion pass through a point? With a via-point, which can be moved and removed again."""
+"""Make a motion pass through a point: add a via-point, which can be moved and removed."""
 
 import numpy as np
 

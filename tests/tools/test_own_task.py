@@ -1,4 +1,4 @@
-"""What somebody is told whose task, in a file of their own, is not yet right."""
+"""Messages about mistakes in the declaration of a task."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is known about a task, and on which stations."""
+"""Prior knowledge of a task on stations, and log output."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ PERIOD = 0.02
 
 
 def known(turn, station, period=PERIOD):
-    """Of a motion that turns by so much [rad] about z."""
+    """Return the prior knowledge of a motion that turns by `turn` [rad] about z."""
     means = np.zeros((30, 6))
     means[:, 3] = np.linspace(0.0, turn, 30)
     reference = ReferenceTrajectory(PERIOD * np.arange(30), means, np.tile(1e-6 * np.eye(6), (30, 1, 1)))

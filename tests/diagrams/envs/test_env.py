@@ -1,4 +1,4 @@
-"""What `DrakeGymEnv` gets wrong, on a task so small that every number is known."""
+"""Reset and step of `GuidedEnv`, on a task so small that every number is known."""
 
 import gymnasium
 import numpy as np
@@ -17,7 +17,7 @@ SOLVER_FAILURE = "The SAP solver failed to converge at simulation time = 0.1."
 
 
 class Toy(LeafSystem):
-    """A position that the held action moves by a tenth per control step; it says what an environment must know.
+    """A position that the held action moves by a tenth per control step; it records what an environment must know.
 
     State: position, what initialization saw, fast ticks so far, the action of this control step.
     """

@@ -1,4 +1,4 @@
-"""Every task with every guidance: what has all it needs runs an episode, the rest says what is missing."""
+"""Every task with every guidance: what has all it needs runs an episode, the rest names what is missing."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_both_contracts_hold_in_every_tasks_diagram(task):
 
 @pytest.mark.parametrize("task", OWN)
 def test_resolved_options_resolve_to_themselves(task):
-    """What a run stores makes the same environment again."""
+    """Options that a run stores make an equal environment."""
     values = EnvConfig.resolve(task, {}).options
     assert EnvConfig.resolve(task, values).options == values
 

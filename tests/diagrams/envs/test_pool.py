@@ -1,4 +1,4 @@
-"""What an environment leaves behind: nothing, and no trace of itself in the next one."""
+"""Environments release their resources, and a reused diagram has no state of the earlier one."""
 
 import gc
 import pickle
@@ -19,7 +19,7 @@ CASES = [
 
 
 def episode(env, seed):
-    """What a dozen random actions lead to, to the last bit."""
+    """Return the results of a dozen random actions, to the last bit."""
     observation, info = env.reset(seed=seed)
     seen, rng = [observation.tobytes(), repr(env.drawn)], np.random.default_rng(seed)
     for _ in range(12):
@@ -107,7 +107,7 @@ def test_memory_does_not_grow_with_environments(close, render_mode):
 
 
 def held(process):
-    """How many threads, descriptors and ports a process has."""
+    """Return the number of threads, descriptors and ports of a process."""
     listening = [one for one in process.net_connections() if one.status == psutil.CONN_LISTEN]
     return process.num_threads(), process.num_fds(), len(listening)
 

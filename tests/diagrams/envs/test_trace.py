@@ -8,7 +8,7 @@ QUIET = {"commanded_violation": -1.0, "measured_violation": -1.0}
 
 
 def trace_of(steps):
-    """Return a trace whose control steps have the given signals, and a contact force if `force` is among them."""
+    """Return a trace of control steps with the given signals, and a contact force if `force` is among them."""
     trace = EpisodeTrace(60, 2, 0.1, SIGNALS)
     for values in steps:
         signals = {name: np.broadcast_to({**QUIET, **values}.get(name, 0.0), size) for name, size in SIGNALS.items()}

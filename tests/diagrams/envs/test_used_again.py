@@ -1,4 +1,4 @@
-"""An environment whose diagram was built for an earlier one is the same as if it were the first."""
+"""An environment with a reused diagram equals one with a new diagram."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ CASES = {
 }
 
 
-def begun(task, options):
-    """What a policy sees at first and after a decision, and what was drawn, in two episodes."""
+def first_observations(task, options):
+    """Return the first two observations and the sampled values of two episodes."""
     env = make_env(task, **options)
     diagram, found = env.task.diagram, []
     for seed in (1, 2):
@@ -26,8 +26,8 @@ def begun(task, options):
 
 @pytest.mark.parametrize("case", CASES)
 def test_reset_values_reach_a_reused_diagram(case):
-    first, expected = begun(*CASES[case])
-    again, found = begun(*CASES[case])
+    first, expected = first_observations(*CASES[case])
+    again, found = first_observations(*CASES[case])
     assert again is first
     for one, other in zip(expected, found, strict=True):
         np.testing.assert_equal(other, one)

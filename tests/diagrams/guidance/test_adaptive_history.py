@@ -1,4 +1,4 @@
-"""sKGRL whose history shrinks in contact: quicker there, and without a jump when it changes."""
+"""SKGRL with a history that shrinks in contact: quicker there, and without a jump when it changes."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_without_contact_it_is_skgrl(skill):
 
 
 def test_in_contact_it_answers_sooner(skill):
-    """How far a sudden action has moved the command after one and after four control steps."""
+    """Return how far a sudden action has moved the command after one and after four control steps."""
     moved = {}
     for name, one in (("plain", skill), ("adaptive", replace(skill, adaptive_history=True))):
         still, _ = rollout(one, np.zeros((STEPS, 2)), touching())

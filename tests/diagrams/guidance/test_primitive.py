@@ -139,7 +139,7 @@ def test_only_a_measured_history_follows_the_robot(skill):
         guidance = build("skgrl", replace(skill, history_source=source))
         return rollout(guidance, constant([0.0, 0.0])[:20], pose=pushed, track=False)[0][-1]
 
-    # Someone holds the robot where the demonstrations are not.
+    # The robot is held away from the demonstrations.
     assert np.linalg.norm(command_after("measured") - pushed) < 0.02
     assert np.linalg.norm(command_after("commanded") - skill.reference.means[19]) < 0.02
 

@@ -1,4 +1,4 @@
-"""What a kind of guidance declares, and what follows from it."""
+"""Declarations of kinds of guidance and their effect."""
 
 import numpy as np
 import pytest

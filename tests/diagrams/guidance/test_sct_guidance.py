@@ -1,4 +1,4 @@
-"""The sct guidance without an arm: a robot that is where it was told to be one period ago."""
+"""The sct guidance without an arm: a robot that is where it was commanded one period ago."""
 
 import numpy as np
 import pytest
@@ -157,7 +157,7 @@ def test_the_filter_takes_requests_from_anyone(template):
 
 
 def test_a_persons_device_and_a_policy_differ_in_one_connection(template):
-    """Figure 3.1: whoever is connected to `action` drives."""
+    """Figure 3.1: the source connected to `action` drives the robot."""
     diagrams = []
     for source in (ConstantVectorSource(np.array([0.0, 1.0, 0.0])), ZeroOrderHold(PERIOD, 3)):
         builder = DiagramBuilder()

@@ -88,7 +88,7 @@ def test_torque_search_finds_the_jack_in_any_episode(kgrl):
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
 def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
-    """Corner actions that change at every decision, into every corner of the square."""
+    """Corner actions that change at every step, into every corner of the square."""
     safe_residual = make_env("BncConnector", guidance="safe_residual", action_scale=3.0)
     env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
     rng = np.random.default_rng(3)
@@ -101,7 +101,7 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
 
 @pytest.fixture(scope="module")
 def felt(kmp):
-    """What is observed while the plug stands on the rim, by where the jack is [mm]."""
+    """Return the observation while the plug stands on the rim, by where the jack is [mm]."""
 
     @cache
     def felt(x_mm, y_mm):
@@ -170,7 +170,7 @@ def test_shaped_reward_adds_the_depth_gained():
 
 
 def test_aligned_reward_adds_distance_gained_to_the_jack():
-    """From 2 mm beside the jack to where a constant action leads."""
+    """From 2 mm next to the jack to where a constant action leads."""
     env = make_env("BncConnector", guidance="kgrl", reward="aligned", fixture_offset="none", action_repeat=10)
     env.reset(seed=0, options={"offset": (2.0 * MM, 0.0)})
     gained = sum(env.step(np.array([1.0, 0.0]))[4]["alignment"] for _ in range(10))

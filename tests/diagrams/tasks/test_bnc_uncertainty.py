@@ -1,4 +1,4 @@
-"""Where jack and plug really are."""
+"""Actual offsets of jack and plug."""
 
 import numpy as np
 import pytest

@@ -60,7 +60,7 @@ JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.
 
 
 def test_samples_of_a_seed_at_standard_are_unchanged():
-    """Of a generator, so the same everywhere."""
+    """Samples of a generator are the same on every machine."""
     fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(3)
     jack, plug = fixture_offset.draw(rng, InsertionReset())
     np.testing.assert_allclose(1e3 * jack, JACK, atol=1e-12)

@@ -73,14 +73,14 @@ def test_straight_descent_inserts_without_offsets(known, seed):
 
 
 def test_aligned_reward_pays_approach_and_costs_collisions():
-    """Two millimetres beside, straight down onto the table, until it is too much."""
+    """Two millimetres off, straight down onto the table, until it is too much."""
     env = make_env("GridClamp", reward="aligned", difficulty="hard")
     info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
     assert info["termination"] == "collision"
     assert terms["collision_cost"] == -25.0
     _, _, sideways = play(env, lambda _: np.array([-0.3, 0.0, 0.3]), seed=0, options={"offset": (2.0 * MM, 0.0)})
     assert sideways["collision_cost"] == 0.0
-    # The cuboid ends 4 mm beside the holes' place: from 2 mm on one side to 2 mm on the other nothing is gained.
+    # The cuboid ends 4 mm off the holes' place: from 2 mm on one side to 2 mm on the other nothing is gained.
     assert sideways["alignment"] == pytest.approx(0.0, abs=1.5)
 
 
@@ -120,7 +120,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     assert np.abs(commanded[:, 3:]).max() <= 1e-9
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert info["termination"] != "collision"
-    if guidance != "residual":  # whose command comes down whatever is in the way
+    if guidance != "residual":  # its command descends whatever is in the way
         assert env.trace.statistics()["peak_force"] < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
@@ -141,7 +141,7 @@ def test_force_costs_unless_it_is_left_out(known):
 
 
 def test_an_observation_is_position_and_force(env):
-    """Pressed on the table beside the holes: the height of the pegs, and the force that bears them."""
+    """Pressed on the table next to the holes: the height of the pegs, and the force that bears them."""
     env.reset(seed=0, options={"offset": (0.0025, 0.001)})
     for _ in range(8):
         observation, _, _, _, info = env.step(DOWN)

@@ -27,7 +27,7 @@ def make(guidance="skgrl", **arguments):
 
 
 def play(env, policy, **reset):
-    """Rewards, observations and the last info of an episode; the policy is called with the decision's number."""
+    """Rewards, observations and the last info of an episode; the policy is called with the number of the action."""
     observation, info = env.reset(**reset)
     observations, rewards, infos = [observation], [], [info]
     finished = False

@@ -1,4 +1,4 @@
-"""What training draws, and what it never draws."""
+"""Training and held-out random streams."""
 
 import numpy as np
 

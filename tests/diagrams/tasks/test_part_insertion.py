@@ -27,7 +27,7 @@ BY_PHASE = {
 
 @pytest.fixture(autouse=True)
 def registered():
-    """What was registered here is nobody else's."""
+    """Remove the registrations of each test."""
     before = set(TASKS.names())
     yield
     for name in set(TASKS.names()) - before:
@@ -41,7 +41,7 @@ def part(name, **changes):
 
 
 def write(folder, **changes):
-    """A folder with a task; `changes` are of what its file says."""
+    """A folder with a task; `changes` are of the content of its file."""
     folder.mkdir(exist_ok=True)
     for name, low, high, radius in (("plug", 0.0, 0.02, 0.005), ("socket", -0.02, -0.005, 0.015)):
         profile = [(0.0, high), (radius, high), (radius, low), (0.0, low)]

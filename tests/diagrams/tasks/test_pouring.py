@@ -1,4 +1,4 @@
-"""Pouring as a user sees it: who may do what, and what comes of it."""
+"""Pouring by scripted policies, adversaries and unconstrained inputs."""
 
 import gymnasium
 import numpy as np
@@ -58,7 +58,7 @@ def test_scripted_policy_pours_because_of_the_constraints(env, unconstrained, st
     assert total > 200.0
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert env.trace.statistics()["collisions"] == 0.0
-    # The very same inputs, or the very same person, who may react: it doesn't depend on which is meant.
+    # The same inputs, or the same scripted policy, which reacts: the result does not depend on it.
     replay = iter([*actions, *[actions[-1]] * 150])
     again = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(replay)
     info, _, _ = run(unconstrained, again, seed=1, options={"start": start})

@@ -16,7 +16,7 @@ IN, FALLEN, KEPT = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]  # in th
 
 
 def judged(in_mug, fallen):
-    """Whether so many of six balls mean success, or a spill, where five are needed; the others are in the thermos."""
+    """Return success and spill if five of six balls are needed; the others are in the thermos."""
     places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
     balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
     _, success, spill = termination_terms(CONFIG, needed=5)

@@ -71,7 +71,7 @@ def test_no_command_ever_leaves_the_constraints(env, name):
 
 
 def test_recomputed_commands_are_inside_the_constraints(env):
-    """Also where the arm and the template's diagram take part, and at every control step, not only at decisions."""
+    """Also where the arm and the template's diagram take part, and at every control step, not only at actions."""
     stepwise = make_env("Pouring", difficulty="hard", action_repeat=1)
     diagram, context = stepwise.task.diagram, stepwise.simulator.get_context()
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)

@@ -39,7 +39,7 @@ def test_step_log_has_every_step_and_agrees_with_the_rows(written):
     last = step_log[step_log["episode"] == 1]
     np.testing.assert_array_equal(last[["desired_pose_0", "desired_pose_1"]], trace.commanded)
     np.testing.assert_array_equal(last[["pose_0", "pose_1"]], trace.measured)
-    # The zone is x ≥ 0.6: by what was commanded itself, and not by what anybody says of it.
+    # The zone is x ≥ 0.6: computed from the commanded pose itself.
     np.testing.assert_allclose(step_log["commanded_violation"], step_log["desired_pose_0"] - 0.6, atol=1e-12)
 
 
