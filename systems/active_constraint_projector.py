@@ -9,16 +9,14 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.template_frames import TemplateFrames
 
@@ -117,37 +115,14 @@ class ActiveConstraintProjector(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_requested_pose_input_port(self) -> InputPort:
-        """Return the port of the requested pose H^im, (6,)."""
-        return self._requested_pose_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (6,)."""
-        return self._pose_port
-
-    def get_state_input_port(self) -> InputPort:
-        """Return the port of the number of the template's state, (1,)."""
-        return self._state_port
-
-    def get_desired_pose_output_port(self) -> OutputPort:
-        """Return the port of the command H^ac, (6,), inside the active constraints."""
-        return self._desired_pose_port
-
-    def get_last_desired_pose_output_port(self) -> OutputPort:
-        """Return the port of the previous command, (6,), which an input displaces; no direct feedthrough."""
-        return self._last_desired_pose_port
-
-    def get_fallback_output_port(self) -> OutputPort:
-        """Return the port of the fallback flag, (1,): 1 while the last safe command is repeated."""
-        return self._fallback_port
-
-    def get_commanded_violation_output_port(self) -> OutputPort:
-        """Return the port of the violation of the command, (1,)."""
-        return self._commanded_violation_port
-
-    def get_measured_violation_output_port(self) -> OutputPort:
-        """Return the port of the violation of the measured pose, (1,)."""
-        return self._measured_violation_port
+    get_requested_pose_input_port = input_getter("requested_pose", "requested pose H^im, (6,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (6,)")
+    get_state_input_port = input_getter("state", "number of the template's state, (1,)")
+    get_desired_pose_output_port = output_getter("desired_pose", "command H^ac, (6,), inside the active constraints")
+    get_last_desired_pose_output_port = output_getter("last_desired_pose", "previous command, (6,)")
+    get_fallback_output_port = output_getter("fallback", "flag that the last safe command is repeated, (1,)")
+    get_commanded_violation_output_port = output_getter("commanded_violation", "violation of the command, (1,)")
+    get_measured_violation_output_port = output_getter("measured_violation", "violation of the measured pose, (1,)")
 
     def _violation(self, context: Context, pose: np.ndarray) -> float:
         state = int(self._state_port.Eval(context)[0])
@@ -197,7 +172,7 @@ class ActiveConstraintProjector(LeafSystem):
     def _calc_measured_violation(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._violation(context, self._pose_port.Eval(context)))
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = self._pose_port.Eval(context)
         if not np.isfinite(measured).all():
             raise InputError(f"a template begins at the robot's pose: the measured pose must be finite, not {measured}")
@@ -206,11 +181,9 @@ class ActiveConstraintProjector(LeafSystem):
         state = self._template.state_at(X_WE, frames)
         command = self._template.command(state, X_WE, X_WE, frames, self._period)
         discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # No step has ended at time zero. An event offset of one period would not fall on k * period exactly.
         if context.get_time() > 0:
             command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)
             discrete_state.set_value(np.concatenate([command, measured]))
-        return EventStatus.Succeeded()

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
 from guiderail.systems.support.last_valid_pose import LastValidPose
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 @dataclass(frozen=True)
@@ -154,37 +155,14 @@ class CartesianImpedanceController(LeafSystem):
             prerequisites_of_calc=self._followed_pose.timed_out_tickets,
         )
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the desired pose of the tool centre, (6,)."""
-        return self._desired_pose_port
-
-    def get_estimated_state_input_port(self) -> InputPort:
-        """Return the port of joint positions and velocities, (2n,) [rad, rad/s]."""
-        return self._estimated_state_port
-
-    def get_command_time_input_port(self) -> InputPort:
-        """Return the port of the time stamp of the desired pose, (1,) [s]; optional."""
-        return self._command_time_port
-
-    def get_generalized_force_output_port(self) -> OutputPort:
-        """Return the port of the joint torques, (n,) [Nm]."""
-        return self._generalized_force_port
-
-    def get_pose_output_port(self) -> OutputPort:
-        """Return the port of the measured pose of the tool centre, (6,)."""
-        return self._pose_port
-
-    def get_impedance_wrench_output_port(self) -> OutputPort:
-        """Return the port of the wrench of spring and damper at P in the axes of T, (6,), force first."""
-        return self._impedance_wrench_port
-
-    def get_saturation_output_port(self) -> OutputPort:
-        """Return the port of the flag that the wrench or a motor is at its limit, (1,)."""
-        return self._saturation_port
-
-    def get_command_timed_out_output_port(self) -> OutputPort:
-        """Return the port of the flag that no valid command is available, (1,)."""
-        return self._command_timed_out_port
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
+    get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
+    get_generalized_force_output_port = output_getter("generalized_force", "joint torques, (n,) [Nm]")
+    get_pose_output_port = output_getter("pose", "measured pose of the tool centre, (6,)")
+    get_impedance_wrench_output_port = output_getter("impedance_wrench", "wrench of spring and damper, (6,)")
+    get_saturation_output_port = output_getter("saturation", "flag that the wrench or a motor is at its limit, (1,)")
+    get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
         self._plant.SetPositionsAndVelocities(plant_context, self._estimated_state_port.Eval(context))

@@ -15,10 +15,7 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
@@ -26,6 +23,7 @@ from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support.caching import declare_plant_context
 from guiderail.systems.support.last_valid_pose import CommandValidity
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -149,33 +147,13 @@ class CartesianPositionController(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the desired pose of the tool centre, (6,)."""
-        return self._desired_pose_port
-
-    def get_positions_input_port(self) -> InputPort:
-        """Return the port of the measured joint positions, (n,) [rad]."""
-        return self._positions_port
-
-    def get_command_time_input_port(self) -> InputPort:
-        """Return the port of the time stamp of the desired pose, (1,) [s]; optional."""
-        return self._command_time_port
-
-    def get_joint_positions_output_port(self) -> OutputPort:
-        """Return the port of the joint command, (n,) [rad]."""
-        return self._joint_positions_port
-
-    def get_pose_output_port(self) -> OutputPort:
-        """Return the port of the pose of the tool centre at the joint command, (6,)."""
-        return self._pose_port
-
-    def get_stuck_output_port(self) -> OutputPort:
-        """Return the port of the flag that the desired direction cannot be followed, (1,)."""
-        return self._stuck_port
-
-    def get_command_timed_out_output_port(self) -> OutputPort:
-        """Return the port of the flag that no valid command is available, (1,)."""
-        return self._command_timed_out_port
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_positions_input_port = input_getter("positions", "measured joint positions, (n,) [rad]")
+    get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
+    get_joint_positions_output_port = output_getter("joint_positions", "joint command, (n,) [rad]")
+    get_pose_output_port = output_getter("pose", "pose of the tool centre at the joint command, (6,)")
+    get_stuck_output_port = output_getter("stuck", "flag that the desired direction cannot be followed, (1,)")
+    get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
         self._plant.SetPositions(plant_context, self._joint_command(context))
@@ -183,7 +161,7 @@ class CartesianPositionController(LeafSystem):
     def _joint_command(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._command).value()
 
-    def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = self._positions_port.Eval(context)
         if not np.isfinite(measured).all():
             raise InputError(
@@ -192,13 +170,12 @@ class CartesianPositionController(LeafSystem):
         discrete_state.set_value(self._command, measured)
         discrete_state.set_value(self._is_stuck, [0.0])
         discrete_state.set_value(self._has_timed_out, [0.0])
-        return EventStatus.Succeeded()
 
-    def _step(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         is_valid = self._validity.is_valid(context, context.get_time())
         discrete_state.set_value(self._has_timed_out, [float(not is_valid)])
         if not is_valid:
-            return EventStatus.Succeeded()
+            return
         plant, plant_context = self._plant, self._plant_context.Eval(context)
         X_TP = self._tool_centre.CalcPose(plant_context, self._target)
         V = self._desired_velocity(X_TP, pose_to_transform(self._desired_pose_port.Eval(context)))
@@ -213,7 +190,6 @@ class CartesianPositionController(LeafSystem):
         if velocities is not None:
             # The solver satisfies limits only to its tolerance; the command satisfies them exactly.
             discrete_state.set_value(self._command, np.clip(q + self._period * velocities, *limits))
-        return EventStatus.Succeeded()
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
         """Return the tool velocity [rotational, translational] (6,) that reaches X_TPd in one period, within limits."""

@@ -1,10 +1,11 @@
 """Center of pressure of a contact, computed from its wrench."""
 
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class CenterOfPressure(LeafSystem):
@@ -43,13 +44,8 @@ class CenterOfPressure(LeafSystem):
             "center_of_pressure", 2, self._calc_center_of_pressure, prerequisites_of_calc={self._wrench_port.ticket()}
         )
 
-    def get_wrench_input_port(self) -> InputPort:
-        """Return the port of force and torque about the tool centre, (6,) [N, Nm]."""
-        return self._wrench_port
-
-    def get_center_of_pressure_output_port(self) -> OutputPort:
-        """Return the port of the center of pressure relative to the tool centre, (2,) [m]."""
-        return self._center_of_pressure_port
+    get_wrench_input_port = input_getter("wrench", "wrench about the tool centre, (6,) [N, Nm]")
+    get_center_of_pressure_output_port = output_getter("center_of_pressure", "center of pressure, (2,) [m]")
 
     def _calc_center_of_pressure(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(center_of_pressure(self._wrench_port.Eval(context), self._min_force))

@@ -5,13 +5,11 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -72,32 +70,23 @@ class CommandDisturbance(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_command_input_port(self) -> InputPort:
-        """Return the port of the command, (n,)."""
-        return self._command_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (n,)."""
-        return self._pose_port
-
-    def get_delivered_command_output_port(self) -> OutputPort:
-        """Return the port of the delivered command, (n,)."""
-        return self._delivered_command_port
+    get_command_input_port = input_getter("command", "command, (n,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (n,)")
+    get_delivered_command_output_port = output_getter("delivered_command", "delivered command, (n,)")
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Set the seed of the losses; `context` is this system's."""
         context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)
         discrete_state.set_value(self._count, [0.0])
         discrete_state.set_value(self._is_lost, [0.0])
         discrete_state.set_value(self._last_delivered, pose)
         if self._delay_line is not None:
             discrete_state.set_value(self._delay_line, np.tile(pose, self._delay))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value()[0] + 1.0
         discrete_state.set_value(self._count, [count])
         discrete_state.set_value(self._last_delivered, self._eval_delivered(context))
@@ -109,7 +98,6 @@ class CommandDisturbance(LeafSystem):
             seed = context.get_numeric_parameter(self._seed).value()[0]
             sample = np.random.default_rng([int(seed), int(count)]).uniform()
             discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
-        return EventStatus.Succeeded()
 
     def _eval_delivered(self, context: Context) -> np.ndarray:
         last = context.get_discrete_state(self._last_delivered).value()

@@ -1,10 +1,11 @@
 """Watchdog that outputs the last valid command when commands stop."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.last_valid_pose import LastValidPose
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class CommandWatchdog(LeafSystem):
@@ -64,25 +65,11 @@ class CommandWatchdog(LeafSystem):
             prerequisites_of_calc=self._followed_pose.timed_out_tickets,
         )
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the commanded pose, (O,)."""
-        return self._desired_pose_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (O,)."""
-        return self._pose_port
-
-    def get_command_time_input_port(self) -> InputPort:
-        """Return the port of the time stamp of the desired pose, (1,) [s]; optional."""
-        return self._command_time_port
-
-    def get_safe_pose_output_port(self) -> OutputPort:
-        """Return the port of the last valid desired pose, (O,)."""
-        return self._safe_pose_port
-
-    def get_command_timed_out_output_port(self) -> OutputPort:
-        """Return the port of the flag that no valid command is available, (1,)."""
-        return self._command_timed_out_port
+    get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (O,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,)")
+    get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
+    get_safe_pose_output_port = output_getter("safe_pose", "last valid desired pose, (O,)")
+    get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
     def _measured_pose(self, context: Context) -> np.ndarray:
         return self._pose_port.Eval(context)

@@ -4,13 +4,11 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.primitives import LinearConstraints
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -58,17 +56,11 @@ class ConstraintViolation(LeafSystem):
             "violation", 1, self._calc_violation, prerequisites_of_calc=prerequisites
         )
 
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the pose, (O,)."""
-        return self._pose_port
+    get_pose_input_port = input_getter("pose", "pose, (O,)")
+    get_violation_output_port = output_getter("violation", "violation max(c − G y), (1,)")
 
-    def get_violation_output_port(self) -> OutputPort:
-        """Return the port of the violation max(c − G y), (1,)."""
-        return self._violation_port
-
-    def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value([round(context.get_time() / self._period)])
-        return EventStatus.Succeeded()
 
     def _calc_violation(self, context: Context, output: BasicVector) -> None:
         step = 0 if self._step is None else int(context.get_discrete_state(self._step).value()[0])

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -65,21 +66,10 @@ class ContactDetector(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_contact_results_input_port(self) -> InputPort:
-        """Return the port of the plant's contact results."""
-        return self._contact_results_port
-
-    def get_collision_output_port(self) -> OutputPort:
-        """Return the port of the flag that a body touches an obstacle now, (1,)."""
-        return self._collision_port
-
-    def get_has_collided_output_port(self) -> OutputPort:
-        """Return the port of the flag that a contact has occurred in this episode, (1,)."""
-        return self._has_collided_port
-
-    def get_contact_force_output_port(self) -> OutputPort:
-        """Return the port of the largest contact force between the two sets, (1,) [N]."""
-        return self._contact_force_port
+    get_contact_results_input_port = input_getter("contact_results", "plant's contact results")
+    get_collision_output_port = output_getter("collision", "flag that a body touches an obstacle now, (1,)")
+    get_has_collided_output_port = output_getter("has_collided", "flag of a contact in this episode, (1,)")
+    get_contact_force_output_port = output_getter("contact_force", "largest contact force, (1,) [N]")
 
     def _largest_force(self, context: Context) -> float | None:
         """Return the largest force [N] between the two sets, or None without contact."""
@@ -102,15 +92,13 @@ class ContactDetector(LeafSystem):
     def _is_collision(self, a: int, b: int) -> bool:
         return (a in self._bodies and b in self._obstacles) or (b in self._bodies and a in self._obstacles)
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         for index in (self._collision, self._has_collided, self._contact_force):
             discrete_state.set_value(index, [0.0])
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         force = self._largest_force(context)
         discrete_state.set_value(self._collision, [float(force is not None)])
         discrete_state.set_value(self._contact_force, [force or 0.0])
         if force is not None:
             discrete_state.set_value(self._has_collided, [1.0])
-        return EventStatus.Succeeded()

@@ -8,14 +8,13 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
     InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.ports import output_getter
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
@@ -129,9 +128,7 @@ class EpisodeMonitor(LeafSystem):
         """
         return self._signals.port(name)
 
-    def get_termination_output_port(self) -> OutputPort:
-        """Return the port of the termination, (1,), an index into `TERMINATIONS`; 0 while the episode continues."""
-        return self._termination_port
+    get_termination_output_port = output_getter("termination", "index into `TERMINATIONS`, (1,)")
 
     def _calc_next(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)
@@ -153,12 +150,10 @@ class EpisodeMonitor(LeafSystem):
     def _calc_termination(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._next.Eval(context)[-1])
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._initial_state)
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # No step has ended at time zero. An event offset of one period would not coincide exactly with k * period.
         if context.get_time() > 0:
             discrete_state.set_value(self._next.Eval(context))
-        return EventStatus.Succeeded()

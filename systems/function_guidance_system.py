@@ -3,9 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 GuidanceFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -66,35 +67,18 @@ class FunctionGuidanceSystem(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
-    def get_action_input_port(self) -> InputPort:
-        """Return the port of the policy's action in [−1, 1], (A,)."""
-        return self._action_port
+    get_action_input_port = input_getter("action", "policy's action in [−1, 1], (A,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,)")
+    get_wrench_input_port = input_getter("wrench", "measured wrench, (W,)")
+    get_desired_pose_output_port = output_getter("desired_pose", "desired pose, (O,)")
+    get_held_action_output_port = output_getter("held_action", "action of the present control step, (A,)")
+    get_fallback_output_port = output_getter("fallback", "flag that the function did not return O finite numbers, (1,)")
 
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (O,)."""
-        return self._pose_port
-
-    def get_wrench_input_port(self) -> InputPort:
-        """Return the port of the measured wrench, (W,)."""
-        return self._wrench_port
-
-    def get_desired_pose_output_port(self) -> OutputPort:
-        """Return the port of the desired pose, (O,)."""
-        return self._desired_pose_port
-
-    def get_held_action_output_port(self) -> OutputPort:
-        """Return the port of the action of the present control step, (A,)."""
-        return self._held_action_port
-
-    def get_fallback_output_port(self) -> OutputPort:
-        """Return the port of the flag that the function did not return O finite numbers, (1,)."""
-        return self._fallback_port
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._desired_pose, self._pose_port.Eval(context))
-        return self._step(context, discrete_state)
+        self._step(context, discrete_state)
 
-    def _step(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         action = self._action_port.Eval(context)
         returned = self._function(
             action.copy(), self._pose_port.Eval(context).copy(), self._wrench_port.Eval(context).copy()
@@ -112,4 +96,3 @@ class FunctionGuidanceSystem(LeafSystem):
             discrete_state.set_value(self._desired_pose, desired)
         discrete_state.set_value(self._held_action, action)
         discrete_state.set_value(self._fallback, [float(not is_usable)])
-        return EventStatus.Succeeded()

@@ -5,13 +5,11 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -63,13 +61,8 @@ class GripperCommand(LeafSystem):
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_position_input_port(self) -> InputPort:
-        """Return the port of desired positions, (n,); optional."""
-        return self._position_port
-
-    def get_desired_state_output_port(self) -> OutputPort:
-        """Return the port of desired positions and velocities, (2n,)."""
-        return self._desired_state_port
+    get_position_input_port = input_getter("position", "desired positions, (n,); optional")
+    get_desired_state_output_port = output_getter("desired_state", "desired positions and velocities, (2n,)")
 
     def _valid_position(self, context: Context) -> np.ndarray:
         last = context.get_discrete_state(self._last_position).value()
@@ -82,6 +75,5 @@ class GripperCommand(LeafSystem):
         position = self._valid_position(context)
         output.SetFromVector(np.concatenate([position, np.zeros_like(position)]))
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._valid_position(context))
-        return EventStatus.Succeeded()

@@ -6,14 +6,12 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, Heartbeat
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -67,17 +65,9 @@ class HeartbeatMonitor(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_heartbeat_input_port(self) -> InputPort:
-        """Return the port of the newest `Heartbeat`; any other object counts as none."""
-        return self._heartbeat_port
-
-    def get_status_fault_input_port(self) -> InputPort:
-        """Return the port of the status fault, (1,), a code of `Fault`."""
-        return self._status_fault_port
-
-    def get_fault_output_port(self) -> OutputPort:
-        """Return the port of the combined fault, (1,), a code of `Fault`."""
-        return self._fault_port
+    get_heartbeat_input_port = input_getter("heartbeat", "newest `Heartbeat`; any other object counts as none")
+    get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
+    get_fault_output_port = output_getter("fault", "combined fault, (1,), a code of `Fault`")
 
     def is_alive(self, context: Context) -> bool:
         """Return True if a heartbeat has been received and has not timed out."""
@@ -92,18 +82,16 @@ class HeartbeatMonitor(LeafSystem):
         last_sequence, age = context.get_discrete_state(self._state).value()
         return heartbeat is not None and heartbeat.sequence == last_sequence and age > self._timeout
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value([np.nan, 0.0])
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         heartbeat = self._heartbeat(context)
         last_sequence, age = context.get_discrete_state(self._state).value()
         if heartbeat is not None and heartbeat.sequence != last_sequence:
             discrete_state.set_value([heartbeat.sequence, 0.0])
         else:
             discrete_state.set_value([last_sequence, age + self._period])
-        return EventStatus.Succeeded()
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         fault = float(self._status_fault_port.Eval(context)[0])

@@ -1,9 +1,10 @@
 """Buffer of the last outputs of a movement primitive (thesis, equation 5.3)."""
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -53,27 +54,17 @@ class HistoryBuffer(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._fill)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._shift)
 
-    def get_output_input_port(self) -> InputPort:
-        """Return the port of the output to store, (O,)."""
-        return self._output_port
+    get_output_input_port = input_getter("output", "output to store, (O,)")
+    get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,); optional")
+    get_history_output_port = output_getter("history", "last P outputs, (P*O,), oldest first")
 
-    def get_initial_output_input_port(self) -> InputPort:
-        """Return the port of the output that fills the history at initialization, (O,); optional."""
-        return self._initial_output_port
-
-    def get_history_output_port(self) -> OutputPort:
-        """Return the port of the last P outputs, (P*O,), oldest first."""
-        return self._history_port
-
-    def _fill(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _fill(self, context: Context, discrete_state: DiscreteValues) -> None:
         initial = self._initial_output_port if self._initial_output_port.HasValue(context) else self._output_port
         discrete_state.set_value(np.tile(initial.Eval(context), self._shape[0]))
-        return EventStatus.Succeeded()
 
-    def _shift(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
         # Nothing has been executed at time zero. An event offset of one period would not do: period + k * period
         # differs from (k + 1) * period in the last bit for every third k.
         if context.get_time() > 0:
             remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]
             discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))
-        return EventStatus.Succeeded()

@@ -7,13 +7,11 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -87,19 +85,13 @@ class HistoryLengthSchedule(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_wrench_input_port(self) -> InputPort:
-        """Return the port of the measured wrench, (W,), force first."""
-        return self._wrench_port
+    get_wrench_input_port = input_getter("wrench", "measured wrench, (W,), force first")
+    get_history_length_output_port = output_getter("history_length", "history length P, (1,)")
 
-    def get_history_length_output_port(self) -> OutputPort:
-        """Return the port of the history length P, (1,)."""
-        return self._history_length_port
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._state, np.zeros(3))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         index, in_contact, num_free_steps = context.get_discrete_state(self._state).value()
         force = float(np.linalg.norm(self._wrench_port.Eval(context)[:3]))
         # In this form NaN counts as contact.
@@ -111,7 +103,6 @@ class HistoryLengthSchedule(LeafSystem):
             if num_free_steps >= self._dwell_steps:
                 index, num_free_steps = max(index - 1, 0), 0
         discrete_state.set_value(self._state, [index, in_contact, num_free_steps])
-        return EventStatus.Succeeded()
 
     def _calc_history_length(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._lengths[int(context.get_discrete_state(self._state).value()[0])])

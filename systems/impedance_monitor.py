@@ -1,9 +1,10 @@
 """Contact force and saturation of an impedance controller."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class ImpedanceMonitor(LeafSystem):
@@ -49,17 +50,9 @@ class ImpedanceMonitor(LeafSystem):
             "saturation", 1, self._calc_saturation, prerequisites_of_calc=wrench
         )
 
-    def get_impedance_wrench_input_port(self) -> InputPort:
-        """Return the port of the wrench that the impedance applies, (6,)."""
-        return self._impedance_wrench_port
-
-    def get_contact_force_output_port(self) -> OutputPort:
-        """Return the port of the norm of the force of the impedance, (1,) [N]."""
-        return self._contact_force_port
-
-    def get_saturation_output_port(self) -> OutputPort:
-        """Return the port of the flag that a component is at its limit, (1,)."""
-        return self._saturation_port
+    get_impedance_wrench_input_port = input_getter("impedance_wrench", "wrench that the impedance applies, (6,)")
+    get_contact_force_output_port = output_getter("contact_force", "norm of the force of the impedance, (1,) [N]")
+    get_saturation_output_port = output_getter("saturation", "flag that a component is at its limit, (1,)")
 
     def _calc_contact_force(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(np.linalg.norm(self._impedance_wrench_port.Eval(context)[:3])))

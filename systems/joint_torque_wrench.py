@@ -3,10 +3,11 @@
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.caching import declare_plant_context
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -72,17 +73,9 @@ class JointTorqueWrench(LeafSystem):
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
-    def get_positions_input_port(self) -> InputPort:
-        """Return the port of the measured joint positions, (n,) [rad]."""
-        return self._positions_port
-
-    def get_external_torque_input_port(self) -> InputPort:
-        """Return the port of the external joint torques, (n,) [Nm]."""
-        return self._external_torque_port
-
-    def get_wrench_output_port(self) -> OutputPort:
-        """Return the port of the filtered wrench of the environment on the tool, (6,), force first."""
-        return self._wrench_port
+    get_positions_input_port = input_getter("positions", "measured joint positions, (n,) [rad]")
+    get_external_torque_input_port = input_getter("external_torque", "external joint torques, (n,) [Nm]")
+    get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
         self._plant.SetPositions(plant_context, self._positions_port.Eval(context))

@@ -8,15 +8,14 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
     InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
 from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -138,9 +137,7 @@ class LcNsKmpSystem(LeafSystem):
         """Raw null-space action per unit of the policy's action, (O,)."""
         return self._by_history_length[self._primitive.history][1].copy()
 
-    def get_null_space_action_input_port(self) -> InputPort:
-        """Return the port of the policy's action in [−1, 1], (O,)."""
-        return self._null_space_action_port
+    get_null_space_action_input_port = input_getter("null_space_action", "policy's action in [−1, 1], (O,)")
 
     def get_history_input_port(self) -> InputPort:
         """Return the port of the last outputs, (P*O,), oldest first.
@@ -162,32 +159,22 @@ class LcNsKmpSystem(LeafSystem):
             raise InputError("this system has one primitive, hence no such port: give it shorter ones")
         return self._history_length_port
 
-    def get_command_output_port(self) -> OutputPort:
-        """Return the port of the command, (O,)."""
-        return self._command_port
+    get_command_output_port = output_getter("command", "command, (O,)")
+    get_constraint_violation_output_port = output_getter("constraint_violation", "violation of the command, (1,)")
+    get_fallback_output_port = output_getter("fallback", "flag that the command is a fallback, (1,)")
 
-    def get_constraint_violation_output_port(self) -> OutputPort:
-        """Return the port of the violation max(c − G y) of the command, (1,)."""
-        return self._constraint_violation_port
-
-    def get_fallback_output_port(self) -> OutputPort:
-        """Return the port of the flag that the command is a fallback, (1,)."""
-        return self._fallback_port
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._period)
         discrete_state.set_value(self._step, [step])
         if step == 0:  # an initialization at a later time keeps the last command for fallbacks
             discrete_state.set_value(self._last_command, self._initial_command)
-        return EventStatus.Succeeded()
 
-    def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._period)
         if step > 0:
             prediction = self._prediction.Eval(context)
             discrete_state.set_value(self._last_command, prediction.output)
         discrete_state.set_value(self._step, [step])
-        return EventStatus.Succeeded()
 
     def _predict(self, context: Context) -> _Prediction:
         step = int(context.get_discrete_state(self._step).value()[0])

@@ -1,9 +1,10 @@
 """Mean contact force of a control step."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import declare_sample
 
 
@@ -53,17 +54,9 @@ class MeanForce(LeafSystem):
             "magnitude", 1, self._calc_magnitude, prerequisites_of_calc=prerequisites
         )
 
-    def get_force_sum_input_port(self) -> InputPort:
-        """Return the port of the sum of the forces of all plant steps so far, (D,) [N]."""
-        return self._force_sum_port
-
-    def get_force_output_port(self) -> OutputPort:
-        """Return the port of the mean force of the control step, (D,) [N]."""
-        return self._force_port
-
-    def get_magnitude_output_port(self) -> OutputPort:
-        """Return the port of the norm of the mean force, (1,) [N]."""
-        return self._magnitude_port
+    get_force_sum_input_port = input_getter("force_sum", "sum of the forces of all plant steps so far, (D,) [N]")
+    get_force_output_port = output_getter("force", "mean force of the control step, (D,) [N]")
+    get_magnitude_output_port = output_getter("magnitude", "norm of the mean force, (1,) [N]")
 
     def _mean(self, context: Context) -> np.ndarray:
         return (self._force_sum_port.Eval(context) - context.get_discrete_state(self._last_sum).value()) * self._scale

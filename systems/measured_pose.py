@@ -3,9 +3,10 @@
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.poses import transform_to_pose
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class MeasuredPose(LeafSystem):
@@ -42,13 +43,8 @@ class MeasuredPose(LeafSystem):
             "pose", 6, self._calc_pose, prerequisites_of_calc={self._body_poses_port.ticket()}
         )
 
-    def get_body_poses_input_port(self) -> InputPort:
-        """Return the port of the plant's body poses."""
-        return self._body_poses_port
-
-    def get_pose_output_port(self) -> OutputPort:
-        """Return the port of the pose X_TP, (6,)."""
-        return self._pose_port
+    get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
+    get_pose_output_port = output_getter("pose", "pose X_TP, (6,)")
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(transform_to_pose(self._X_TW @ self._body_poses_port.Eval(context)[self._body]))

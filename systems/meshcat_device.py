@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import output_getter
 from guiderail.systems.support.sampling import check_period
 
 DEAD_ZONE = 0.1
@@ -53,9 +54,7 @@ class MeshcatDevice(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._sample)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
-    def get_action_output_port(self) -> OutputPort:
-        """Return the port of the operator's input, (n,), in [−1, 1]."""
-        return self._action_port
+    get_action_output_port = output_getter("action", "operator's input, (n,), in [−1, 1]")
 
     def read(self) -> np.ndarray:
         """Return the operator's present input, (n,), in [−1, 1]."""
@@ -66,6 +65,5 @@ class MeshcatDevice(LeafSystem):
             values.append(sign * stick if abs(stick) > DEAD_ZONE else self._meshcat.GetSliderValue(slider))
         return np.clip(values, -1.0, 1.0)
 
-    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self.read())
-        return EventStatus.Succeeded()

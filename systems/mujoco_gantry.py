@@ -15,14 +15,13 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
     OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, pose_to_transform
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 if TYPE_CHECKING:
@@ -181,33 +180,13 @@ class MujocoGantry(LeafSystem):
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the desired pose of the tool centre, (6,)."""
-        return self._desired_pose_port
-
-    def get_nominal_body_poses_input_port(self) -> InputPort:
-        """Return the port of the body poses of the static plant."""
-        return self._nominal_body_poses_port
-
-    def get_pose_output_port(self) -> OutputPort:
-        """Return the port of the pose of the tool centre, (6,)."""
-        return self._pose_port
-
-    def get_wrench_output_port(self) -> OutputPort:
-        """Return the port of the filtered wrench of the environment on the tool, (6,), force first."""
-        return self._wrench_port
-
-    def get_impedance_wrench_output_port(self) -> OutputPort:
-        """Return the port of forces and torques of the six motors, (6,)."""
-        return self._impedance_wrench_port
-
-    def get_body_poses_output_port(self) -> OutputPort:
-        """Return the port of the poses of all bodies of the plant, including the simulated ones."""
-        return self._body_poses_port
-
-    def get_geometry_poses_output_port(self) -> OutputPort:
-        """Return the port of the poses of all frames with geometry, for a scene graph."""
-        return self._geometry_poses_port
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_nominal_body_poses_input_port = input_getter("nominal_body_poses", "body poses of the static plant")
+    get_pose_output_port = output_getter("pose", "pose of the tool centre, (6,)")
+    get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
+    get_impedance_wrench_output_port = output_getter("impedance_wrench", "forces and torques of the six motors, (6,)")
+    get_body_poses_output_port = output_getter("body_poses", "poses of all bodies of the plant")
+    get_geometry_poses_output_port = output_getter("geometry_poses", "poses of all frames with geometry")
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the tool at rest at `pose`, (6,); `context` is this system's."""
@@ -238,7 +217,7 @@ class MujocoGantry(LeafSystem):
     def _values(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._state).value()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         model, data = self.model, self._data
         state = self._values(context)
         self._place(self._nominal_body_poses_port.Eval(context))
@@ -260,7 +239,6 @@ class MujocoGantry(LeafSystem):
         if not np.isfinite(following).all():
             raise DivergedError("the simulation failed in MuJoCo: its state is not finite")
         discrete_state.set_value(self._state, following)
-        return EventStatus.Succeeded()
 
     def _check_warnings(self) -> None:
         numbers = self._data.warning.number[self._failures]

@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem, OutputPort, State
+from pydrake.systems.framework import Context, LeafSystem, State
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -71,15 +72,10 @@ class PolicySystem(LeafSystem):
         self._action_port = self.DeclareStateOutputPort("action", self._action)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
-    def get_observation_input_port(self) -> InputPort:
-        """Return the port of the observation, (N,) or an image."""
-        return self._observation_port
+    get_observation_input_port = input_getter("observation", "observation, (N,) or an image")
+    get_action_output_port = output_getter("action", "last action, (A,), in [−1, 1]")
 
-    def get_action_output_port(self) -> OutputPort:
-        """Return the port of the last action, (A,), in [−1, 1]."""
-        return self._action_port
-
-    def _update(self, context: Context, state: State) -> EventStatus:
+    def _update(self, context: Context, state: State) -> None:
         """Set the action.
 
         Raises:
@@ -94,7 +90,6 @@ class PolicySystem(LeafSystem):
         if action.shape != (size,) or not np.isfinite(action).all():
             raise PolicyError(f"the policy returned {action}, not {size} finite numbers: the robot must stop")
         state.get_mutable_discrete_state().set_value(self._action, np.clip(action, -1.0, 1.0))
-        return EventStatus.Succeeded()
 
     def _observe(self, context: Context) -> np.ndarray:
         observation = self._observation_port.Eval(context)

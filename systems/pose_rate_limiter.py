@@ -5,13 +5,11 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -71,21 +69,10 @@ class PoseRateLimiter(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the commanded pose, (6,)."""
-        return self._desired_pose_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (6,)."""
-        return self._pose_port
-
-    def get_blend_factor_input_port(self) -> InputPort:
-        """Return the port of the blend factor, (1,); 0 while the arm is not controlled."""
-        return self._blend_factor_port
-
-    def get_limited_pose_output_port(self) -> OutputPort:
-        """Return the port of the rate-limited pose, (6,)."""
-        return self._limited_pose_port
+    get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (6,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (6,)")
+    get_blend_factor_input_port = input_getter("blend_factor", "blend factor, (1,); 0 while the arm is not controlled")
+    get_limited_pose_output_port = output_getter("limited_pose", "rate-limited pose, (6,)")
 
     def _eval_limited_pose(self, context: Context) -> np.ndarray:
         if self._blend_factor_port.Eval(context)[0] <= 0.0:
@@ -107,10 +94,8 @@ class PoseRateLimiter(LeafSystem):
     def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._eval_limited_pose(context))
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._pose_port.Eval(context))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._eval_limited_pose(context))
-        return EventStatus.Succeeded()

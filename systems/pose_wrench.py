@@ -1,8 +1,9 @@
 """Wrench on a tool from the generalized forces along its pose coordinates."""
 
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class PoseWrench(LeafSystem):
@@ -35,17 +36,9 @@ class PoseWrench(LeafSystem):
             "wrench", WRENCH_SIZE, self._calc_wrench, prerequisites_of_calc=inputs
         )
 
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the pose X_TP, (6,)."""
-        return self._pose_port
-
-    def get_generalized_force_input_port(self) -> InputPort:
-        """Return the port of the generalized forces along and about the pose coordinates, (6,)."""
-        return self._generalized_force_port
-
-    def get_wrench_output_port(self) -> OutputPort:
-        """Return the port of the wrench at P in the axes of T, (6,), force first."""
-        return self._wrench_port
+    get_pose_input_port = input_getter("pose", "pose X_TP, (6,)")
+    get_generalized_force_input_port = input_getter("generalized_force", "generalized forces, (6,) [N, Nm]")
+    get_wrench_output_port = output_getter("wrench", "wrench at P in the axes of T, (6,), force first")
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         pose, force = self._pose_port.Eval(context), self._generalized_force_port.Eval(context)

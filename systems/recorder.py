@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import output_getter
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.signal_ports import SignalPorts
 
@@ -78,9 +79,7 @@ class Recorder(LeafSystem):
         """
         return self._signals.port(name)
 
-    def get_num_recorded_output_port(self) -> OutputPort:
-        """Return the port of the number of samples so far, (1,)."""
-        return self._num_recorded_port
+    get_num_recorded_output_port = output_getter("num_recorded", "number of samples so far, (1,)")
 
     def recording(self, context: Context) -> Recording:
         """Return a copy of the samples so far; `context` is this system's."""

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class RelativePoses(LeafSystem):
@@ -53,13 +54,8 @@ class RelativePoses(LeafSystem):
             prerequisites_of_calc={self._body_poses_port.ticket()},
         )
 
-    def get_body_poses_input_port(self) -> InputPort:
-        """Return the port of the plant's body poses."""
-        return self._body_poses_port
-
-    def get_relative_poses_output_port(self) -> OutputPort:
-        """Return the port of position and rotation vector of each body, (6·n,)."""
-        return self._relative_poses_port
+    get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
+    get_relative_poses_output_port = output_getter("relative_poses", "poses relative to the reference, (6·n,)")
 
     def _calc_relative_poses(self, context: Context, output: BasicVector) -> None:
         poses = self._body_poses_port.Eval(context)

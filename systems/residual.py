@@ -1,9 +1,10 @@
 """Sum of a reference and a residual, for residual learning."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class Residual(LeafSystem):
@@ -46,17 +47,9 @@ class Residual(LeafSystem):
             prerequisites_of_calc={self._reference_port.ticket(), self._action_port.ticket()},
         )
 
-    def get_reference_input_port(self) -> InputPort:
-        """Return the port of the reference, (O,)."""
-        return self._reference_port
-
-    def get_action_input_port(self) -> InputPort:
-        """Return the port of the policy's action, (O,)."""
-        return self._action_port
-
-    def get_desired_pose_output_port(self) -> OutputPort:
-        """Return the port of the desired pose, (O,)."""
-        return self._desired_pose_port
+    get_reference_input_port = input_getter("reference", "reference, (O,)")
+    get_action_input_port = input_getter("action", "policy's action, (O,)")
+    get_desired_pose_output_port = output_getter("desired_pose", "desired pose, (O,)")
 
     def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._reference_port.Eval(context) + self._gain * self._action_port.Eval(context))

@@ -9,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSyste
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.ports import output_getter
 from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
 
@@ -94,9 +95,7 @@ class RewardSystem(LeafSystem):
         """
         return self._signals.port(name)
 
-    def get_reward_output_port(self) -> OutputPort:
-        """Return the port of the sum of all terms, (1,)."""
-        return self._reward_port
+    get_reward_output_port = output_getter("reward", "sum of all terms, (1,)")
 
     def get_term_output_port(self, name: str) -> OutputPort:
         """Return the port of the term `name`, (1,).

@@ -1,10 +1,11 @@
 """Safety filter that projects commanded positions out of keep-out boxes."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import declare_sample
 
 
@@ -59,21 +60,10 @@ class SafetyFilter(LeafSystem):
             "intervention", 1, self._calc_intervention, prerequisites_of_calc=projection
         )
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the desired pose, (O,)."""
-        return self._desired_pose_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (O,)."""
-        return self._pose_port
-
-    def get_safe_pose_output_port(self) -> OutputPort:
-        """Return the port of the projected pose, (O,)."""
-        return self._safe_pose_port
-
-    def get_intervention_output_port(self) -> OutputPort:
-        """Return the port of the flag that a box changed the command, (1,)."""
-        return self._intervention_port
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,)")
+    get_safe_pose_output_port = output_getter("safe_pose", "projected pose, (O,)")
+    get_intervention_output_port = output_getter("intervention", "flag that a box changed the command, (1,)")
 
     def _calc_projection(self, context: Context) -> np.ndarray:
         """Return the safe pose and the intervention flag, (O + 1,)."""

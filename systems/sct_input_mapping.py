@@ -4,10 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.template_frames import TemplateFrames
 
@@ -68,21 +69,10 @@ class SctInputMapping(LeafSystem):
             },
         )
 
-    def get_action_input_port(self) -> InputPort:
-        """Return the port of the inputs u of a policy or a user, (n,), in [−1, 1]."""
-        return self._action_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the pose H to displace, (6,)."""
-        return self._pose_port
-
-    def get_state_input_port(self) -> InputPort:
-        """Return the port of the number of the template's state, (1,)."""
-        return self._state_port
-
-    def get_requested_pose_output_port(self) -> OutputPort:
-        """Return the port of the requested pose H^im, (6,), not constrained."""
-        return self._requested_pose_port
+    get_action_input_port = input_getter("action", "inputs u of a policy or a user, (n,), in [−1, 1]")
+    get_pose_input_port = input_getter("pose", "pose H to displace, (6,)")
+    get_state_input_port = input_getter("state", "number of the template's state, (1,)")
+    get_requested_pose_output_port = output_getter("requested_pose", "requested pose H^im, (6,), not constrained")
 
     def _calc_requested_pose(self, context: Context, output: BasicVector) -> None:
         action = self._action_port.Eval(context)

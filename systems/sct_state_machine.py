@@ -7,14 +7,12 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.template_frames import TemplateFrames
 
@@ -77,25 +75,11 @@ class SctStateMachine(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the pose at which transition distances are evaluated, (6,)."""
-        return self._pose_port
-
-    def get_initial_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (6,), which determines the first state of an episode."""
-        return self._initial_pose_port
-
-    def get_state_output_port(self) -> OutputPort:
-        """Return the port of the number of the template's state, (1,)."""
-        return self._state_port
-
-    def get_transition_distance_output_port(self) -> OutputPort:
-        """Return the port of the current state's transition distance d_t, (1,) [m] or [rad]."""
-        return self._transition_distance_port
-
-    def get_progress_output_port(self) -> OutputPort:
-        """Return the port of the progress in the task, (1,)."""
-        return self._progress_port
+    get_pose_input_port = input_getter("pose", "pose at which transition distances are evaluated, (6,)")
+    get_initial_pose_input_port = input_getter("initial_pose", "pose that determines the first state, (6,)")
+    get_state_output_port = output_getter("state", "number of the template's state, (1,)")
+    get_transition_distance_output_port = output_getter("transition_distance", "distance d_t, (1,) [m or rad]")
+    get_progress_output_port = output_getter("progress", "progress in the task, (1,)")
 
     def _state_pose_frames(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
         state = int(context.get_discrete_state(self._state).value()[0])
@@ -107,14 +91,12 @@ class SctStateMachine(LeafSystem):
     def _calc_progress(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._template.progress(*self._state_pose_frames(context)))
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
         discrete_state.set_value([float(self._template.state_at(X_WE, self.frames.eval(context)))])
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # No step has ended at time zero. An event offset of one period would not fall on k * period exactly.
         if context.get_time() > 0:
             state = self._template.next_state(*self._state_pose_frames(context), self._period)
             discrete_state.set_value([float(state)])
-        return EventStatus.Succeeded()

@@ -5,13 +5,11 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -78,28 +76,22 @@ class SensorDisturbance(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_measurement_input_port(self) -> InputPort:
-        """Return the port of the undisturbed measurement, (n,)."""
-        return self._measurement_port
-
-    def get_disturbed_measurement_output_port(self) -> OutputPort:
-        """Return the port of the disturbed measurement, (n,)."""
-        return self._disturbed_measurement_port
+    get_measurement_input_port = input_getter("measurement", "undisturbed measurement, (n,)")
+    get_disturbed_measurement_output_port = output_getter("disturbed_measurement", "disturbed measurement, (n,)")
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
         """Set s and b, (n,) each, and the seed of the noise; `context` is this system's."""
         for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         size = len(self._noise)
         discrete_state.set_value(self._count, np.zeros(1))
         discrete_state.set_value(self._noise_sample, np.zeros(size))
         if self._delay_line is not None:
             discrete_state.set_value(self._delay_line, np.zeros(self._delay * size))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value() + 1.0
         discrete_state.set_value(self._count, count)
         if self._noise.any():
@@ -110,7 +102,6 @@ class SensorDisturbance(LeafSystem):
             line = context.get_discrete_state(self._delay_line).value()
             newest = self._measurement_port.Eval(context)
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(newest) :], newest]))
-        return EventStatus.Succeeded()
 
     def _calc_disturbed_measurement(self, context: Context, output: BasicVector) -> None:
         if self._delay_line is None:

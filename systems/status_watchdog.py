@@ -8,14 +8,12 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 # Indices into the state, all times in s: local time of the next check, last value of the clock input; time stamp, clock
@@ -142,33 +140,13 @@ class StatusWatchdog(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_status_input_port(self) -> InputPort:
-        """Return the port of the newest `JointStatus`; any other object counts as none."""
-        return self._status_port
-
-    def get_clock_input_port(self) -> InputPort:
-        """Return the port of the wall-clock time, (1,) [s]; optional."""
-        return self._clock_port
-
-    def get_estimated_state_output_port(self) -> OutputPort:
-        """Return the port of positions and velocities of the accepted status, (2n,) [rad, rad/s]."""
-        return self._estimated_state_port
-
-    def get_external_torque_output_port(self) -> OutputPort:
-        """Return the port of the external torques of the accepted status, (n,) [Nm]."""
-        return self._external_torque_port
-
-    def get_fault_output_port(self) -> OutputPort:
-        """Return the port of the present or recent fault, (1,), a code of `Fault`."""
-        return self._fault_port
-
-    def get_age_output_port(self) -> OutputPort:
-        """Return the port of the age of the accepted status, (1,) [s]."""
-        return self._age_port
-
-    def get_is_new_output_port(self) -> OutputPort:
-        """Return the port of the flag that a status is accepted at this check, (1,)."""
-        return self._is_new_port
+    get_status_input_port = input_getter("status", "newest `JointStatus`; any other object counts as none")
+    get_clock_input_port = input_getter("clock", "wall-clock time, (1,) [s]; optional")
+    get_estimated_state_output_port = output_getter("estimated_state", "accepted joint state, (2n,) [rad, rad/s]")
+    get_external_torque_output_port = output_getter("external_torque", "accepted external torques, (n,) [Nm]")
+    get_fault_output_port = output_getter("fault", "present or recent fault, (1,), a code of `Fault`")
+    get_age_output_port = output_getter("age", "age of the accepted status, (1,) [s]")
+    get_is_new_output_port = output_getter("is_new", "flag that a status is accepted at this check, (1,)")
 
     def _state_of(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._state).value()
@@ -214,13 +192,12 @@ class StatusWatchdog(LeafSystem):
         is_fresh = status.time > accepted.time and now - (status.time + accepted.offset) <= max_age
         return is_fresh and check_status(status, accepted, now, self._limits) == Fault.NONE
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._state, INITIAL_STATE)
         for group in (self._last_values, self._accepted):
             discrete_state.set_value(group, np.zeros(3 * self._num_joints))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         evaluation, state = self._evaluation.Eval(context), self._state_of(context).copy()
         now = self._now(context)
         if evaluation.is_new:
@@ -243,7 +220,6 @@ class StatusWatchdog(LeafSystem):
         elif state[_CHECK_TIME] - state[_DOUBT_TIME] > self._limits.settling_time:
             state[_DOUBT_TIME] = np.nan
         discrete_state.set_value(self._state, state)
-        return EventStatus.Succeeded()
 
     def _next_offset(self, measured: float, evaluation: _Evaluation, state: np.ndarray, now: float) -> float:
         """Return the clock offset [s] after a status with the measured offset `measured`."""

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.ports import input_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -42,15 +43,9 @@ class TorquePublisher(LeafSystem):
         self._is_sending_port = self.DeclareVectorInputPort("is_sending", 1)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
-    def get_torque_input_port(self) -> InputPort:
-        """Return the port of the torques, (n,) [Nm]."""
-        return self._torque_port
+    get_torque_input_port = input_getter("torque", "torques, (n,) [Nm]")
+    get_is_sending_input_port = input_getter("is_sending", "enable flag, (1,); no message is sent while it is 0")
 
-    def get_is_sending_input_port(self) -> InputPort:
-        """Return the port of the enable flag, (1,); no message is sent while it is 0."""
-        return self._is_sending_port
-
-    def _publish(self, context: Context) -> EventStatus:
+    def _publish(self, context: Context) -> None:
         if self._is_sending_port.Eval(context)[0] > 0.0:
             self._write(self._torque_port.Eval(context), context.get_time())
-        return EventStatus.Succeeded()

@@ -9,15 +9,13 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault, damping_torque
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 # Indices into the discrete state.
@@ -214,69 +212,22 @@ class TorqueSafetyLimiter(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_torque_input_port(self) -> InputPort:
-        """Return the port of the commanded torques, (n,) [Nm]."""
-        return self._torque_port
-
-    def get_estimated_state_input_port(self) -> InputPort:
-        """Return the port of joint positions and velocities, (2n,) [rad, rad/s]."""
-        return self._estimated_state_port
-
-    def get_external_torque_input_port(self) -> InputPort:
-        """Return the port of the external joint torques, (n,) [Nm]."""
-        return self._external_torque_port
-
-    def get_wrench_input_port(self) -> InputPort:
-        """Return the port of the wrench of the environment on the tool, (6,), force first."""
-        return self._wrench_port
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the pose of the tool centre, (6,)."""
-        return self._pose_port
-
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the desired pose of the tool centre, (6,)."""
-        return self._desired_pose_port
-
-    def get_status_fault_input_port(self) -> InputPort:
-        """Return the port of the status fault, (1,), a code of `Fault`."""
-        return self._status_fault_port
-
-    def get_status_age_input_port(self) -> InputPort:
-        """Return the port of the age of the status, (1,) [s]."""
-        return self._status_age_port
-
-    def get_status_is_new_input_port(self) -> InputPort:
-        """Return the port of the flag that a new status has been accepted, (1,)."""
-        return self._status_is_new_port
-
-    def get_command_timed_out_input_port(self) -> InputPort:
-        """Return the port of the flag that no valid command is available, (1,)."""
-        return self._command_timed_out_port
-
-    def get_safe_torque_output_port(self) -> OutputPort:
-        """Return the port of the limited torques, (n,) [Nm]."""
-        return self._safe_torque_port
-
-    def get_fault_output_port(self) -> OutputPort:
-        """Return the port of the fault, (1,), a code of `Fault`."""
-        return self._fault_port
-
-    def get_arm_state_output_port(self) -> OutputPort:
-        """Return the port of the arm state, (1,), a value of `ArmState`."""
-        return self._arm_state_port
-
-    def get_blend_factor_output_port(self) -> OutputPort:
-        """Return the port of the blend factor, (1,), from 0 to 1."""
-        return self._blend_factor_port
-
-    def get_is_sending_output_port(self) -> OutputPort:
-        """Return the port of the flag that commands are sent, (1,)."""
-        return self._is_sending_port
-
-    def get_not_following_output_port(self) -> OutputPort:
-        """Return the port of the flag that the desired pose is not followed, (1,)."""
-        return self._not_following_port
+    get_torque_input_port = input_getter("torque", "commanded torques, (n,) [Nm]")
+    get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
+    get_external_torque_input_port = input_getter("external_torque", "external joint torques, (n,) [Nm]")
+    get_wrench_input_port = input_getter("wrench", "wrench of the environment on the tool, (6,), force first")
+    get_pose_input_port = input_getter("pose", "pose of the tool centre, (6,)")
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
+    get_status_age_input_port = input_getter("status_age", "age of the status, (1,) [s]")
+    get_status_is_new_input_port = input_getter("status_is_new", "flag that a new status has been accepted, (1,)")
+    get_command_timed_out_input_port = input_getter("command_timed_out", "flag that no command is valid, (1,)")
+    get_safe_torque_output_port = output_getter("safe_torque", "limited torques, (n,) [Nm]")
+    get_fault_output_port = output_getter("fault", "fault, (1,), a code of `Fault`")
+    get_arm_state_output_port = output_getter("arm_state", "arm state, (1,), a value of `ArmState`")
+    get_blend_factor_output_port = output_getter("blend_factor", "blend factor, (1,), from 0 to 1")
+    get_is_sending_output_port = output_getter("is_sending", "flag that commands are sent, (1,)")
+    get_not_following_output_port = output_getter("not_following", "flag that the desired pose is not followed, (1,)")
 
     def stop(self, context: Context) -> None:
         """Stop the arm with the fault `Fault.USER_STOP`; `context` is this system's."""
@@ -336,12 +287,11 @@ class TorqueSafetyLimiter(LeafSystem):
             return Fault.TORQUE_NOT_FINITE
         return Fault.NONE
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._state, [ArmState.WAITING, Fault.NONE, 0.0, 0.0])
         discrete_state.set_value(self._impulse, np.zeros(self._num_joints))
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         arm_state, fault, state_time, blend_factor = self._state_of(context)
         state_time += self._period
         present_fault = self._present_fault.Eval(context)
@@ -366,7 +316,6 @@ class TorqueSafetyLimiter(LeafSystem):
         ):
             arm_state, state_time = ArmState.OFF, 0.0
         discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor])
-        return EventStatus.Succeeded()
 
     def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
         arm_state, _, state_time, blend_factor = self._state_of(context)

@@ -10,14 +10,12 @@ from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
     DiscreteValues,
-    EventStatus,
-    InputPort,
     LeafSystem,
-    OutputPort,
 )
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import external_wrench
+from guiderail.systems.support.ports import input_getter, output_getter
 from guiderail.systems.support.sampling import check_period
 
 
@@ -111,31 +109,16 @@ class WrenchSensor(LeafSystem):
         builder.Connect(plant.get_body_spatial_velocities_output_port(), self._body_spatial_velocities_port)
         builder.Connect(plant.get_body_spatial_accelerations_output_port(), self._body_spatial_accelerations_port)
 
-    def get_reaction_forces_input_port(self) -> InputPort:
-        """Return the port of the plant's joint reaction forces."""
-        return self._reaction_forces_port
+    get_reaction_forces_input_port = input_getter("reaction_forces", "plant's joint reaction forces")
+    get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
+    get_body_spatial_velocities_input_port = input_getter("body_spatial_velocities", "plant's body velocities")
+    get_body_spatial_accelerations_input_port = input_getter("body_spatial_accelerations", "plant's body accelerations")
+    get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
 
-    def get_body_poses_input_port(self) -> InputPort:
-        """Return the port of the plant's body poses."""
-        return self._body_poses_port
-
-    def get_body_spatial_velocities_input_port(self) -> InputPort:
-        """Return the port of the plant's body velocities."""
-        return self._body_spatial_velocities_port
-
-    def get_body_spatial_accelerations_input_port(self) -> InputPort:
-        """Return the port of the plant's body accelerations."""
-        return self._body_spatial_accelerations_port
-
-    def get_wrench_output_port(self) -> OutputPort:
-        """Return the port of the filtered wrench of the environment on the tool, (6,), force first."""
-        return self._wrench_port
-
-    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         newest = self._measure(context)
         last = context.get_discrete_state(self._state).value()
         discrete_state.set_value(newest + self._decay * (last - newest))
-        return EventStatus.Succeeded()
 
     def _measure(self, context: Context) -> np.ndarray:
         F_reaction = self._wrist_to_tool @ self._reaction_forces_port.Eval(context)[self._wrist].get_coeffs()

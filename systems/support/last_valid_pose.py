@@ -8,7 +8,6 @@ from pydrake.systems.framework import (
     Context,
     DependencyTicket,
     DiscreteValues,
-    EventStatus,
     InputPort,
     LeafSystem,
 )
@@ -114,14 +113,12 @@ class LastValidPose:
     def _is_valid(self, context: Context) -> bool:
         return self._validity.is_valid(context, float(context.get_discrete_state(self._check_time).value()[0]))
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._last_pose, self._measured_pose(context))
         discrete_state.set_value(self._check_time, [context.get_time()])
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # Validity at the last check: the pose followed until now is stored, even if it becomes stale now.
         if self._is_valid(context):
             discrete_state.set_value(self._last_pose, self._desired_pose.Eval(context))
         discrete_state.set_value(self._check_time, [context.get_time()])
-        return EventStatus.Succeeded()

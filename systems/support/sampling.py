@@ -1,7 +1,7 @@
 """Check of periods, and inputs sampled once per control period."""
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, EventStatus, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
 
@@ -33,9 +33,8 @@ def declare_sample(system: LeafSystem, port: InputPort, period: float) -> Discre
     check_period(period)
     state = system.DeclareDiscreteState(port.size())
 
-    def sample(context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def sample(context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(state, port.Eval(context))
-        return EventStatus.Succeeded()
 
     system.DeclareInitializationDiscreteUpdateEvent(sample)
     system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, sample)
