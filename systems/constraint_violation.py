@@ -1,11 +1,6 @@
 """Constraint violation of a pose."""
 
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.support.ports import input_getter, output_getter

@@ -11,13 +11,7 @@ from pydrake.geometry import FramePoseVector
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-    OutputPort,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, pose_to_transform

@@ -1,12 +1,7 @@
 """Rate limiter of a desired pose."""
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.ports import input_getter, output_getter

@@ -3,12 +3,7 @@
 from collections.abc import Mapping
 
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate

@@ -1,12 +1,7 @@
 """Sensor with scale error, bias, noise and delay."""
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.ports import input_getter, output_getter

@@ -4,12 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.systems.support.caching import declare_cache

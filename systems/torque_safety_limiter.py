@@ -5,12 +5,7 @@ from enum import IntEnum
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault, damping_torque

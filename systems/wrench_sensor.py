@@ -6,12 +6,7 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.math import SpatialAcceleration, SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, Joint, RigidBody
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import external_wrench

@@ -3,14 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DependencyTicket,
-    DiscreteValues,
-    InputPort,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
