@@ -133,7 +133,8 @@ class MujocoGantry(LeafSystem):
         self._X_WT, self._X_TW = X_WT, X_WT.inverse()
         self._fixture, self._workpiece = (model.body(name).id for name in ("fixture", "workpiece"))
         self._moved = MovedBodies(*(int(body.index()) for body in moved))
-        self._frames = _geometry_frames(plant)
+        frames = [(i, plant.GetBodyFrameIdIfExists(BodyIndex(i))) for i in range(1, plant.num_bodies())]
+        self._frames = [(body, frame) for body, frame in frames if frame is not None]  # of bodies with geometry
         size = self._mujoco.mj_stateSize(model, self._parts)
         self._physics = slice(0, size)
         self._filtered = slice(size, size + 6)
@@ -218,10 +219,9 @@ class MujocoGantry(LeafSystem):
         num_substeps = self._scale_contact(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
+        # At a count of 0 the engine would write a log file to the working directory.
         for warning in self._failures:
-            data.warning[
-                warning
-            ].number = 1  # at a count of 0 the engine would write a log file to the working directory
+            data.warning[warning].number = 1
         filtered = state[self._filtered]
         decay = np.exp(-model.opt.timestep / self._time_constant) if self._time_constant > 0.0 else 0.0
         for _ in range(num_substeps * self._num_steps):
@@ -288,9 +288,3 @@ class MujocoGantry(LeafSystem):
         for body, frame in self._frames:
             vector.set_value(frame, poses[body])
         output.set_value(vector)
-
-
-def _geometry_frames(plant: MultibodyPlant) -> list[tuple[int, object]]:
-    """Return the bodies with geometry, except the world, and their geometry frames."""
-    frames = [(i, plant.GetBodyFrameIdIfExists(BodyIndex(i))) for i in range(1, plant.num_bodies())]
-    return [(body, frame) for body, frame in frames if frame is not None]

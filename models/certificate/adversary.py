@@ -5,8 +5,6 @@ third are full deflections that change sign at random. A third are variations of
 kept if they are worse.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -19,8 +19,6 @@ are certified:
   is assumed and not proven.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

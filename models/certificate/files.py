@@ -1,7 +1,5 @@
 """Files of a certificate: the primitive, its constraints, the certified bounds, and the data that prove them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

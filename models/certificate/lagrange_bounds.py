@@ -6,8 +6,6 @@ adding the multiplier times the margin of its constraint gives another valid bou
 are feasible points of the dual of a linear program, which is not solved. Good ones are found by a greedy search.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

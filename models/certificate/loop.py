@@ -1,7 +1,5 @@
 """Primitive in its feedback loop, the subject of a certificate, and its reachable motions without constraints."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

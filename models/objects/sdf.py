@@ -1,7 +1,5 @@
 """SDF files of objects: collision and visual geometry, and models with one link."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cache

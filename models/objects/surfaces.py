@@ -1,7 +1,5 @@
 """Collision geometry as convex solids, for physics engines that support nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

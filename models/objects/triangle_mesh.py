@@ -1,7 +1,5 @@
 """Triangle meshes for Wavefront OBJ files."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ class TriangleMesh:
     triangles: np.ndarray
 
     @staticmethod
-    def from_quads(quads: np.ndarray) -> TriangleMesh:
+    def from_quads(quads: np.ndarray) -> "TriangleMesh":
         """Return the mesh of counter-clockwise quads (Q, 4, 3), each cut in two; equal corners become one vertex."""
         corners = np.round(np.asarray(quads, dtype=float), 9).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
         vertices, numbers = np.unique(corners, axis=0, return_inverse=True)

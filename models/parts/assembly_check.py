@@ -1,7 +1,5 @@
 """Geometric checks of a plug and its socket: overlap, clearance between walls, and the way to the target."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ clearances of a tenth of a millimetre. The solid is therefore cut along its own 
 moves.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

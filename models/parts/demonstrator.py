@@ -4,8 +4,6 @@ Poses are those of the plug in the target frame, [x y z Rz Ry Rx]. A command lie
 under impedance control the difference is the push.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from guiderail.models.common.poses import POSE_SIZE

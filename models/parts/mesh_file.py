@@ -1,7 +1,5 @@
 """Mesh files of parts: read in metres and checked to be solids, and written with their SDF models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -40,7 +38,7 @@ class Part:
         points = np.concatenate([vertices for vertices, _ in self.bodies])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
-    def transform(self, rotation: np.ndarray, translation: np.ndarray) -> Part:
+    def transform(self, rotation: np.ndarray, translation: np.ndarray) -> "Part":
         """Return the part with every point p at R p + t; rotation (3, 3), translation (3,) [m]."""
         return Part(self.path, tuple((v @ rotation.T + translation, t) for v, t in self.bodies))
 

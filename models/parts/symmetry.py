@@ -4,8 +4,6 @@ Experience can be augmented by a symmetry. On the rim, where only the outlines o
 often have more symmetries than when they are assembled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

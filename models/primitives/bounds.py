@@ -1,7 +1,5 @@
 """Bounds on outputs from demonstrations: the demonstrated range in each phase plus a margin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ the wrong unit pulls everything towards zero. All three increase the error with 
 the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Kernels k(ζ, ζ') of a kernelized movement primitive (thesis, section 2.2.7), and their registry."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.2), with neither KMP (2
 sKGRL (5.1 to 5.3).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import OrderedDict
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Connector tool: a rigid tool that holds a connector's back shell."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """KUKA LBR iiwa 14 R820."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

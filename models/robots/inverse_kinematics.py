@@ -1,7 +1,5 @@
 """Inverse kinematics: joint positions for a tool pose."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.inverse_kinematics import InverseKinematics

@@ -1,7 +1,5 @@
 """Mounting of a robot and its end effector in a plant."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

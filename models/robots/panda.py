@@ -1,7 +1,5 @@
 """Franka Emika Panda."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from guiderail.models.robots.robot import Robot, register_robot

@@ -1,7 +1,5 @@
 """Gripper with two parallel fingers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from guiderail.models.robots.robot import EndEffector, JointDrives, register_end_effector

@@ -5,8 +5,6 @@ A robot is one file of this package and a model file. The Python file constructs
 (end effectors: `guiderail.end_effectors`), a script by calling `register_robot`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Universal Robots UR5e."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -9,8 +9,6 @@ difference of both.
 `python -m research.generate connector-demonstrations` records them again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -13,8 +13,6 @@ detents.
 `python -m guiderail.models.objects.bnc_connector.sdf` writes the SDF and OBJ files in this folder.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,7 +68,7 @@ class BncDimensions:
         """Clearance between barrel and bore on each side."""
         return round(self.bore_radius - self.barrel_radius, 9)
 
-    def with_bore_clearance(self, clearance: float) -> BncDimensions:
+    def with_bore_clearance(self, clearance: float) -> "BncDimensions":
         """Return the connector with a bore of another clearance."""
         return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
 

@@ -1,7 +1,5 @@
 """SDF and OBJ files of the BNC jack and plug."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -8,8 +8,6 @@ the same effect in every direction of the whole search.
 `python -m research.generate connector-search-demonstrations` records them again.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Collision geometry of the BNC connector as convex solids: rings and outlines of slots cut into prisms."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -13,8 +13,6 @@ is a soft pad, thick enough for impacts, that collides only with the table's sla
 `python -m guiderail.models.objects.grid_clamp.sdf` writes the SDF and OBJ files in this folder.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -64,7 +62,7 @@ class GridClampDimensions:
         """Clearance between a peg and its hole on each side."""
         return round(self.hole_radius - self.peg_radius, 9)
 
-    def with_clearance(self, clearance: float) -> GridClampDimensions:
+    def with_clearance(self, clearance: float) -> "GridClampDimensions":
         """Return the same clamp with holes of another clearance."""
         return self if clearance == self.clearance else replace(self, hole_radius=self.peg_radius + clearance)
 

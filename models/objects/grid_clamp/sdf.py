@@ -1,7 +1,5 @@
 """SDF and OBJ files of the grid clamp and its table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Collision geometry of the grid clamp and its table as convex solids: rings of prisms, and a sprung bead."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from guiderail.models.common.units import MM
