@@ -514,8 +514,8 @@ def worlds() -> str:
 
     page = (
         "# Workcells and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns the object that a "
-        "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a workcell of "
-        "another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
+        "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a workcell "
+        "of another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
         "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
     )
     rows = (
@@ -601,8 +601,8 @@ def files() -> str:
     page += _fields(OffPolicyConfig)
     page += (
         "### episodes.csv\n\nBesides these, `reward_…` is the sum of each reward term. `collisions` and "
-        "`collision_steps` are of the signal that `Task.collision` names. An episode that a `TerminationTerm` ends as `collision` counts "
-        "only where that signal is above its limit too.\n\n"
+        "`collision_steps` are of the signal that `Task.collision` names. An episode that a "
+        "`TerminationTerm` ends as `collision` counts only where that signal is above its limit too.\n\n"
     )
     page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
     page += "### Step log\n\n`…_i` are columns for the numbers of a pose or a wrench.\n\n"

@@ -1,9 +1,8 @@
-"""Runs programs in forks of one interpreter, which imported what all of them need once.
+"""Run programs in forks of one interpreter that has imported the common packages.
 
-A line of JSON in, and one out. In: `arguments` as an interpreter takes them after its name (`-c`, code and what
-follows, or a file and what follows), the `folder` to run in, and what of the `environment` is other. Out: `returncode`,
-`stdout` and `stderr`. A fork has what any new process has: its own memory and exit code, and no learner, task or
-environment that another one made.
+Protocol: one line of JSON in, one out. In: `arguments` of an interpreter (`-c`, code and arguments, or a file and
+arguments), the working `folder`, and changes of the `environment`. Out: `returncode`, `stdout` and `stderr`. A fork has
+its own memory and exit code, and nothing that another program registered.
 """
 
 import contextlib
@@ -18,7 +17,7 @@ import traceback
 from multiprocessing import forkserver, resource_tracker, util
 from typing import TextIO
 
-# What takes long, and knows nothing of tasks: others' packages, and none of guiderail's registries.
+# Slow imports of other packages; none of guiderail's registries.
 PRELOADED = (
     "pydrake.all", "torch", "stable_baselines3", "sb3_contrib", "gymnasium", "sklearn.mixture", "scipy.stats",
     "scipy.signal", "pandas", "pyarrow.parquet", "pydantic", "typer", "rich.progress", "jinja2", "safetensors.torch",
@@ -27,39 +26,39 @@ PRELOADED = (
 
 
 class Forks:
-    """Programs in forks of this process as it is now."""
+    """Server that runs programs in forks of this process."""
 
     def __init__(self) -> None:
-        ours, theirs = socket.socketpair()
+        parent_end, child_end = socket.socketpair()
         self._server = os.fork()
         if not self._server:
-            ours.close()  # so that the end of this process is the server's
-            serve(theirs.makefile("r"), theirs.makefile("w"))
+            parent_end.close()  # so that the server ends with this process
+            serve(child_end.makefile("r"), child_end.makefile("w"))
             os._exit(0)
-        theirs.close()
-        self._asked, self._answered = ours.makefile("w"), ours.makefile("r")
-        ours.close()
+        child_end.close()
+        self._requests, self._responses = parent_end.makefile("w"), parent_end.makefile("r")
+        parent_end.close()
 
     def run(self, *arguments: object, folder: object = ".", **environment: str) -> subprocess.CompletedProcess:
-        """As `subprocess.run` of an interpreter with these arguments."""
+        """Run an interpreter with these arguments, as `subprocess.run`."""
         words = [str(argument) for argument in arguments]
-        print(json.dumps({"arguments": words, "folder": str(folder), "environment": environment}), file=self._asked)
-        self._asked.flush()
-        return subprocess.CompletedProcess(words, **json.loads(self._answered.readline()))
+        print(json.dumps({"arguments": words, "folder": str(folder), "environment": environment}), file=self._requests)
+        self._requests.flush()
+        return subprocess.CompletedProcess(words, **json.loads(self._responses.readline()))
 
     def close(self) -> None:
-        """Ends the server."""
-        self._asked.close(), self._answered.close()
+        """Stop the server."""
+        self._requests.close(), self._responses.close()
         os.waitpid(self._server, 0)
 
 
 def begin_forkserver() -> None:
-    """Begins the standard library's server of forks as a fork of this process, where it would be a new interpreter."""
+    """Start the fork server of multiprocessing as a fork of this process instead of as a new interpreter."""
 
     def begin(path: bytes, arguments: list[str], kept: list[int]) -> int:
         if number := os.fork():
             return number
-        # It is to end with its parent, which alone may hold the other end of a pipe for that.
+        # The server ends with its parent, which alone may hold the other end of this pipe.
         pipe = os.fstat(kept[-1])
         for descriptor in set(range(3, 1024)) - set(kept):
             with contextlib.suppress(OSError):
@@ -67,20 +66,20 @@ def begin_forkserver() -> None:
                     os.close(descriptor)
         try:
             exec(arguments[arguments.index("-c") + 1], {})
-        finally:  # it ends by an exception: nobody is left who asks
+        finally:  # the server ends with an exception
             os._exit(0)
 
     resource_tracker.ensure_running()
-    usual, util.spawnv_passfds = util.spawnv_passfds, begin
+    original, util.spawnv_passfds = util.spawnv_passfds, begin
     try:
         forkserver.ensure_running()
     finally:
-        util.spawnv_passfds = usual
+        util.spawnv_passfds = original
 
 
 def child(arguments: list[str], folder: str, environment: dict[str, str], out: int, err: int) -> None:
-    """Becomes the program; never returns."""
-    forkserver._forkserver._forkserver_pid = None  # another process's child
+    """Run the program in this process; never returns."""
+    forkserver._forkserver._forkserver_pid = None  # a child of another process
     os.dup2(out, 1)
     os.dup2(err, 2)
     sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))  # noqa: SIM115
@@ -104,9 +103,9 @@ def child(arguments: list[str], folder: str, environment: dict[str, str], out: i
     os._exit(status)
 
 
-def serve(asked: TextIO, answered: TextIO) -> None:
-    """Serves until nobody asks any more."""
-    for line in asked:
+def serve(requests: TextIO, responses: TextIO) -> None:
+    """Serve requests until the input ends."""
+    for line in requests:
         program = json.loads(line)
         with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
             if (number := os.fork()) == 0:
@@ -114,11 +113,11 @@ def serve(asked: TextIO, answered: TextIO) -> None:
             returncode = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
             out.seek(0), err.seek(0)
             result = {"returncode": returncode, "stdout": out.read(), "stderr": err.read()}
-            print(json.dumps(result), file=answered, flush=True)
+            print(json.dumps(result), file=responses, flush=True)
 
 
 def main() -> None:
-    """Serves who started this interpreter."""
+    """Serve the process that started this interpreter."""
     for name in PRELOADED:
         __import__(name)
     print("ready", flush=True)

@@ -1,9 +1,9 @@
-"""Runs the code of pages as a reader would, from top to bottom, and compares what it prints.
+"""Run the code of pages from top to bottom and compare what it prints.
 
-A fenced block is one step. `python` is run, in one namespace a page; `sh` is a line of the command each; a block whose
-first line is `# file: NAME` is written to that file. A `text` block right after a step is what that step prints, where
-`...` stands for anything. Of a notebook, the cells are run, and only they: what they print is no part of the page. Each
-page has an empty folder of its own. Prints one JSON object: page to what was wrong.
+A fenced block is one step. `python` is run in one namespace per page; each line of `sh` is a command; a block whose
+first line is `# file: NAME` is written to that file. A `text` block after a step is its expected output, in which `...`
+matches anything. Of a notebook only the cells are run, and their output is not compared. Each page has an empty folder.
+Prints one JSON object from page to failure.
 """
 
 import contextlib
@@ -25,13 +25,13 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def steps(page: Path) -> list[tuple[str, str]]:
-    """Language and text of each block of a page, or of each cell of a notebook."""
+    """Return language and text of each block of a page, or of each cell of a notebook."""
     text = page.read_text(encoding="utf-8")
     return (CELL if "\nfile_format: mystnb\n" in text else FENCE).findall(text)
 
 
 def command(line: str) -> None:
-    """What a shell does with a line that begins with guiderail."""
+    """Run a line that begins with guiderail, as a shell does."""
     from guiderail.tools.cli.main import main
 
     words = shlex.split(line)
@@ -45,17 +45,17 @@ def command(line: str) -> None:
 
 
 class Shell:
-    """A fork of this process as it is now, for lines that import what a page imports: here it would be there twice."""
+    """Fork of this process for one step, whose imports must not happen twice in this process."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("fork")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=self._serve, args=(theirs, self._connection), daemon=True)
+        self._connection, child_end = context.Pipe()
+        self._process = context.Process(target=self._serve, args=(child_end, self._connection), daemon=True)
         self._process.start()
-        theirs.close()
+        child_end.close()
 
     def run(self, text: str) -> None:
-        """Once only."""
+        """Run a step in the fork; only once."""
         self._connection.send((os.getcwd(), text))
         out, err, wrong = self._connection.recv()
         print(out, end="")
@@ -64,11 +64,11 @@ class Shell:
             raise RuntimeError(wrong)
 
     @staticmethod
-    def _serve(connection, others) -> None:
-        others.close()  # so that the end of the page is the end of this
+    def _serve(connection, parent_end) -> None:
+        parent_end.close()  # so that this process ends when the page ends
         try:
             folder, text = connection.recv()
-        except EOFError:  # the page ended before
+        except EOFError:  # the page has ended
             return
         os.chdir(folder)
         wrong = None
@@ -82,16 +82,16 @@ class Shell:
 
 
 def run(page: Path, shell: Shell | None) -> str:
-    """What is wrong with a page; nothing where all of it runs and prints what it says."""
+    """Return what fails on a page; an empty text if nothing does."""
     namespace: dict = {"__name__": "page"}
     printed = None
     for language, text in steps(page):
         try:
             if language == "text":
                 if printed is None:
-                    raise ValueError("a text block follows what prints it")
+                    raise ValueError("a text block must follow a step that prints")
                 if not doctest.OutputChecker().check_output(text, printed, FLAGS):
-                    raise ValueError(f"it prints\n{printed}\nand the page says\n{text}")
+                    raise ValueError(f"it prints\n{printed}\nbut the page shows\n{text}")
                 printed = None
                 continue
             with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
@@ -107,7 +107,7 @@ def run(page: Path, shell: Shell | None) -> str:
                         for line in text.splitlines():
                             command(line)
                     else:
-                        raise ValueError(f"nobody runs {language}")
+                        raise ValueError(f"{language} cannot be run")
                 except Exception as error:
                     error.add_note(err.getvalue()[-2000:])
                     raise
@@ -118,17 +118,17 @@ def run(page: Path, shell: Shell | None) -> str:
 
 
 def main(pages: list[Path]) -> None:
-    """Runs pages one after the other."""
-    found = {}
+    """Run pages one after the other."""
+    failures = {}
     shells = [Shell() if "--import" in page.read_text(encoding="utf-8") else None for page in pages]
     for page, shell in zip(pages, shells, strict=True):
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
             sys.path.insert(0, folder)
-            found[page.stem] = run(page, shell)
+            failures[page.stem] = run(page, shell)
             sys.path.remove(folder)
-    print(json.dumps(found))
+    print(json.dumps(failures))
     sys.stdout.flush()
-    os._exit(0)  # threads of what was run end with it
+    os._exit(0)  # ends threads as well
 
 
 if __name__ == "__main__":

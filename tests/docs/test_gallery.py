@@ -1,4 +1,4 @@
-"""The gallery shows what its command makes, small enough for a page, and is not older than the code."""
+"""The animations of the gallery: complete, small and up to date."""
 
 import json
 import re
@@ -9,12 +9,12 @@ import pytest
 from PIL import Image
 
 DOCS = Path(__file__).parents[2] / "docs"
-SHOWN = re.findall(r"\]\(pictures/(\w+)\.webp\)", (DOCS / "gallery.md").read_text(encoding="utf-8"))
+NAMES = re.findall(r"\]\(pictures/(\w+)\.webp\)", (DOCS / "gallery.md").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
 def gallery():
-    """The module that makes it, which is no part of the package."""
+    """Return the module that renders the gallery, which is not part of the package."""
     sys.path.insert(0, str(DOCS))
     try:
         import make_gallery
@@ -23,12 +23,12 @@ def gallery():
     return make_gallery
 
 
-def test_the_page_shows_each_picture_that_the_command_makes_and_no_other(gallery):
-    assert sorted(SHOWN) == sorted(gallery.PICTURES)
+def test_gallery_page_has_every_animation(gallery):
+    assert sorted(NAMES) == sorted(gallery.PICTURES)
 
 
-@pytest.mark.parametrize("name", SHOWN)
-def test_a_picture_is_there_moves_and_is_small(gallery, name):
+@pytest.mark.parametrize("name", NAMES)
+def test_animation_is_small_and_moves(gallery, name):
     path = gallery.FOLDER / f"{name}.webp"
     assert path.is_file(), f"{path} is missing: make gallery"
     assert path.stat().st_size < 250_000
@@ -38,20 +38,20 @@ def test_a_picture_is_there_moves_and_is_small(gallery, name):
     assert first.tobytes() != last.tobytes()
 
 
-def test_all_of_them_together_are_small(gallery):
+def test_animations_together_are_small(gallery):
     assert sum(path.stat().st_size for path in gallery.FOLDER.glob("*.webp")) < 2_500_000
 
 
-def test_what_is_told_of_every_picture_is_there(gallery):
-    told = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
+def test_endings_are_stored_for_every_panel(gallery):
+    endings = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
     for name, (panels, _, _) in gallery.PICTURES.items():
-        assert list(told[name]) == [panel.title for panel in panels()], f"{name} is stale: make gallery"
+        assert list(endings[name]) == [panel.title for panel in panels()], f"{name} is stale: make gallery"
 
 
-def test_pictures_of_the_passage_show_what_the_code_does_today(gallery):
-    told = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
+def test_endings_in_the_passage_are_up_to_date(gallery):
+    endings = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
     name = "passage_constraint"
     panels, size, every = gallery.PICTURES[name]
     for panel in panels():
         gallery.run_panel(panel, size, every)
-        assert panel.ending() == told[name][panel.title], f"{name} is stale: make gallery"
+        assert panel.ending() == endings[name][panel.title], f"{name} is stale: make gallery"

@@ -1,4 +1,4 @@
-"""The pages lead to what there is, and the reference says everything that it is written from."""
+"""Links and tables of contents of the pages, and completeness of the reference."""
 
 import inspect
 import re
@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -15,8 +14,8 @@ LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 
 @pytest.fixture(scope="module")
-def made():
-    """The module that makes the reference, which is no part of the package."""
+def generator():
+    """Return the module that generates the reference, which is not part of the package."""
     sys.path.insert(0, str(DOCS))
     try:
         import make_reference
@@ -26,12 +25,12 @@ def made():
 
 
 @pytest.fixture(scope="module")
-def reference(made):
-    return {name: page() for name, page in made.PAGES.items()}
+def reference(generator):
+    return {name: page() for name, page in generator.PAGES.items()}
 
 
-def test_links_of_pages_lead_somewhere(made):
-    generated = {DOCS / "reference" / f"{name}.md" for name in made.PAGES}
+def test_links_of_pages_have_targets(generator):
+    generated = {DOCS / "reference" / f"{name}.md" for name in generator.PAGES}
     for page in WRITTEN:
         for link in LINK.findall(page.read_text(encoding="utf-8")):
             if "://" not in link:
@@ -46,12 +45,12 @@ def test_every_page_is_in_the_contents():
         assert name == "index" or f"\n{name}\n" in contents, name
 
 
-def test_every_page_of_the_reference_is_shown(made):
+def test_every_reference_page_is_in_a_toctree(generator):
     text = "".join(page.read_text(encoding="utf-8") for page in WRITTEN)
-    assert all(f"reference/{name}\n" in text for name in made.PAGES)
+    assert all(f"reference/{name}\n" in text for name in generator.PAGES)
 
 
-def test_every_system_is_there_with_every_port(reference):
+def test_reference_has_every_system_with_its_ports(reference):
     from pydrake.systems.framework import LeafSystem
 
     from guiderail import systems
@@ -66,7 +65,7 @@ def test_every_system_is_there_with_every_port(reference):
                     assert f"| {found[2]} | `{found[1]}` |" in part, f"{name} lacks {found[1]}"
 
 
-def test_every_command_task_and_kind_is_there(reference):
+def test_reference_has_every_command_task_and_template_kind(reference):
     import typer
 
     from guiderail.diagrams.tasks.registry import TASKS
@@ -88,13 +87,13 @@ def test_every_command_task_and_kind_is_there(reference):
     assert all(f"| `{metric.name}` |" in reference["metrics"] for metric in (*COLUMNS, *statistics_of().values()))
 
 
-def test_every_field_of_a_template_says_what_it_is(reference):
+def test_template_fields_have_descriptions(reference):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| .* \|$", reference["templates"], re.MULTILINE)
     assert len(rows) > 50
     assert not [name for name, _, words in rows if not words.strip()]
 
 
-def test_whatever_a_task_can_declare_and_every_shipped_template_is_there(reference):
+def test_reference_has_task_attributes_and_shipped_templates(reference):
     from guiderail.diagrams.tasks.task import Task
     from guiderail.models import objects
 
@@ -106,14 +105,14 @@ def test_whatever_a_task_can_declare_and_every_shipped_template_is_there(referen
         assert file.read_text(encoding="utf-8").rstrip() in reference["templates"], file.name
 
 
-def test_the_reference_names_no_place_of_this_machine(reference):
+def test_reference_has_no_local_path(reference):
     for name, page in reference.items():
         assert str(ROOT) not in page, name
         assert " at 0x" not in page, name
 
 
-def test_the_limits_of_a_robot_are_those_that_the_page_names():
-    """Its table of limits, where a number of it has one home."""
+def test_robot_page_has_the_limits_of_the_code():
+    """Compare the table of limits with the constants."""
     import numpy as np
     from pydrake.lcm import DrakeLcm
 
@@ -130,7 +129,7 @@ def test_the_limits_of_a_robot_are_those_that_the_page_names():
     limits, status, force = station.limits, station.status_limits, np.array(station.impedance.limits[:3])
     load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture)).max()
     age = f"{status.max_age / MM:.0f} ms"
-    said = {
+    expected = {
         "age of a status": f"{MAX_MISSED_MESSAGES} periods: {age} |",
         "clock of statuses": f"{status.max_lead / MM:.0f} ms behind the last one, or ahead |",
         "jump of a position": f"{status.position_jump} rad ",
@@ -147,13 +146,5 @@ def test_the_limits_of_a_robot_are_those_that_the_page_names():
         "torque that is sent": f"{TORQUE_SHARE:.0%} of that".replace("%", " %"),
         "task's force": f"the task's own, {COLLISION_FORCE:.0f} N",
     }
-    assert [name for name, words in said.items() if words not in rows[name] + " |"] == []
+    assert [name for name, words in expected.items() if words not in rows[name] + " |"] == []
     assert f"up to {100 * load:.0f} % of it" in rows["torque that is sent"]
-
-
-def test_whoever_cites_it_cites_this_version():
-    import guiderail
-
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["version"] == guiderail.__version__
-    assert {"cff-version", "message", "title", "authors"} <= set(citation)

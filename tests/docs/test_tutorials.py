@@ -1,4 +1,4 @@
-"""Every block of every tutorial and every cell of every notebook runs as it stands, and prints what the page says."""
+"""Blocks of tutorials and cells of notebooks: they run and print what the page shows."""
 
 import json
 import re
@@ -12,12 +12,12 @@ PAGES = sorted((DOCS / "tutorials").glob("*.md"))
 NOTEBOOKS = sorted(
     page for page in (*DOCS.glob("*.md"), *DOCS.glob("*/*.md")) if "\nfile_format: mystnb\n" in page.read_text("utf-8")
 )
-SCREENS = 130  # lines: two screens
+MAX_LINES = 130  # two screens
 
 
 @pytest.fixture(scope="module")
-def found(forks):
-    """What is wrong with each page."""
+def failures(forks):
+    """Return the failure of each page, an empty text if there is none."""
     environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
     finished = forks.run(Path(__file__).with_name("run_pages.py"), *PAGES, *NOTEBOOKS, **environment)
     assert finished.returncode == 0, finished.stderr
@@ -25,37 +25,36 @@ def found(forks):
 
 
 @pytest.mark.parametrize("page", PAGES + NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_tutorial_does_what_it_says(page, found):
-    assert not found[page.stem], found[page.stem]
+def test_page_runs_and_prints_what_it_shows(page, failures):
+    assert not failures[page.stem], failures[page.stem]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_a_tutorial_is_short_and_in_the_contents(page):
-    assert len(page.read_text(encoding="utf-8").splitlines()) <= SCREENS
+def test_tutorial_is_short_and_in_the_contents(page):
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
     assert f"tutorials/{page.stem}\n" in (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
 
 
-def test_pages_on_what_a_picture_shows_draw_it_themselves():
+def test_concept_pages_are_notebooks():
     assert {page.stem for page in NOTEBOOKS} >= {"start", "templates", "primitives", "kgrl", "exploration", "safety"}
 
 
-def test_a_cell_that_fails_is_found(forks, tmp_path):
+def test_failing_cell_is_reported(forks, tmp_path):
     page = tmp_path / "wrong.md"
     cells = "```{code-cell} python\n---\ntags: [hide-input]\n---\na = 1\n```\n\n```{code-cell} python\na / 0\n```\n"
-    page.write_text(f"---\nfile_format: mystnb\n---\n\n```sh\nnobody runs this\n```\n\n{cells}", encoding="utf-8")
+    page.write_text(f"---\nfile_format: mystnb\n---\n\n```sh\nnot run\n```\n\n{cells}", encoding="utf-8")
     finished = forks.run(Path(__file__).with_name("run_pages.py"), page)
     assert "ZeroDivisionError" in json.loads(finished.stdout)["wrong"]
 
 
-def test_a_page_that_says_something_else_is_found(forks, tmp_path):
+def test_wrong_output_is_reported(forks, tmp_path):
     page = tmp_path / "wrong.md"
     page.write_text("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", encoding="utf-8")
     finished = forks.run(Path(__file__).with_name("run_pages.py"), page)
     assert "it prints" in json.loads(finished.stdout)["wrong"]
 
 
-def test_prose_is_about_what_there_is():
-    """Files that pages name in code are there."""
+def test_files_named_in_pages_exist():
     for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "concepts").glob("*.md"), *PAGES]:
         for name in re.findall(
             r"`((?:examples|models|diagrams|tests|systems|tools)/[\w./]+)`", page.read_text("utf-8")

@@ -1,6 +1,6 @@
-"""Runs programs one after the other in one process, as importing costs more than most of them: file to what it printed.
+"""Run programs one after the other in one process, because importing takes longer than most of them.
 
-Prints one JSON object: by file, its standard output, and the traceback that ended it where one did.
+Prints one JSON object from file to its standard output and its traceback, if it failed.
 """
 
 import contextlib
@@ -25,5 +25,5 @@ def main() -> None:
     print(json.dumps(found))
 
 
-if __name__ == "__main__":  # an example may begin processes, which import this file
+if __name__ == "__main__":  # processes that an example starts import this file
     main()

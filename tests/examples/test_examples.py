@@ -1,4 +1,4 @@
-"""Every example runs as it stands, is short, and is understood by a type checker without being told any path."""
+"""Examples: they run, are short and pass the type checker."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ LINES = 60
 
 @pytest.fixture(scope="module")
 def found(forks, tmp_path_factory):
-    """What each of them printed, away from the repository."""
+    """Return the output of each example, run in another folder."""
     program = Path(__file__).with_name("run_all.py")
     environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
     finished = forks.run(program, *FILES, folder=tmp_path_factory.mktemp("elsewhere"), **environment)
@@ -23,18 +23,18 @@ def found(forks, tmp_path_factory):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
-def test_an_example_runs_from_anywhere(file, found):
+def test_example_runs_in_another_folder(file, found):
     assert not found[str(file)]["wrong"], found[str(file)]["wrong"]
     assert found[str(file)]["printed"].strip()
     assert len(file.read_text().splitlines()) <= LINES
 
 
-def test_a_type_checker_resolves_them_without_path_settings(tmp_path):
+def test_examples_pass_mypy_without_path_settings(tmp_path):
     configuration = tmp_path / "mypy.ini"
-    # Others' packages are not read, which takes seconds; guiderail is.
-    others = "pydrake.*,numpy.*,scipy.*,pandas.*,pydantic.*,gymnasium.*,matplotlib.*,torch.*"
-    configuration.write_text(f"[mypy]\n[mypy-{others}]\nfollow_imports = skip\nfollow_imports_for_stubs = True\n")
-    # The interpreter's own packages are where it looks: an editable install has to be enough.
+    # Other packages are skipped, because reading them takes seconds.
+    skipped = "pydrake.*,numpy.*,scipy.*,pandas.*,pydantic.*,gymnasium.*,matplotlib.*,torch.*"
+    configuration.write_text(f"[mypy]\n[mypy-{skipped}]\nfollow_imports = skip\nfollow_imports_for_stubs = True\n")
+    # mypy searches the interpreter's packages: an editable install must be enough.
     command = [sys.executable, "-m", "mypy", "--config-file", str(configuration), *map(str, FILES)]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert "import-not-found" not in result.stdout, result.stdout

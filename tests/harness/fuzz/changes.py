@@ -1,4 +1,4 @@
-"""What is changed at random: bytes, characters, and the entries of trees of lists and mappings."""
+"""Random mutations of bytes, texts, and trees of lists and mappings."""
 
 import copy
 
@@ -6,18 +6,18 @@ from hypothesis import strategies as st
 
 
 @st.composite
-def edits(draw, most=6):
-    """Changes to a sequence: where, how much is taken out, and what comes in."""
+def edits(draw, max_size=6):
+    """Draw mutations of a byte string: position, number of removed bytes, and inserted bytes."""
     return [
         (draw(st.floats(0, 1)), draw(st.sampled_from([0, 0, 1, 1, 2, 4, 8, 50])), draw(st.binary(max_size=8)))
-        for _ in range(draw(st.integers(1, most)))
+        for _ in range(draw(st.integers(1, max_size)))
     ]
 
 
 def edited(data: bytes, changes) -> bytes:
-    for where, out, into in changes:
-        at = int(where * len(data))
-        data = data[:at] + into + data[at + out :]
+    for position, removed, inserted in changes:
+        at = int(position * len(data))
+        data = data[:at] + inserted + data[at + removed :]
     return data
 
 
@@ -47,7 +47,7 @@ ODD = st.sampled_from(
 
 
 def places(tree, path=()):
-    """Every path into a tree of lists and mappings."""
+    """Yield every path in a tree of lists and mappings."""
     yield path
     entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in entries:

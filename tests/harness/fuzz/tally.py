@@ -1,4 +1,4 @@
-"""What came of the inputs that were tried, for the count at the end of a long run."""
+"""Counts of fuzzed inputs by outcome, with limits of time and memory."""
 
 import faulthandler
 import resource
@@ -6,45 +6,45 @@ import signal
 from collections import Counter
 from pathlib import Path
 
-MOST_SECONDS = 2.0  # of CPU, for one input
-MOST_BYTES = 200_000_000  # beyond what the process had before it
-STUCK = 300  # s of the clock, after which what does not even hear a signal is ended
+MAX_SECONDS = 2.0  # CPU time of an input [s]
+MAX_BYTES = 200_000_000  # growth of memory by an input [bytes]
+TIMEOUT = 300  # wall-clock time after which a process that ignores signals is ended [s]
 
-TRIED: Counter[tuple[str, str]] = Counter()
-measuring = False  # in a counted run; tests make no assertion about time
+COUNTS: Counter[tuple[str, str]] = Counter()
+measuring = False  # limits are checked by fuzz.py only, not in tests
 
 
 class TooSlowError(BaseException):
-    """An input took too long; no handler of the code under test takes this for its own."""
+    """An input took too long. Not an `Exception`, so that the code under test does not handle it."""
 
 
 def attempt(target: str, refusal: type[Exception], call):
-    """What `call` returns, or None where it refuses; anything else that it raises is a failure.
+    """Return the result of `call`, or None if it refuses the input; other exceptions are failures.
 
     Args:
-        target: the kind of input, for the count.
-        refusal: how it may refuse.
-        call: what tries the input.
+        target: Kind of input, for the counts.
+        refusal: Exception of a refusal.
+        call: Function that reads the input.
     """
-    TRIED[target, "inputs"] += 1
+    COUNTS[target, "inputs"] += 1
     try:
         with _Limits(target) if measuring else _NoLimits():
             result = call()
     except refusal as error:
-        said = str(error)
+        message = str(error)
     except TooSlowError:
-        TRIED[target, "hangs"] += 1
+        COUNTS[target, "hangs"] += 1
         raise
     except Exception:
-        TRIED[target, "tracebacks"] += 1
+        COUNTS[target, "tracebacks"] += 1
         raise
     else:
-        TRIED[target, "accepted"] += 1
+        COUNTS[target, "accepted"] += 1
         return result
-    TRIED[target, "refused"] += 1
-    # One sentence: it is printed as it is.
-    assert "\n" not in said
-    assert 0 < len(said) < 1000
+    COUNTS[target, "refused"] += 1
+    # The message is printed as one sentence.
+    assert "\n" not in message
+    assert 0 < len(message) < 1000
     return None
 
 
@@ -57,36 +57,36 @@ class _NoLimits:
 
 
 class _Limits:
-    """Ends what takes more than its CPU time, and counts what takes more than its memory."""
+    """Limit of CPU time and memory of an input."""
 
     def __init__(self, target: str):
         self.target = target
 
     def __enter__(self):
-        faulthandler.dump_traceback_later(STUCK, exit=True)
-        Path("/proc/self/clear_refs").write_text("5")  # the peak is measured from here on
+        faulthandler.dump_traceback_later(TIMEOUT, exit=True)
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
         self.before = _status("VmRSS")
         signal.signal(signal.SIGPROF, _too_slow)
-        signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
 
     def __exit__(self, *error):
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         faulthandler.cancel_dump_traceback_later()
-        if (grown := _status("VmHWM") - self.before) > MOST_BYTES:
-            TRIED[self.target, "too large"] += 1
+        if (grown := _status("VmHWM") - self.before) > MAX_BYTES:
+            COUNTS[self.target, "too large"] += 1
             raise MemoryError(f"it took {grown / 1e6:.0f} MB")
 
 
 def _too_slow(number, frame):
-    raise TooSlowError(f"it takes more than {MOST_SECONDS:g} s")
+    raise TooSlowError(f"it takes more than {MAX_SECONDS:g} s")
 
 
 def _status(name: str) -> int:
-    """A line of /proc/self/status [bytes]."""
+    """Return a number of /proc/self/status [bytes]."""
     line = next(one for one in Path("/proc/self/status").read_text().splitlines() if one.startswith(name))
     return 1024 * int(line.split()[1])
 
 
 def bound_memory() -> None:
-    """Nothing here may take what the machine needs: an array of terabytes is refused as anywhere."""
+    """Limit the address space, so that an array of terabytes raises MemoryError."""
     resource.setrlimit(resource.RLIMIT_AS, (12 * 2**30, 12 * 2**30))

@@ -1,13 +1,13 @@
-"""Kills training runs at random instants, and a study, and asks whether what they leave is as if nobody had.
+"""Kill training runs and a study at random instants, and compare the results with undisturbed runs.
 
-    python tests/kills/kill.py --kills 40                       # some ten minutes where nothing else runs
-    python tests/kills/kill.py --kills 12 --tasks GridClamp     # some of them
+    python tests/harness/kills/kill.py --kills 40                       # about ten minutes on an idle machine
+    python tests/harness/kills/kill.py --kills 12 --tasks GridClamp     # of one task
 
-A run is begun, killed (SIGKILL), gone on with, killed again, and so on, and at last left alone. Half of the kills come
-when at least half of its episodes are in a checkpoint, after a random part of an episode's time; the others at any
-instant from the first import on. Then its folder is compared with that of an undisturbed run: every table without its
-clock, the policy's bytes, every array and value of the checkpoint. A study is killed with its workers running, and
-once only a worker: no process may be left. It prints what was found as JSON, and ends with 1 if anything differs.
+A run is started, killed (SIGKILL) and resumed repeatedly, and finally completed. Half of the kills happen when at least
+half of its episodes are in a checkpoint, after a random part of an episode; the others at any instant after the first
+import. Its folder is compared with that of an undisturbed run: tables without wall-clock times, the policy's bytes,
+every array and value of the checkpoint. A study is killed with its workers running, and once only a worker: no process
+may remain. The results are printed as JSON, and the exit code is 1 if anything differs.
 """
 
 from __future__ import annotations
@@ -60,18 +60,18 @@ STUDY = {
     "after_episodes": [2],
     "eval_set": [{"episodes": 2}],
 }
-PATIENCE = 600.0  # s
+TIMEOUT = 600.0  # largest time of a command or of waiting [s]
 
 
 def guiderail(*arguments: object) -> subprocess.Popen:
-    """The command, in a process of its own."""
+    """Start the command in a child process."""
     program = "from guiderail.tools.cli.main import main; main()"
     words = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
 def episodes(run: Path) -> int:
-    """How many are in a run's table, each of which is in its checkpoint too."""
+    """Return the number of episodes in a run's table, all of which are in its checkpoint."""
     try:
         return (run / "episodes.csv").read_bytes().count(b"\n") - 1
     except FileNotFoundError:
@@ -79,58 +79,58 @@ def episodes(run: Path) -> int:
 
 
 def finished(process: subprocess.Popen) -> None:
-    """Waits for a command that must succeed."""
-    _, words = process.communicate(timeout=PATIENCE)
+    """Wait for a command that must succeed."""
+    _, output = process.communicate(timeout=TIMEOUT)
     if process.returncode:
-        raise RuntimeError(f"exit code {process.returncode}: {words.strip()[-500:]}")
+        raise RuntimeError(f"exit code {process.returncode}: {output.strip()[-500:]}")
 
 
 def until(done: Callable[[], bool], process: subprocess.Popen) -> bool:
-    """Waits for something to happen while a command runs; whether it did before the command ended."""
-    end = time.monotonic() + PATIENCE
+    """Wait for a condition while a command runs; return True if it occurred before the command ended."""
+    end = time.monotonic() + TIMEOUT
     while not done():
         if process.poll() is not None:
             return done()
         if time.monotonic() > end:
-            raise RuntimeError("nothing happens")
+            raise RuntimeError("timeout")
         time.sleep(0.005)
     return True
 
 
-def kill_run(task: str, options: list[str], whole: Path, run: Path, wanted: int, chance: random.Random) -> dict:
-    """Kills a run so often and lets it end; what came of it."""
+def kill_run(task: str, options: list[str], whole: Path, run: Path, kills: int, rng: random.Random) -> dict:
+    """Kill a run repeatedly and complete it; return counts and differences."""
     total, seconds = episodes(whole), json.loads((whole / "seconds.json").read_text())
-    when = sorted(chance.choice([*range(total // 2, total)]) for _ in range(wanted - wanted // 2))
-    early = sorted(chance.uniform(0.0, 1.3 * seconds["begins"]) for _ in range(wanted // 2))
-    killed = {"begun": 0, "late": 0, "instants": []}
+    when = sorted(rng.choice([*range(total // 2, total)]) for _ in range(kills - kills // 2))
+    early = sorted(rng.uniform(0.0, 1.3 * seconds["begins"]) for _ in range(kills // 2))
+    result = {"early": 0, "late": 0, "instants": []}
     for index, at in enumerate([*early, *when]):
-        go_on = ["--resume"] if (run / "config.yaml").exists() else [task, *options, "--seed", "3"]
-        process = guiderail("train", "--out", run, *go_on)
+        arguments = ["--resume"] if (run / "config.yaml").exists() else [task, *options, "--seed", "3"]
+        process = guiderail("train", "--out", run, *arguments)
         late = index >= len(early)
         if late:
             until(lambda at=at: episodes(run) >= at, process)
-            time.sleep(chance.uniform(0.0, 1.5 * seconds["episode"]))
+            time.sleep(rng.uniform(0.0, 1.5 * seconds["episode"]))
         else:
             time.sleep(at)
         if process.poll() is not None:
             process.communicate()
-            continue  # it ended before: no kill
+            continue  # it ended before the kill
         process.kill()
         process.communicate()
         done = episodes(run)
-        killed["late" if done >= total / 2 else "begun"] += 1
-        killed["instants"].append(done)
+        result["late" if done >= total / 2 else "early"] += 1
+        result["instants"].append(done)
     if (run / "config.yaml").exists():
         finished(guiderail("train", "--out", run, "--resume"))
     else:
         finished(guiderail("train", "--out", run, task, *options, "--seed", "3"))
     parts = [str(path.relative_to(run)) for path in run.rglob("*.part")]
     same = [line for line in differences(whole, run) if "seconds.json" not in line and ".part" not in line]
-    return killed | {"differences": same, "left_over_parts": parts}
+    return result | {"differences": same, "left_over_parts": parts}
 
 
 def undisturbed(task: str, options: list[str], run: Path) -> None:
-    """A run that nobody kills, and how long its parts take."""
+    """Run without kills, and measure the durations of its parts."""
     started = time.perf_counter()
     process = guiderail("train", "--out", run, task, *options, "--seed", "3")
     until(lambda: episodes(run) >= 1, process)
@@ -143,7 +143,7 @@ def undisturbed(task: str, options: list[str], run: Path) -> None:
 
 
 def alive(process: int) -> bool:
-    """Whether a process is there and no zombie."""
+    """Return True if a process exists and is not a zombie."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
@@ -151,7 +151,7 @@ def alive(process: int) -> bool:
 
 
 def workers(out: Path) -> dict[str, int]:
-    """The process that has each job of the study that is not done."""
+    """Return the process of each unfinished job of a study."""
     found = {}
     for log in (out / "logs").glob("*.txt"):
         lines = log.read_text().splitlines()
@@ -160,8 +160,8 @@ def workers(out: Path) -> dict[str, int]:
     return found
 
 
-def kill_study(folder: Path, kills: int, chance: random.Random) -> dict:
-    """Kills a study's own process again and again, then a worker of it; what came of it."""
+def kill_study(folder: Path, kills: int, rng: random.Random) -> dict:
+    """Kill the process of a study repeatedly, then one of its workers; return counts and differences."""
     file, whole, torn = folder / "killed.yaml", folder / "study", folder / "killed-study"
     file.write_text(yaml.safe_dump(STUDY))
     started = time.perf_counter()
@@ -170,38 +170,40 @@ def kill_study(folder: Path, kills: int, chance: random.Random) -> dict:
     found: dict = {"parents": 0, "workers": 0, "left_over_processes": 0}
     for _ in range(kills):
         process = guiderail("study", file, "--out", torn)
-        had = set(workers(torn).values())  # of the one before
-        until(lambda had=had: bool(set(workers(torn).values()) - had), process)
-        time.sleep(chance.uniform(0.0, seconds / 3))
+        previous = set(workers(torn).values())  # workers of the previous process
+        until(lambda previous=previous: bool(set(workers(torn).values()) - previous), process)
+        time.sleep(rng.uniform(0.0, seconds / 3))
         if process.poll() is not None:
             process.communicate()
             continue
-        mine = [one for one in set(workers(torn).values()) - had if alive(one)]
+        own = [one for one in set(workers(torn).values()) - previous if alive(one)]
         process.send_signal(signal.SIGKILL)
         process.communicate()
         end = time.monotonic() + 10.0
-        while any(map(alive, mine)) and time.monotonic() < end:
+        while any(map(alive, own)) and time.monotonic() < end:
             time.sleep(0.05)
         found["parents"] += 1
-        found["left_over_processes"] += sum(map(alive, mine))
+        found["left_over_processes"] += sum(map(alive, own))
     process = guiderail("study", file, "--out", torn)
-    had = set(workers(torn).values())
-    if until(lambda: any(alive(one) for one in set(workers(torn).values()) - had), process):
-        os.kill(next(one for one in set(workers(torn).values()) - had if alive(one)), signal.SIGKILL)
+    previous = set(workers(torn).values())
+    if until(lambda: any(alive(one) for one in set(workers(torn).values()) - previous), process):
+        os.kill(next(one for one in set(workers(torn).values()) - previous if alive(one)), signal.SIGKILL)
         found["workers"] += 1
     finished(process)
     return found | {"differences": [line for line in differences(whole, torn) if ".part" not in line]}
 
 
 def main() -> None:
-    """The command."""
+    """Run the program."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=40, help="of training runs; a quarter as many, or 2, of studies")
+    parser.add_argument(
+        "--kills", type=int, default=40, help="kills of training runs; a tenth as many, at least 2, of studies"
+    )
     parser.add_argument("--tasks", nargs="+", choices=list(RUNS), default=list(RUNS))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="keeps the runs there")
+    parser.add_argument("--out", type=Path, help="folder in which the runs are kept")
     given = parser.parse_args()
-    chance = random.Random(given.seed)
+    rng = random.Random(given.seed)
     with tempfile.TemporaryDirectory() as temporary:
         folder = (given.out or Path(temporary)).absolute()
         folder.mkdir(parents=True, exist_ok=True)
@@ -210,12 +212,12 @@ def main() -> None:
         for task, kills in left.items():
             undisturbed(task, RUNS[task], folder / task)
             for number in range(-(-kills // KILLS_OF_A_RUN)):
-                wanted, run = min(KILLS_OF_A_RUN, kills - number * KILLS_OF_A_RUN), folder / f"{task}-{number}"
-                found[run.name] = kill_run(task, RUNS[task], folder / task, run, wanted, chance)
+                count, run = min(KILLS_OF_A_RUN, kills - number * KILLS_OF_A_RUN), folder / f"{task}-{number}"
+                found[run.name] = kill_run(task, RUNS[task], folder / task, run, count, rng)
                 print(f"{run.name}: {json.dumps(found[run.name])}", file=sys.stderr, flush=True)
-        found["study"] = kill_study(folder, max(2, given.kills // 10), chance)
+        found["study"] = kill_study(folder, max(2, given.kills // 10), rng)
     runs = [one for name, one in found.items() if name != "study"]
-    late, early = sum(one["late"] for one in runs), sum(one["begun"] for one in runs)
+    late, early = sum(one["late"] for one in runs), sum(one["early"] for one in runs)
     wrong = [f"{name}: {line}" for name, one in found.items() for line in one["differences"]]
     totals = {"kills": late + early, "in_the_second_half": late, "differences": wrong, "study": found["study"]}
     print(json.dumps(totals | {"left_over_parts": [part for one in runs for part in one["left_over_parts"]]}, indent=2))

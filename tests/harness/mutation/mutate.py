@@ -1,14 +1,14 @@
-"""Changes the safety code one place at a time, and asks whether a test notices.
+"""Mutation testing of the safety code.
 
-    python tests/harness/mutation/mutate.py                         # everything, some hours
-    python tests/harness/mutation/mutate.py --every 8               # an eighth, chosen by hashes of the names
-    python tests/harness/mutation/mutate.py qp window               # these files
-    python tests/harness/mutation/mutate.py --results mutants.json  # goes on where it was stopped
+    python tests/harness/mutation/mutate.py                         # all mutants, hours
+    python tests/harness/mutation/mutate.py --every 8               # an eighth of them, by hashes of the names
+    python tests/harness/mutation/mutate.py qp window               # of these files
+    python tests/harness/mutation/mutate.py --results mutants.json  # resumes an interrupted run
 
-Every operator below is applied at every place of a file that it fits: comparisons, arithmetic, logic, numbers,
-branches, statements, calls that have a counterpart, slices, keyword arguments. A mutant is tried by the tests that
-execute its line, the quickest first. One that no test notices survives: `survivors.yaml` says of each why that makes no
-difference. A survivor that it does not name is an error, and so is a name in it that no mutant has or that is killed.
+Every operator below is applied wherever it fits: comparisons, arithmetic, logic, numbers, branches, statements, calls
+with a counterpart, slices, keyword arguments. A mutant is tried with the tests that execute its line, fastest first.
+A mutant that passes them survives. `survivors.yaml` explains why a survivor makes no difference. A survivor without an
+explanation is an error, and so is an explanation without a surviving mutant.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ TARGETS = {
     ],
 }
 SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
-# Imported once, before a process is forked for each mutant: what takes seconds and is never mutated.
+# Slow imports without mutants, imported before a process is forked for each mutant.
 HEAVY = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
 HEAVY += ("scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure")
 HEAVY += (
@@ -74,7 +74,7 @@ HEAVY += (
 )
 
 
-# --- what is changed ---
+# --- mutations ---
 
 ORDER = {
     ast.Lt: (ast.LtE, ast.Gt),
@@ -104,12 +104,12 @@ COUNTERPART = {
     **{"max": "min", "all": "any", "maximum": "minimum", "argmax": "argmin", "cos": "sin", "ones": "zeros"},
     **{"radians": "degrees", "deg2rad": "rad2deg", "sum": "max", "mean": "max", "asin": "sin", "flatnonzero": "argmin"},
 }
-# Without them the number is another one, or the array is the caller's.
+# Calls that are replaced by their argument.
 DROPPED = {"abs", "sqrt", "copy", "sorted", "float", "int", "bool", "round", "array", "asarray", "ascontiguousarray"}
 
 
 def changes(node: ast.AST) -> Iterator[ast.AST | None]:
-    """What may stand in place of a node; None removes a statement."""
+    """Yield the mutations of a node; None removes a statement."""
     if isinstance(node, ast.Compare) and len(node.ops) >= 1:
         for i, operator in enumerate(node.ops):
             for other in ORDER[type(operator)]:
@@ -138,12 +138,12 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
         yield from (_with(node, **{end: None}) for end in ("lower", "upper", "step") if getattr(node, end))
     elif isinstance(node, ast.Continue | ast.Break):
         yield ast.copy_location(ast.Break() if isinstance(node, ast.Continue) else ast.Continue(), node)
-    elif _can_be_left_out(node):
+    elif _can_be_removed(node):
         yield None
 
 
-def _can_be_left_out(node: ast.AST) -> bool:
-    """A statement without which the others can still be executed."""
+def _can_be_removed(node: ast.AST) -> bool:
+    """Return True for a statement that the following ones do not need."""
     if isinstance(node, ast.Assign):
         return not any(isinstance(target, ast.Name | ast.Tuple) for target in node.targets)
     return isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
@@ -185,7 +185,7 @@ Path_ = tuple[tuple[str, int | None], ...]
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change of one file; `name` says which, whatever its line number is."""
+    """Mutation of a file, with a name that does not depend on line numbers."""
 
     file: str
     name: str
@@ -195,18 +195,18 @@ class Mutant:
     change: int
 
     def tree(self) -> ast.Module:
-        """The file with the change."""
+        """Return the syntax tree of the mutated file."""
         tree = ast.parse((ROOT / self.file).read_text())
         _replace(tree, self.path, list(changes(_at(tree, self.path)))[self.change])
         return ast.fix_missing_locations(tree)
 
     def is_in_sample(self, every: int) -> bool:
-        """Whether it is one of a part of all, which is the same wherever and whenever."""
+        """Return True if the mutant is in the reproducible sample of one in `every`."""
         return int.from_bytes(hashlib.sha256(f"{self.file}: {self.name}".encode()).digest()[:8], "big") % every == 0
 
 
 def mutants(file: str) -> list[Mutant]:
-    """Every change of a file, in the order of its lines."""
+    """Return the mutants of a file in the order of its lines."""
     tree = ast.parse((ROOT / file).read_text())
     found, seen = [], Counter()
     for path in list(_places(tree)):
@@ -216,7 +216,7 @@ def mutants(file: str) -> list[Mutant]:
             mutated = ast.Module([copy.deepcopy(before)], [])
             inside = (("body", 0), *path[depth:])
             _replace(mutated, inside, list(changes(_at(mutated, inside)))[i])
-            name = f"{_function(tree, path)}: {_difference(_said(before), _said(mutated.body[0]))}"
+            name = f"{_function(tree, path)}: {_difference(_source(before), _source(mutated.body[0]))}"
             seen[name] += 1
             if seen[name] > 1:
                 name += f" ({seen[name]})"
@@ -225,7 +225,7 @@ def mutants(file: str) -> list[Mutant]:
 
 
 def _places(node: ast.AST, path: Path_ = ()) -> Iterator[Path_]:
-    """Paths to all nodes that are code: no docstrings, annotations, decorators, messages or imports."""
+    """Yield the paths of all code nodes: no docstrings, annotations, decorators, messages or imports."""
     yield path
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "ctx", "ops", "op", "bases"):
@@ -257,12 +257,12 @@ def _replace(tree: ast.Module, path: Path_, new: ast.AST | None) -> None:
 
 
 def _depth_of_statement(tree: ast.Module, path: Path_) -> int:
-    """How long the path to the innermost statement around a place is."""
+    """Return the length of the path to the innermost statement around a node."""
     return next(n for n in range(len(path), -1, -1) if isinstance(_at(tree, path[:n]), ast.stmt))
 
 
-def _said(statement: ast.stmt) -> str:
-    """A statement's own line: of a block its head alone."""
+def _source(statement: ast.stmt) -> str:
+    """Return the source of a statement, of a block only its head."""
     head = copy.copy(statement)
     if hasattr(head, "body"):
         head.body = [ast.Pass()]
@@ -273,13 +273,13 @@ def _said(statement: ast.stmt) -> str:
 
 
 def _function(tree: ast.Module, path: Path_) -> str:
-    """The function or class that a place is in."""
+    """Return the function or class around a node."""
     around = [_at(tree, path[:n]) for n in range(len(path))]
     return ".".join(node.name for node in around if isinstance(node, ast.FunctionDef | ast.ClassDef)) or "module"
 
 
 def _difference(before: str, after: str, context: int = 30) -> str:
-    """What differs between two lines, with as much around it as tells where it is."""
+    """Return the difference between two lines, with context."""
     start = _common(before, after)
     end = _common(before[start:][::-1], after[start:][::-1])
     left, right = before[max(0, start - context) : start], before[len(before) - end :][:context]
@@ -287,15 +287,15 @@ def _difference(before: str, after: str, context: int = 30) -> str:
 
 
 def _common(a: str, b: str) -> int:
-    """How many letters two texts begin with alike."""
+    """Return the length of the common prefix of two texts."""
     return next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
 
 
-# --- who notices ---
+# --- tests ---
 
 
 class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Imports the mutated module where the file's own is asked for."""
+    """Importer that replaces a module by its mutant."""
 
     def __init__(self, mutant: Mutant):
         self.name = "guiderail." + mutant.file.removesuffix(".py").replace("/", ".")
@@ -310,7 +310,7 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 class _Coverage:
-    """Which tests execute which lines of the files that can be changed, and how long each takes."""
+    """Pytest plugin that records the executed lines of mutated files and the CPU time of each test."""
 
     def __init__(self):
         self.files = {str(ROOT / file): file for file in TARGETS}
@@ -347,7 +347,7 @@ def _pytest(arguments: list[str], plugins=()) -> int:
 
 
 def _forked(work, cpu_seconds: float) -> int:
-    """Runs `work` in a process of its own, silent and limited; the exit status that it returns."""
+    """Run `work` in a silent child process with limits; return its exit status."""
     child = os.fork()
     if child == 0:
         silent = os.open(os.devnull, os.O_WRONLY)
@@ -365,9 +365,11 @@ def _forked(work, cpu_seconds: float) -> int:
 
 
 def coverage(tests: list[str], store: Path) -> dict:
-    """The lines of each file that each test executes, and each test's CPU seconds, with nothing changed.
+    """Return the lines of each file that each test executes and the CPU time of each test, without mutations.
 
-    It is measured once for tests that several files share; `store` keeps it, as this takes longer than many mutants.
+    Args:
+        tests: Test files or folders.
+        store: JSON file in which results are stored, because measuring takes longer than many mutants.
     """
     key = f"{' '.join(tests)} {_newest(tests)}"
     kept = json.loads(store.read_text()) if store.exists() else {}
@@ -382,25 +384,24 @@ def coverage(tests: list[str], store: Path) -> dict:
 
         status = _forked(work, 3600)
         if status != 0:
-            raise SystemExit(f"{' '.join(tests)} fails without any change (status {status}): mend it first")
+            raise SystemExit(f"{' '.join(tests)} fails without a mutation (status {status}): fix it first")
         kept = json.loads(store.read_text())
     return kept[key]
 
 
 def _newest(tests: list[str]) -> float:
-    """When what the tests are made of, or what they test, was last changed."""
+    """Return the time of the last change of the tests or of mutated files."""
     places = [ROOT / test for test in tests] + [ROOT / file for file in TARGETS]
     files = [file for place in places for file in (place.rglob("*.py") if place.is_dir() else [place])]
     return max(file.stat().st_mtime for file in files)
 
 
 def survives(mutant: Mutant, covered: dict) -> bool:
-    """True if every test passes that executes the changed line."""
+    """Return True if every test that executes the mutated line passes."""
     here, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
     lines = covered["lines"].get(mutant.file, {})
     chosen = {test for test in seconds if any(line in here for line in lines.get(test, ()))}
-    # Of a fixture that several tests share only the first executes the line; what is executed on import, such as a
-    # default or a constant, belongs to no test at all.
+    # Only the first test executes a shared fixture, and no test executes constants and defaults.
     chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
     chosen = sorted(chosen or seconds, key=lambda test: seconds[test])
     limit = 10 + 5 * sum(seconds[test] for test in chosen)
@@ -414,13 +415,13 @@ def survives(mutant: Mutant, covered: dict) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("files", nargs="*", help="names of files, without .py; all unless given")
-    parser.add_argument("--every", type=int, default=1, help="try one of so many mutants")
-    parser.add_argument("--results", type=Path, help="a JSON file that keeps what was tried")
-    parser.add_argument("--again", action="store_true", help="try those again that survived")
+    parser.add_argument("files", nargs="*", help="names of files without .py (default: all)")
+    parser.add_argument("--every", type=int, default=1, help="try one mutant of this many")
+    parser.add_argument("--results", type=Path, help="JSON file of results, for resuming")
+    parser.add_argument("--again", action="store_true", help="try survivors again")
     arguments = parser.parse_args()
     if unknown := {*arguments.files} - {Path(file).stem for file in TARGETS}:
-        parser.error(f"none of the safety code's files is called {min(unknown)}")
+        parser.error(f"there is no file of the safety code called {min(unknown)}")
     os.chdir(ROOT)
     for name in HEAVY:
         importlib.import_module(name)
@@ -428,12 +429,12 @@ def main() -> int:
         results = arguments.results.absolute() if arguments.results else Path(folder) / "mutants.json"
         files = [file for file in TARGETS if not arguments.files or Path(file).stem in arguments.files]
         wrong, total, killed = np.sum([try_file(file, arguments.every, results, arguments.again) for file in files], 0)
-    print(f"together: {killed} of {total} killed ({killed / max(total, 1):.1%}); {wrong} to be explained or mended")
+    print(f"total: {killed} of {total} killed ({killed / max(total, 1):.1%}); {wrong} to be explained or fixed")
     return min(int(wrong), 1)
 
 
 def try_file(file: str, every: int, kept: Path, again: bool) -> tuple[int, int, int]:
-    """How many of a file's survivors are unexplained or wrongly explained, how many were tried and how many killed."""
+    """Return the numbers of unexplained survivors and stale explanations, of mutants, and of killed mutants."""
     tried = json.loads(kept.read_text()) if kept.exists() else {}
     results, reasons = tried.setdefault(file, {}), yaml.safe_load(SURVIVORS.read_text()).get(file, {})
     everything = mutants(file)
@@ -450,7 +451,7 @@ def try_file(file: str, every: int, kept: Path, again: bool) -> tuple[int, int, 
     killed = {mutant.name for mutant in found} - survivors
     stale = (set(reasons) - {mutant.name for mutant in everything}) | (killed & set(reasons))
     for name in sorted(stale):
-        print(f"{file}: explained, but no survivor: {name}", flush=True)
+        print(f"{file}: explained, but not a survivor: {name}", flush=True)
     known = len(survivors & set(reasons))
     print(f"{file}: {len(killed)} of {len(found)} killed, {known} explained, {len(survivors) - known} not", flush=True)
     return len(survivors) - known + len(stale), len(found), len(killed)
