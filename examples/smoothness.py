@@ -1,4 +1,4 @@
-"""How do I compare the smoothness of exploration methods? At the same RMS, because smaller motions have less jerk."""
+"""Compare the smoothness of exploration methods: at the same RMS, because smaller motions have less jerk."""
 
 import numpy as np
 

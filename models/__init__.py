@@ -1,1 +1,1 @@
-"""What is known, free of Drake systems: robots, objects, demonstrations, movement primitives and templates."""
+"""Models without Drake systems: robots, objects, demonstrations, movement primitives and templates."""

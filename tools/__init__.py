@@ -1,1 +1,1 @@
-"""What a person runs: the `guiderail` command, training, replay, recording, studies and benchmarks."""
+"""Applications: the `guiderail` command, training, evaluation, studies, datasets and operation of robots."""

@@ -1,4 +1,4 @@
-"""Disks that are full and folders that cannot be written, also for the superuser whom tests may be run by."""
+"""Full disks and read-only folders, also for tests that run as the superuser."""
 
 import contextlib
 import ctypes
@@ -7,12 +7,12 @@ import resource
 from collections.abc import Iterator
 
 CAPABILITY_VERSION = 0x20080522
-OVERRIDES = 0b110  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: whom permissions do not concern
+OVERRIDES = 0b110  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
 
 
 @contextlib.contextmanager
 def full_disk(room: int = 512) -> Iterator[None]:
-    """No file grows beyond so many bytes, as on a disk that has no more of them."""
+    """Limit the size of files [bytes], as a full disk does."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
     try:
@@ -23,7 +23,7 @@ def full_disk(room: int = 512) -> Iterator[None]:
 
 @contextlib.contextmanager
 def bound_by_permissions() -> Iterator[None]:
-    """This thread may write what its permissions say, whoever it is."""
+    """Apply file permissions to this thread even if it runs as the superuser."""
     if os.geteuid() != 0:
         yield
         return

@@ -1,10 +1,10 @@
-"""Letters as several people write them: sharp corners, straight strokes, loops, and a pen that slows at corners."""
+"""Synthetic handwriting: sharp corners, straight strokes, loops, and lower speed at corners."""
 
 import numpy as np
 
 from guiderail.models.primitives import Demonstrations
 
-# Strokes on a unit square: ("line", x, y) goes straight to a point, ("arc", x, y, degrees) turns about one.
+# Strokes on a unit square: ("line", x, y) is a straight stroke to a point, ("arc", x, y, degrees) an arc about one.
 LETTERS = {
     "N": [(0, 0), ("line", 0, 1), ("line", 0.7, 0), ("line", 0.7, 1)],
     "Z": [(0, 1), ("line", 0.8, 1), ("line", 0, 0), ("line", 0.8, 0)],
@@ -17,7 +17,7 @@ LETTERS = {
 
 
 def path(letter: str, points: int = 2000) -> np.ndarray:
-    """(points, 2), evenly spaced along the strokes."""
+    """Return points, (points, 2), evenly spaced along the strokes."""
     strokes = LETTERS[letter]
     corners = [np.array(strokes[0], dtype=float)]
     for kind, x, y, *turn in strokes[1:]:
@@ -37,19 +37,21 @@ def path(letter: str, points: int = 2000) -> np.ndarray:
 def write(
     letter: str, seed: int = 0, count: int = 6, steps: int = 200, spread: float = 0.03, size: float = 1.0, offset=(0, 0)
 ):
-    """Demonstrations of a letter: each leans, stretches, wanders and hurries in its own way.
+    """Return demonstrations of a letter with random shear, scale, waves and timing.
 
     Args:
-        letter: one of `LETTERS`.
-        seed: of who writes.
-        count, steps: how many, and points in each.
-        spread: how far they differ, in sizes of the letter.
-        size, offset: of the page, in any unit.
+        letter: One of `LETTERS`.
+        seed: Seed of the variations.
+        count: Number of demonstrations.
+        steps: Number of points of each.
+        spread: Standard deviation of the variations, relative to the size of the letter.
+        size: Size of the letter, in any unit.
+        offset: Position of the letter, (2,).
     """
     rng = np.random.default_rng(seed)
     straight = path(letter)
     phase = np.linspace(0, 1, len(straight))
-    # Slower where it turns.
+    # The speed is lower in curves.
     heading = np.unwrap(np.arctan2(*np.gradient(straight, axis=0).T[::-1]))
     bend = np.convolve(np.abs(np.gradient(heading)), np.ones(60), mode="same")
     clock = np.cumsum(1 + 2 * np.minimum(bend, 1.5))
@@ -69,7 +71,7 @@ def write(
 
 
 def correlated(seed: int = 0, count: int = 6, steps: int = 200, correlation: float = 0.98) -> Demonstrations:
-    """Three outputs that differ together: whoever is too far in one is as much too far in the others."""
+    """Return demonstrations of three outputs with correlated deviations."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 2, steps)
     mean = np.column_stack([np.sin(2 * t), np.abs(t - 1), np.cos(3 * t)])

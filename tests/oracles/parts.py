@@ -1,6 +1,6 @@
-"""Parts that nobody tuned anything for, from drawings: six plugs and sockets as STL files in millimetres.
+"""Six plugs and sockets as STL files in millimetres, for which nothing is tuned.
 
-Each pair is drawn as it is assembled, the plug coming from above along z. A plug that turns is drawn locked.
+Each pair is drawn assembled, with insertion along z from above. A plug that turns is drawn locked.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import trimesh
 from manifold3d import CrossSection, Manifold
 
 SIDES = 24
-CHAMFER = 0.5  # [mm] of a plug's tip and a socket's mouth
+CHAMFER = 0.5  # chamfer of a plug's tip and a socket's mouth [mm]
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,10 @@ class Part:
     """A plug and its socket.
 
     Attributes:
-        plug, socket: solids of one piece each, or several.
-        clearance: between their walls, on each side [mm].
-        options: further words of the command.
+        plug: Solids of the plug.
+        socket: Solids of the socket.
+        clearance: Clearance between their walls on each side [mm].
+        options: Further arguments of `guiderail create-task`.
     """
 
     plug: list[Manifold]
@@ -31,7 +32,7 @@ class Part:
     options: list[str] = field(default_factory=list)
 
     def write(self, folder: Path) -> tuple[Path, Path]:
-        """The two STL files."""
+        """Write both STL files; return their paths."""
         paths = folder / "plug.stl", folder / "socket.stl"
         for path, solids in zip(paths, (self.plug, self.socket), strict=True):
             trimesh.util.concatenate([_mesh(solid) for solid in solids]).export(path)
@@ -62,13 +63,13 @@ def _grown(outline: CrossSection, by: float) -> CrossSection:
 
 
 def _shaft(outline: CrossSection, low: float, high: float, chamfer: float = CHAMFER) -> Manifold:
-    """A convex prism whose lower end is chamfered."""
+    """Return a convex prism with a chamfered lower end."""
     tip = _prism(_grown(outline, -chamfer), low, low + 0.01)
     return Manifold.batch_hull([tip, _prism(outline, low + chamfer, high)])
 
 
 def _hole(outline: CrossSection, clearance: float, low: float) -> Manifold:
-    """What a convex outline's hole takes away below z = 0, its mouth chamfered."""
+    """Return the volume of a hole below z = 0 with a convex outline and a chamfered mouth."""
     wall = _grown(outline, clearance)
     mouth = [_prism(wall, -CHAMFER, -CHAMFER + 0.01), _prism(_grown(wall, CHAMFER), 0.0, 0.01)]
     return _prism(wall, low, 0.01) + Manifold.batch_hull(mouth)

@@ -1,4 +1,4 @@
-"""What workers are given to do in tests of engines: importable wherever they are."""
+"""Jobs of the tests of study engines, importable in workers."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from guiderail.tools.experiments.engines.engine import Outcome
 
 
 def work(job):
-    """A number is squared; a path is where this process kills itself unless the path exists by then."""
+    """Square a number; for a path that does not exist, create it and kill this process."""
     if isinstance(job, Path):
         if job.exists():
             return Outcome(({"found": str(job)},))
@@ -20,14 +20,14 @@ def work(job):
 
 
 def die(job):
-    """No worker survives an odd number."""
+    """Square an even number; exit the worker for an odd one."""
     if job % 2:
         os._exit(3)
     return Outcome(({"square": job**2},))
 
 
 def wait(job):
-    """Says which process it is, and never ends."""
+    """Print the process number and wait forever."""
     sys.stdout.write(f"{os.getpid()}\n")
     sys.stdout.flush()
     while True:

@@ -1,4 +1,4 @@
-"""What a run leaves, changed at random: each of its files means what it says, or is refused in one sentence."""
+"""Mutated files of a run: each is read with the values that it has, or refused with one sentence."""
 
 import csv
 import io
@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
     return RunFolder(tmp_path_factory.mktemp("fuzz") / "run")
 
 
-def written(config, folder):
+def config_text(config, folder):
     folder.write_config(config)
     return (folder.path / "config.yaml").read_text()
 
@@ -48,11 +48,11 @@ CONFIGS = [
 
 @pytest.fixture(scope="module")
 def texts(folder):
-    return [written(config, folder) for config in CONFIGS]
+    return [config_text(config, folder) for config in CONFIGS]
 
 
 def read(folder):
-    """A configuration, and that an environment and a learner can be made of it."""
+    """Read a configuration and check that an environment and a learner can be built from it."""
     config = folder.config()
     check_environment(config.task, config.environment)
     LEARNERS.get(config.learner.algorithm)
@@ -64,14 +64,14 @@ def try_config(target, folder, text):
     config = attempt(target, InputError, lambda: read(folder))
     if config is None:
         return
-    said = yaml.safe_load(text)
+    expected = yaml.safe_load(text)
     for name in ("task", "seed", "episodes", "preset"):
-        assert getattr(config, name) == said[name]
-        assert type(getattr(config, name)) is type(said[name])
-    for name, value in said["environment"].items():
+        assert getattr(config, name) == expected[name]
+        assert type(getattr(config, name)) is type(expected[name])
+    for name, value in expected["environment"].items():
         found = config.environment[name]
         assert (list(found) if isinstance(found, tuple) else found) == value or value != value
-    for name, value in said["learner"].items():
+    for name, value in expected["learner"].items():
         found = getattr(config.learner, name)
         if isinstance(found, bool) or isinstance(value, bool):
             assert found in (0, 1)
@@ -87,7 +87,7 @@ def try_config(target, folder, text):
 @given(st.data())
 def test_configurations_with_entries_changed(folder, texts, data):
     tree = data.draw(changed_trees([yaml.safe_load(text) for text in texts]))
-    # A file that a run imports is code, and whoever changes that changes what is run.
+    # Imports are code, so that a changed import is not wrong input.
     if isinstance(tree, dict):
         tree.pop("imports", None)
     try_config("config.yaml, entries changed", folder, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
@@ -118,15 +118,15 @@ def try_table(target, folder, content):
     assert list(table.columns) == header
     assert len(table) == len([row for row in rows if row])
     for row, (_, found) in zip([row for row in rows if row], table.iterrows(), strict=True):
-        for said, value in zip(row, found, strict=True):
+        for text, value in zip(row, found, strict=True):
             if isinstance(value, str):
-                assert value == said
-            elif said == "":
+                assert value == text
+            elif text == "":
                 assert pd.isna(value)
             elif isinstance(value, bool | np.bool_):
-                assert str(value) == said
+                assert str(value) == text
             else:
-                assert float(value) == float(said) or float(said) != float(said)
+                assert float(value) == float(text) or float(text) != float(text)
 
 
 def _summarized(folder):
@@ -174,14 +174,14 @@ LAYERS = [
 ]
 DESCRIPTION = {"pool": 1, "action_low": [-1.0, -2.0], "action_high": [1.0, 2.0], "activation": "relu", "task": "Bead"}
 DESCRIPTION |= {"observation_shape": [3]}
-SEEN = np.array([0.5, -1.0, 2.0])
+OBSERVATION = np.array([0.5, -1.0, 2.0])
 
 
 def try_policy(target, folder, expected):
     policy = attempt(target, InputError, lambda: Policy.load(folder.path))
     if policy is None:
         return
-    action = attempt(f"{target}, acting", InputError, lambda: policy(np.resize(SEEN, policy._shape)))
+    action = attempt(f"{target}, acting", InputError, lambda: policy(np.resize(OBSERVATION, policy._shape)))
     assert np.isfinite(action).all()
     assert (action >= policy._low).all()
     assert (action <= policy._high).all()
@@ -197,7 +197,7 @@ def test_policies_with_bytes_changed(folder, file, changes, flips):
     for where, bit in flips:
         content[min(int(where * len(content)), len(content) - 1)] ^= 1 << bit
     (folder.path / file).write_bytes(content)
-    try_policy("policy, bytes changed", folder, policy(SEEN))
+    try_policy("policy, bytes changed", folder, policy(OBSERVATION))
 
 
 @given(st.data())
@@ -214,7 +214,7 @@ def test_policies_with_entries_changed_that_have_their_digest(folder, data):
 
 @pytest.fixture(scope="module")
 def resumable(folder):
-    """A small learner that has seen something, and what a checkpoint of it holds."""
+    """Return a small learner with transitions, and the content of its checkpoint."""
     env = Line()
     settings = {"net_arch": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_freq": 1}
     learner = LEARNERS.get("tqc")(
@@ -227,7 +227,7 @@ def resumable(folder):
 
 
 class Line(gymnasium.Env):
-    """The two spaces and the random numbers that a learner and a checkpoint ask for."""
+    """Environment with spaces and a random generator only."""
 
     observation_space = spaces.Box(-1, 1, (3,), np.float32)
     action_space = spaces.Box(-1, 1, (2,), np.float32)
