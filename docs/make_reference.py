@@ -514,8 +514,8 @@ def worlds() -> str:
 
     page = (
         "# Workcells and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns the object that a "
-        "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a workcell "
-        "of another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
+        "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a "
+        "workcell of another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
         "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
     )
     rows = (

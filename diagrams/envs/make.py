@@ -40,8 +40,8 @@ class DiagramPool(Generic[Built]):
     """Pool of built diagrams, for reuse by later environments with the same configuration.
 
     A diagram that contains a LeafSystem written in Python is never freed: C++ holds references to the system's methods,
-    the methods hold the system, and no garbage collector finds this cycle. Reuse is safe because everything that changes
-    during a simulation is in a context, and each environment creates its own.
+    the methods hold the system, and no garbage collector finds this cycle. Reuse is safe because everything that
+    changes during a simulation is in a context, and each environment creates its own.
     """
 
     def __init__(self) -> None:

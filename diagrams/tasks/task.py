@@ -247,7 +247,7 @@ class Task(ABC):
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
-        """Return the kinds of prior knowledge, names in `REQUIREMENTS`, that the task provides by overriding a method."""
+        """Return the kinds of prior knowledge that the task provides, names in `REQUIREMENTS`."""
         methods = {
             "demonstrations": "reference",
             "keep_out": "keep_out",

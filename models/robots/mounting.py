@@ -150,7 +150,7 @@ def _find_joint(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], nam
 
 
 def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:
-    """Of the joints, which must be all that their model actuates, in the model's order."""
+    """Return the actuators of the joints, which must be all actuated joints of their model, in the model's order."""
     if not joints:
         return []
     everywhere = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]

@@ -2,7 +2,7 @@
 
 The four folders of the repository are the four parts of this package: `models` (numerics without Drake systems),
 `systems` (one LeafSystem a file), `diagrams` (wiring) and `tools` (the command and the Python API). Importing it
-registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported when they are first used.
+registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use.
 """
 
 from importlib.metadata import version

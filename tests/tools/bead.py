@@ -13,7 +13,7 @@ VIOLATIONS = {"commanded_violation": 1, "measured_violation": 1}
 
 
 class Bead(gymnasium.Env):
-    metadata = {"render_modes": ["human"]}  # noqa: RUF012
+    metadata = {"render_modes": ["human"]}
 
     def __init__(
         self, guidance="skgrl", reward="shaped", observation="state", action_repeat=1, wall=1.0, render_mode=None

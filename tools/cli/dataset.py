@@ -136,7 +136,7 @@ def create_task(
 
     The meshes are drawn assembled, or --plug-pose moves the plug there. The command checks them, selects a contact
     geometry that is fast and stiff enough, inserts the plug by a script, aligned and misaligned, records demonstrations
-    and writes a task folder for guiderail train ./peg. All parameters are in its task.yaml; preview.html shows the task.
+    and writes a task folder for guiderail train ./peg. Parameters are in its task.yaml; preview.html shows the task.
     """
     from guiderail.tools.parts.create_task import ask_unit
     from guiderail.tools.parts.create_task import create_task as create

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
-import guiderail  # noqa: F401 (registers the environments)
+import guiderail
 from guiderail.diagrams.envs import cameras
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage as Task

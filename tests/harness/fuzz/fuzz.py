@@ -5,8 +5,8 @@
     python tests/harness/fuzz/fuzz.py --seed 1 --add FILE   # other inputs, added to the counts in FILE
 
 An input must be accepted, with the values that an independent reader finds in it, or refused with one sentence, within
-2 s of CPU time and 200 MB. Everything else counts as a traceback, a hang, too large or a wrong number, is shown with its
-smallest input, and makes the exit code 1. The same seed tries the same inputs.
+2 s of CPU time and 200 MB. Everything else counts as a traceback, a hang, too large or a wrong number, is shown with
+its smallest input, and makes the exit code 1. The same seed tries the same inputs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a person types, made at random: `--set`, `--env` and reset options mean what they say, or one sentence."""
+"""Random command-line values: `--set`, `--env` and options of a reset are accepted or refused in one sentence."""
 
 import numpy as np
 import pytest
