@@ -198,8 +198,8 @@ def systems() -> str:
         system = getattr(module, name)
         if not (inspect.isclass(system) and issubclass(system, LeafSystem)):
             continue
-        page += f"## {name}\n\n{documented(system)}{table(['', 'port', 'what it is'], ports(system))}"
-        page += signature(name, system) + documented(system.__init__)
+        page += f"## {name}\n\n{signature(name, system)}{documented(system)}"
+        page += table(["", "port", "what it is"], ports(system))
     return page
 
 
@@ -211,8 +211,7 @@ def ports(system: type) -> list[tuple[str, str, str]]:
         lines = re.search(rf"{kind}_ports:\n((?: *- .*\n)+)", block[0] if block else "")
         for line in re.findall(r"- (.*)", lines[1]) if lines else []:
             name, _, more = line.partition(" (")
-            getter = getattr(system, f"get_{name}_{kind}_port", None) or getattr(system, f"get_{kind}_port", None)
-            own = getter if getter is not None and getter.__qualname__.startswith(system.__name__) else None
+            own = vars(system).get(f"get_{name}_{kind}_port") or vars(system).get(f"get_{kind}_port")
             words = inspect.getdoc(own) if own else more.rstrip(")")
             text, found = sections(words or "")
             is_name = name.isidentifier()
@@ -220,7 +219,10 @@ def ports(system: type) -> list[tuple[str, str, str]]:
                 (
                     kind,
                     code(name) if is_name else cell(name),
-                    cell(text or " ".join(words for rows_of in found.values() for _, words in rows_of)),
+                    cell(
+                        text.removeprefix("Return the port of the ")
+                        or " ".join(words for rows_of in found.values() for _, words in rows_of)
+                    ),
                 )
             )
     return rows
@@ -279,7 +281,7 @@ def exported(name: str, thing: Any) -> str:
     own = "__init__" in vars(thing) and not dataclasses.is_dataclass(thing)
     if own or dataclasses.is_dataclass(thing):
         page = signature(name, thing) + page
-    if own and inspect.getdoc(thing.__init__):
+    if own and thing.__init__.__doc__:
         page += documented(thing.__init__)
     rows = []
     for method, value in vars(thing).items():

@@ -24,21 +24,19 @@ class Policy:
 
     It computes the same action as Stable-Baselines3's `predict(deterministic=True)`, in single precision, with NumPy
     alone, so that a robot's computer needs neither PyTorch nor the learner.
+
+    Args:
+        layers: Weight (out, in) and bias (out,) of each layer, first to last.
+        description: Content of `policy.json`: the shape of observations, the limits of actions, `activation` ("relu",
+            the default, or "normalized_relu"), and for images `pool`, the side of the squares of pixels that are
+            averaged.
+
+    Raises:
+        ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from observation
+            to action, or a number is not finite.
     """
 
     def __init__(self, layers: list[tuple[np.ndarray, np.ndarray]], description: Mapping[str, Any]):
-        """Construct a policy.
-
-        Args:
-            layers: Weight (out, in) and bias (out,) of each layer, first to last.
-            description: Content of `policy.json`: the shape of observations, the limits of actions, `activation`
-                ("relu", the default, or "normalized_relu"), and for images `pool`, the side of the squares of pixels
-                that are averaged.
-
-        Raises:
-            ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from
-                observation to action, or a number is not finite.
-        """
         self._layers = layers
         self.description = dict(description)
         activation = self.description.setdefault("activation", "relu")

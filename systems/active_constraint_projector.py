@@ -45,6 +45,16 @@ class ActiveConstraintProjector(LeafSystem):
     All poses are (6,), [x y z Rz Ry Rx] in metres and radians; the other ports are (1,). ``state`` is the number of the
     template's state. A violation is the distance from the projection, the larger of metres and radians, 0 inside.
 
+    Args:
+        template: The template.
+        frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+        period: Control period [s], positive.
+        max_tracking_error: Distance between the robot and its command beyond which the command waits [m], positive.
+
+    Raises:
+        InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the
+            measured pose is not finite.
+
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
     """
@@ -56,18 +66,6 @@ class ActiveConstraintProjector(LeafSystem):
         period: float,
         max_tracking_error: float = np.inf,
     ):
-        """Construct the system.
-
-        Args:
-            template: The template.
-            frames: Poses of the template's objects by name, in the frame of the poses at the ports.
-            period: Control period [s], positive.
-            max_tracking_error: Distance between the robot and its command beyond which the command waits [m], positive.
-
-        Raises:
-            InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the
-                measured pose is not finite.
-        """
         super().__init__()
         check_period(period)
         if not max_tracking_error > 0.0:

@@ -81,6 +81,20 @@ class CartesianImpedanceController(LeafSystem):
     is not connected, commands never time out. ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench``
     is (6,), force first, in the axes of T. ``saturation`` (1,) is 1 while the wrench or a motor is at its limit.
     ``command_timed_out`` (1,) is 1 while no valid command is available.
+
+    Args:
+        plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.
+        target: Frame T, fixed in the world.
+        tool_centre: Frame P.
+        gains: Impedance parameters.
+        period: Period of the command check [s], positive.
+        stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the impedance is
+            not strictly passive: turning the axes of a loaded spring can add energy.
+        compensate_gravity: False if the robot's own controller compensates gravity.
+        timeout: Age above which a desired pose is stale [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(
@@ -95,22 +109,6 @@ class CartesianImpedanceController(LeafSystem):
         compensate_gravity: bool = True,
         timeout: float = 0.1,
     ):
-        """Construct the system.
-
-        Args:
-            plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.
-            target: Frame T, fixed in the world.
-            tool_centre: Frame P.
-            gains: Impedance parameters.
-            period: Period of the command check [s], positive.
-            stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the
-                impedance is not strictly passive: turning the axes of a loaded spring can add energy.
-            compensate_gravity: False if the robot's own controller compensates gravity.
-            timeout: Age above which a desired pose is stale [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         num_joints = plant.num_positions()
         if np.shape(gains.posture) != (num_joints,):

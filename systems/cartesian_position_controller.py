@@ -72,6 +72,19 @@ class CartesianPositionController(LeafSystem):
     (n,) [rad]. ``pose`` is (6,), the pose of the tool centre at the joint command. ``stuck`` (1,) is 1 while the
     desired direction cannot be followed. ``command_timed_out`` (1,) is 1 while no valid command is available. All
     outputs depend on state alone; there is no direct feedthrough.
+
+    Args:
+        plant: Model of the arm alone, finalized; its joint limits are satisfied.
+        target: Frame T, fixed in the world.
+        tool_centre: Frame P.
+        posture: Joint positions (n,) that the null-space control returns to [rad], finite.
+        period: Period of the joint commands [s], positive.
+        speed_limits: Speed limits of the tool centre.
+        posture_gain: Gain of the return to the posture [1/s], not negative.
+        timeout: Age above which a desired pose is stale [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range. At initialization, if a measured position is not finite.
     """
 
     def __init__(
@@ -86,21 +99,6 @@ class CartesianPositionController(LeafSystem):
         posture_gain: float = 0.5,
         timeout: float = 0.1,
     ):
-        """Construct the system.
-
-        Args:
-            plant: Model of the arm alone, finalized; its joint limits are satisfied.
-            target: Frame T, fixed in the world.
-            tool_centre: Frame P.
-            posture: Joint positions (n,) that the null-space control returns to [rad], finite.
-            period: Period of the joint commands [s], positive.
-            speed_limits: Speed limits of the tool centre.
-            posture_gain: Gain of the return to the posture [1/s], not negative.
-            timeout: Age above which a desired pose is stale [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range. At initialization, if a measured position is not finite.
-        """
         super().__init__()
         check_period(period)
         num_joints = plant.num_positions()

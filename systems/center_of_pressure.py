@@ -24,17 +24,15 @@ class CenterOfPressure(LeafSystem):
         - center_of_pressure
 
     ``wrench`` is (6,), force and torque about the tool centre [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
+
+    Args:
+        min_force: Force along z below which there is no contact [N], positive.
+
+    Raises:
+        InputError: If the force is not positive.
     """
 
     def __init__(self, min_force: float):
-        """Construct the system.
-
-        Args:
-            min_force: Force along z below which there is no contact [N], positive.
-
-        Raises:
-            InputError: If the force is not positive.
-        """
         super().__init__()
         if not min_force > 0.0:
             raise InputError(f"a center of pressure needs a positive minimum force, not {min_force} N")

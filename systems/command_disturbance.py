@@ -25,20 +25,18 @@ class CommandDisturbance(LeafSystem):
         - delivered_command
 
     All are (n,). ``pose`` is the measured pose, read at initialization only.
+
+    Args:
+        size: Size n of a command, at least 1.
+        period: Period of the commands [s], positive.
+        loss_probability: p, from 0 to less than 1.
+        delay: k periods, at least 0.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
-        """Construct the system.
-
-        Args:
-            size: Size n of a command, at least 1.
-            period: Period of the commands [s], positive.
-            loss_probability: p, from 0 to less than 1.
-            delay: k periods, at least 0.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         if size < 1:

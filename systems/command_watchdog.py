@@ -28,19 +28,17 @@ class CommandWatchdog(LeafSystem):
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``command_time`` is (1,),
     the time stamp of ``desired_pose`` [s]; if it is not connected, commands never time out. ``command_timed_out`` (1,)
     is 1 while no valid command is available.
+
+    Args:
+        period: Period of the check [s], positive; ideally the period of the commands.
+        timeout: Age above which a command is stale [s], positive.
+        pose_size: Number of coordinates O, at least 1.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, period: float, timeout: float = 0.1, pose_size: int = 6):
-        """Construct the system.
-
-        Args:
-            period: Period of the check [s], positive; ideally the period of the commands.
-            timeout: Age above which a command is stale [s], positive.
-            pose_size: Number of coordinates O, at least 1.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         if pose_size < 1:
             raise InputError(f"a pose has at least one coordinate, not {pose_size}")

@@ -22,21 +22,19 @@ class ConstraintViolation(LeafSystem):
 
     ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c; `UNCONSTRAINED` if there is no
     constraint. It depends on the pose and the control step alone, so it evaluates every guidance in the same way.
+
+    Args:
+        constraints: Constraints on O outputs, constant or one set per control step.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If the period is not positive.
     """
 
     #: Violation if there is no constraint: finite, so that it can be logged.
     UNCONSTRAINED = -1e30
 
     def __init__(self, constraints: LinearConstraints, period: float):
-        """Construct the system.
-
-        Args:
-            constraints: Constraints on O outputs, constant or one set per control step.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If the period is not positive.
-        """
         super().__init__()
         check_period(period)
         self._constraints, self._period = constraints, period

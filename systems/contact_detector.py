@@ -31,22 +31,20 @@ class ContactDetector(LeafSystem):
     ``contact_results`` is the plant's output. ``collision`` (1,) is 1 while bodies and obstacles are in contact.
     ``has_collided`` (1,) is 1 from the first contact of the episode on. ``contact_force`` is (1,), the norm of the
     largest contact force between the two sets [N]. Point contact and hydroelastic contact both count.
+
+    Args:
+        plant: Finalized plant.
+        bodies: Bodies that must not touch `obstacles`.
+        obstacles: Obstacles; no body may be in both sets.
+        period: Plant step [s], positive.
+
+    Raises:
+        InputError: If the period is not positive, or a body is in both sets.
     """
 
     def __init__(
         self, plant: MultibodyPlant, bodies: Sequence[RigidBody], obstacles: Sequence[RigidBody], period: float
     ):
-        """Construct the system.
-
-        Args:
-            plant: Finalized plant.
-            bodies: Bodies that must not touch `obstacles`.
-            obstacles: Obstacles; no body may be in both sets.
-            period: Plant step [s], positive.
-
-        Raises:
-            InputError: If the period is not positive, or a body is in both sets.
-        """
         super().__init__()
         check_period(period)
         self._bodies = {int(body.index()) for body in bodies}

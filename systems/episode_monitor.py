@@ -72,20 +72,18 @@ class EpisodeMonitor(LeafSystem):
         - termination
 
     ``termination`` is (1,), an index into `TERMINATIONS`; 0 while the episode continues.
+
+    Args:
+        terms: Termination terms, at least one; the first one that is met takes precedence.
+        period: Control period [s], positive.
+        task_name: Name of the task, for messages.
+
+    Raises:
+        InputError: If there is no term, the period is not positive, two terms disagree about the size of a signal, or
+            the parameters of a function are not named like its signals.
     """
 
     def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):
-        """Construct the system.
-
-        Args:
-            terms: Termination terms, at least one; the first one that is met takes precedence.
-            period: Control period [s], positive.
-            task_name: Name of the task, for messages.
-
-        Raises:
-            InputError: If there is no term, the period is not positive, two terms disagree about the size of a signal,
-                or the parameters of a function are not named like its signals.
-        """
         super().__init__()
         if not terms:
             raise InputError("a monitor needs at least one condition")

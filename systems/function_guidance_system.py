@@ -35,21 +35,19 @@ class FunctionGuidanceSystem(LeafSystem):
 
     ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,). The
     outputs are state without direct feedthrough, so that the measured pose of a station can close the loop.
+
+    Args:
+        function: Pure function (action, pose, wrench) → desired pose. A reset cannot restore internal memory.
+        action_size: A, at least 1.
+        pose_size: O, at least 1.
+        wrench_size: W, at least 1.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If a size or the period is out of range.
     """
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
-        """Construct the system.
-
-        Args:
-            function: Pure function (action, pose, wrench) → desired pose. A reset cannot restore internal memory.
-            action_size: A, at least 1.
-            pose_size: O, at least 1.
-            wrench_size: W, at least 1.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If a size or the period is out of range.
-        """
         super().__init__()
         check_period(period)
         if min(action_size, pose_size, wrench_size) < 1:

@@ -23,20 +23,18 @@ class GripperCommand(LeafSystem):
         - desired_state
 
     ``position`` is (n,) [m or rad]. ``desired_state`` is (2n,), positions and velocities.
+
+    Args:
+        lower: Lower joint limits, (n,) [m or rad].
+        upper: Upper joint limits, (n,) [m or rad].
+        opening: Initial joint positions, (n,) [m or rad].
+        period: Period at which the desired position is stored [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, opening: np.ndarray, *, period: float):
-        """Construct the system.
-
-        Args:
-            lower: Lower joint limits, (n,) [m or rad].
-            upper: Upper joint limits, (n,) [m or rad].
-            opening: Initial joint positions, (n,) [m or rad].
-            period: Period at which the desired position is stored [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         self._lower, self._upper = np.array(lower, dtype=float), np.array(upper, dtype=float)
         opening = np.array(opening, dtype=float)

@@ -26,18 +26,16 @@ class HeartbeatMonitor(LeafSystem):
 
     ``heartbeat`` is abstract: the newest `Heartbeat`, or None. ``status_fault`` and ``fault`` are (1,), codes of
     `Fault`; a status fault takes precedence.
+
+    Args:
+        period: Sampling period [s], positive.
+        timeout: Largest accepted age of a heartbeat [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, *, period: float, timeout: float):
-        """Construct the monitor.
-
-        Args:
-            period: Sampling period [s], positive.
-            timeout: Largest accepted age of a heartbeat [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         if not 0.0 < timeout < np.inf:

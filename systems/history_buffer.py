@@ -28,19 +28,17 @@ class HistoryBuffer(LeafSystem):
 
     ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
     ``output``. ``history`` is state without direct feedthrough, so that the primitive can close a loop around it.
+
+    Args:
+        num_outputs: O, at least 1.
+        length: P, at least 1.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, num_outputs: int, length: int, period: float):
-        """Construct the system.
-
-        Args:
-            num_outputs: O, at least 1.
-            length: P, at least 1.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         if num_outputs < 1 or length < 1:
             raise InputError(f"a history needs at least one output and one step, not {num_outputs} and {length}")

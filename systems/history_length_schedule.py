@@ -28,6 +28,18 @@ class HistoryLengthSchedule(LeafSystem):
 
     ``wrench`` is (W,), measured; its first three entries are a force [N] (its first two for W = 2).
     ``history_length`` is (1,), P; it is state, initially the longest.
+
+    Args:
+        lengths: History lengths in any order, each at least 1, because without a history a command would not start at
+            the end of its predecessor.
+        period: Control period [s], positive.
+        contact_threshold: Force above which contact begins [N].
+        release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.
+        dwell_steps: Control steps in free space before the next longer length, at least 1.
+        wrench_size: W, at least 1.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(
@@ -40,20 +52,6 @@ class HistoryLengthSchedule(LeafSystem):
         dwell_steps: int = 10,
         wrench_size: int = 6,
     ):
-        """Construct the system.
-
-        Args:
-            lengths: History lengths in any order, each at least 1, because without a history a command would not start
-                at the end of its predecessor.
-            period: Control period [s], positive.
-            contact_threshold: Force above which contact begins [N].
-            release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.
-            dwell_steps: Control steps in free space before the next longer length, at least 1.
-            wrench_size: W, at least 1.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         if not len(lengths) or min(lengths) < 1:
             raise InputError(f"history lengths are whole numbers from 1, at least one of them, not {list(lengths)}")

@@ -26,17 +26,15 @@ class ImpedanceMonitor(LeafSystem):
 
     ``impedance_wrench`` is (6,), force [N] first, then torque [Nm]. ``contact_force`` is (1,), the norm of the force
     [N]. ``saturation`` (1,) is 1 if any of the six components is within 0.1 % of its limit, otherwise 0.
+
+    Args:
+        limits: Limits of the magnitudes of the components, (6,) [N, Nm], positive.
+
+    Raises:
+        InputError: If there are not six positive limits.
     """
 
     def __init__(self, limits: np.ndarray):
-        """Construct the system.
-
-        Args:
-            limits: Limits of the magnitudes of the components, (6,) [N, Nm], positive.
-
-        Raises:
-            InputError: If there are not six positive limits.
-        """
         super().__init__()
         self._limits = np.array(limits, dtype=float)
         if self._limits.shape != (6,) or not (self._limits > 0.0).all():

@@ -32,6 +32,17 @@ class JointTorqueWrench(LeafSystem):
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool centre P in the axes of
     T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, without direct feedthrough.
     Samples that are not finite are skipped.
+
+    Args:
+        plant: Model of the arm alone, finalized.
+        target: Frame T.
+        tool_centre: Frame P.
+        period: Sampling period [s], positive.
+        time_constant: τ of the filter [s]; 0 disables it.
+        damping: Damping of the pseudoinverse, not negative.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(
@@ -44,19 +55,6 @@ class JointTorqueWrench(LeafSystem):
         time_constant: float,
         damping: float = 1e-4,
     ):
-        """Construct the system.
-
-        Args:
-            plant: Model of the arm alone, finalized.
-            target: Frame T.
-            tool_centre: Frame P.
-            period: Sampling period [s], positive.
-            time_constant: τ of the filter [s]; 0 disables it.
-            damping: Damping of the pseudoinverse, not negative.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         if not 0.0 <= time_constant < np.inf or not damping >= 0.0:

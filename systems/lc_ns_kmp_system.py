@@ -49,6 +49,18 @@ class LcNsKmpSystem(LeafSystem):
     The step is state and counts control periods since time zero. The command is a pure function of step, action and
     history, evaluated once per control step (see CONTRIBUTING.md, "Rates and the order of events"). The evaluation
     raises an `InputError` if no primitive has the selected history length.
+
+    Args:
+        primitive: Primitive with O outputs and a history of P outputs.
+        gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); ones by default.
+        period: Control period [s], positive. It must be that of the reference trajectory, otherwise the speed differs
+            from the demonstrations.
+        shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their gains
+            (O,).
+
+    Raises:
+        InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
+            `shorter` has no shorter history, the history length of another one, or other constraints.
     """
 
     #: ``constraint_violation`` if there is no constraint: finite, so that it can be logged and reduced.
@@ -61,21 +73,6 @@ class LcNsKmpSystem(LeafSystem):
         period: float,
         shorter: Sequence[tuple[LcNsKmp, np.ndarray]] = (),
     ):
-        """Construct the system.
-
-        Args:
-            primitive: Primitive with O outputs and a history of P outputs.
-            gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); ones by
-                default.
-            period: Control period [s], positive. It must be that of the reference trajectory, otherwise the speed
-                differs from the demonstrations.
-            shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their
-                gains (O,).
-
-        Raises:
-            InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
-                `shorter` has no shorter history, the history length of another one, or other constraints.
-        """
         super().__init__()
         outputs = primitive.num_outputs
         if any(not 0 < other.history < primitive.history for other, _ in shorter):

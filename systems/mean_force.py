@@ -27,19 +27,17 @@ class MeanForce(LeafSystem):
 
     ``force_sum`` is (D,), the sum over all plant steps so far [N]. ``force`` is (D,), the mean over the plant steps
     since the last control step [N]. ``magnitude`` is (1,), its norm [N].
+
+    Args:
+        size: D, at least 1.
+        substeps: Plant steps per control step, at least 1.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, size: int, substeps: int, period: float):
-        """Construct the system.
-
-        Args:
-            size: D, at least 1.
-            substeps: Plant steps per control step, at least 1.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         if size < 1 or substeps < 1:
             raise InputError(f"a mean needs at least one component and one substep, not {size} and {substeps}")

@@ -23,16 +23,14 @@ class MeasuredPose(LeafSystem):
         - pose
 
     ``body_poses`` is the plant's output. ``pose`` is (6,), [x y z Rz Ry Rx] in metres and radians.
+
+    Args:
+        plant: Finalized plant.
+        body: Body P.
+        X_WT: Pose of frame T in the world.
     """
 
     def __init__(self, plant: MultibodyPlant, body: RigidBody, X_WT: RigidTransform):
-        """Construct the system.
-
-        Args:
-            plant: Finalized plant.
-            body: Body P.
-            X_WT: Pose of frame T in the world.
-        """
         super().__init__()
         self._body = int(body.index())
         self._X_TW = X_WT.inverse()

@@ -25,22 +25,20 @@ class MeshcatDevice(LeafSystem):
 
     ``action`` is (n,), in [−1, 1], sampled once per control period. An entry is the value of its gamepad axis outside
     the dead zone, otherwise the value of its slider; each slider has two keys.
+
+    Args:
+        meshcat: Meshcat instance that shows the sliders and reads the gamepad.
+        axes: Index and sign of the gamepad axis of each entry.
+        keys: JavaScript codes of the keys that decrease and increase the slider of each entry.
+        period: Sampling period [s], positive.
+
+    Raises:
+        InputError: If the period is not positive, or the numbers of axes and key pairs differ.
     """
 
     def __init__(
         self, meshcat: Meshcat, axes: Sequence[tuple[int, float]], keys: Sequence[tuple[str, str]], period: float
     ):
-        """Construct the system.
-
-        Args:
-            meshcat: Meshcat instance that shows the sliders and reads the gamepad.
-            axes: Index and sign of the gamepad axis of each entry.
-            keys: JavaScript codes of the keys that decrease and increase the slider of each entry.
-            period: Sampling period [s], positive.
-
-        Raises:
-            InputError: If the period is not positive, or the numbers of axes and key pairs differ.
-        """
         super().__init__()
         check_period(period)
         if len(axes) != len(keys) or not axes:

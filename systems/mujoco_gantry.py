@@ -88,6 +88,17 @@ class MujocoGantry(LeafSystem):
 
     If the engine diverges, the update raises a `DivergedError`. The engine's automatic reset is disabled, because it
     would move the tool to the target.
+
+    Args:
+        model: MuJoCo model with bodies of the names in `MovedBodies`; this system writes to it.
+        plant: Finalized plant without joints, registered as a source of geometry.
+        moved: Bodies of the plant that the model simulates.
+        X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
+        period: Update period [s], positive, an integer multiple of the model's step.
+        time_constant: τ of the wrench filter [s]; 0 disables it.
+
+    Raises:
+        InputError: If a number is out of range, or the model's step does not divide the period.
     """
 
     def __init__(
@@ -99,19 +110,6 @@ class MujocoGantry(LeafSystem):
         period: float,
         time_constant: float,
     ):
-        """Construct the system.
-
-        Args:
-            model: MuJoCo model with bodies of the names in `MovedBodies`; this system writes to it.
-            plant: Finalized plant without joints, registered as a source of geometry.
-            moved: Bodies of the plant that the model simulates.
-            X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
-            period: Update period [s], positive, an integer multiple of the model's step.
-            time_constant: τ of the wrench filter [s]; 0 disables it.
-
-        Raises:
-            InputError: If a number is out of range, or the model's step does not divide the period.
-        """
         super().__init__()
         check_period(period)
         if not 0.0 <= time_constant < np.inf:

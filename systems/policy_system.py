@@ -36,6 +36,15 @@ class PolicySystem(LeafSystem):
     ``observation`` is a vector (N,) or an abstract image. The policy's argument is an array as returned by an
     environment: (N,) of float32 or (h, w, 3) of uint8. ``action`` is (A,), in [−1, 1]. It is state without direct
     feedthrough: zero before the first evaluation and after a reset.
+
+    Args:
+        policy: Pure function observation → action (A,), clipped to [−1, 1]. A reset cannot restore internal memory.
+        observation: N, at least 1, or a model value of an image port, `Value(ImageRgba8U(w, h))`.
+        action_size: A, at least 1.
+        period: Action period [s], positive, an integer multiple of the control period.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(
@@ -45,17 +54,6 @@ class PolicySystem(LeafSystem):
         action_size: int,
         period: float,
     ):
-        """Construct the system.
-
-        Args:
-            policy: Pure function observation → action (A,), clipped to [−1, 1]. A reset cannot restore internal memory.
-            observation: N, at least 1, or a model value of an image port, `Value(ImageRgba8U(w, h))`.
-            action_size: A, at least 1.
-            period: Action period [s], positive, an integer multiple of the control period.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         if action_size < 1:

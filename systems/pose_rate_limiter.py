@@ -28,19 +28,17 @@ class PoseRateLimiter(LeafSystem):
 
     ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians.
     ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`.
+
+    Args:
+        period: Sampling period [s], positive.
+        speed: Speed limit of the tool centre [m/s], positive.
+        angular_speed: Speed limit of each angle [rad/s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, *, period: float, speed: float = 0.25, angular_speed: float = 1.5):
-        """Construct the system.
-
-        Args:
-            period: Sampling period [s], positive.
-            speed: Speed limit of the tool centre [m/s], positive.
-            angular_speed: Speed limit of each angle [rad/s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         if not 0.0 < speed < np.inf or not 0.0 < angular_speed < np.inf:

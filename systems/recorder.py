@@ -44,19 +44,17 @@ class Recorder(LeafSystem):
         - num_recorded
 
     ``num_recorded`` is (1,), the number of samples so far. `recording` returns the samples.
+
+    Args:
+        signals: Size of each signal by name, at least one signal.
+        num_samples: Maximum number of samples, at least 1.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
-        """Construct the system.
-
-        Args:
-            signals: Size of each signal by name, at least one signal.
-            num_samples: Maximum number of samples, at least 1.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         if not signals or num_samples < 1:
             raise InputError("a recorder needs at least one signal, and room for one sample")

@@ -26,19 +26,17 @@ class RelativePoses(LeafSystem):
 
     ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,): for each body its position in metres and its
     orientation as a rotation vector of at most π radians.
+
+    Args:
+        plant: Finalized plant.
+        bodies: Bodies B, at least one.
+        reference: Body R.
+
+    Raises:
+        InputError: If there is no body.
     """
 
     def __init__(self, plant: MultibodyPlant, bodies: Sequence[RigidBody], reference: RigidBody):
-        """Construct the system.
-
-        Args:
-            plant: Finalized plant.
-            bodies: Bodies B, at least one.
-            reference: Body R.
-
-        Raises:
-            InputError: If there is no body.
-        """
         super().__init__()
         if not bodies:
             raise InputError("relative poses need at least one body")

@@ -23,17 +23,15 @@ class Residual(LeafSystem):
 
     All are (O,); ``action`` is in [−1, 1]. Drake's `Adder` computes the same sum, but its output counts as
     time-dependent, so downstream outputs would be computed again at every plant step.
+
+    Args:
+        gain: Diagonal of K, (O,), in units of the reference per unit of action.
+
+    Raises:
+        InputError: If the gain is not a vector of finite numbers.
     """
 
     def __init__(self, gain: np.ndarray):
-        """Construct the system.
-
-        Args:
-            gain: Diagonal of K, (O,), in units of the reference per unit of action.
-
-        Raises:
-            InputError: If the gain is not a vector of finite numbers.
-        """
         super().__init__()
         self._gain = np.array(gain, dtype=float)
         if self._gain.ndim != 1 or not self._gain.size or not np.isfinite(self._gain).all():

@@ -44,20 +44,17 @@ class RewardSystem(LeafSystem):
 
     All outputs are (1,). The system has no state: values of the previous control step come from a `ZeroOrderHold` of
     the control period.
+
+    Args:
+        terms: Reward terms, at least one, with different names, neither empty nor "reward".
+        task_name: Name of the task, for messages.
+
+    Raises:
+        InputError: If there is no term, a name is not allowed, two terms disagree about the size of a signal, or the
+            parameters of a function are not named like its signals. At evaluation, if a term is not one finite number.
     """
 
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
-        """Construct the system.
-
-        Args:
-            terms: Reward terms, at least one, with different names, neither empty nor "reward".
-            task_name: Name of the task, for messages.
-
-        Raises:
-            InputError: If there is no term, a name is not allowed, two terms disagree about the size of a signal, or
-                the parameters of a function are not named like its signals. At evaluation, if a term is not one finite
-                number.
-        """
         super().__init__()
         names = [term.name for term in terms]
         self._terms, self._of_task = tuple(terms), f" of {task_name}" if task_name else ""

@@ -28,18 +28,16 @@ class SafetyFilter(LeafSystem):
 
     ``desired_pose``, ``pose`` (measured) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1 if a box changed the
     command.
+
+    Args:
+        keep_out: Boxes and constraints.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If the period is not positive.
     """
 
     def __init__(self, keep_out: KeepOut, period: float):
-        """Construct the system.
-
-        Args:
-            keep_out: Boxes and constraints.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If the period is not positive.
-        """
         super().__init__()
         self._keep_out = keep_out
         outputs = keep_out.num_outputs

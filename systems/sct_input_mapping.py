@@ -18,8 +18,8 @@ class SctInputMapping(LeafSystem):
 
         H^im = displace_q(H, map_q(u))    (equations 2.19 and 2.20)
 
-    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input gives a
-    NaN pose, which `ActiveConstraintProjector` refuses.
+    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input results in
+    a NaN pose, which `ActiveConstraintProjector` refuses.
 
     .. pydrake_system::
 
@@ -34,21 +34,19 @@ class SctInputMapping(LeafSystem):
     ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians;
     ``state`` is (1,), the number of the template's state.
 
+    Args:
+        template: The template.
+        frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+        period: Time for which an input is held [s], positive.
+
+    Raises:
+        InputError: If the period is not positive, or a frame is missing or not finite.
+
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
-        """Construct the system.
-
-        Args:
-            template: The template.
-            frames: Poses of the template's objects by name, in the frame of the poses at the ports.
-            period: Time for which an input is held [s], positive.
-
-        Raises:
-            InputError: If the period is not positive, or a frame is missing or not finite.
-        """
         super().__init__()
         check_period(period)
         self._template = template

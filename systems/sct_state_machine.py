@@ -37,21 +37,19 @@ class SctStateMachine(LeafSystem):
     the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_t of the current state in metres or
     radians. ``progress`` is (1,), on one scale for all states: its increase is d_{t−1} − d_t of equation 3.2.
 
+    Args:
+        template: The template.
+        frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If the period is not positive, or a frame is missing or not finite.
+
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
-        """Construct the system.
-
-        Args:
-            template: The template.
-            frames: Poses of the template's objects by name, in the frame of the poses at the ports.
-            period: Control period [s], positive.
-
-        Raises:
-            InputError: If the period is not positive, or a frame is missing or not finite.
-        """
         super().__init__()
         check_period(period)
         self._template, self._period = template, period

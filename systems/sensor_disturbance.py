@@ -25,19 +25,17 @@ class SensorDisturbance(LeafSystem):
         - disturbed_measurement
 
     Both are (n,), in the units of the sensor.
+
+    Args:
+        period: Period h of noise and delay [s], positive.
+        noise: Standard deviations σ, (n,), not negative.
+        delay: k periods, at least 0.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, period: float, noise: np.ndarray, delay: int = 0):
-        """Construct the system.
-
-        Args:
-            period: Period h of noise and delay [s], positive.
-            noise: Standard deviations σ, (n,), not negative.
-            delay: k periods, at least 0.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         self._noise = np.array(noise, dtype=float)

@@ -89,18 +89,16 @@ class StatusWatchdog(LeafSystem):
     [rad, rad/s], and ``external_torque`` is (n,) [Nm]; both are those of the last accepted status and zero before it.
     ``fault`` is (1,), a code of `Fault`. ``age`` is (1,), the age of the last accepted status relative to the earliest
     arrival [s]. ``is_new`` (1,) is 1 at the check at which a status is accepted.
+
+    Args:
+        limits: Plausibility limits of a status.
+        period: Period of the check, and of the status messages [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, limits: StatusLimits, *, period: float):
-        """Construct the watchdog.
-
-        Args:
-            limits: Plausibility limits of a status.
-            period: Period of the check, and of the status messages [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         self._limits, self._period = limits, period

@@ -21,19 +21,17 @@ class TorquePublisher(LeafSystem):
         - is_sending
 
     ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0.
+
+    Args:
+        write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
+        num_joints: n, at least 1.
+        period: Publishing period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, write: Callable[[np.ndarray, float], None], num_joints: int, *, period: float):
-        """Construct the system.
-
-        Args:
-            write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
-            num_joints: n, at least 1.
-            period: Publishing period [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         if num_joints < 1:

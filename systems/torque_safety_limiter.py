@@ -115,19 +115,17 @@ class TorqueSafetyLimiter(LeafSystem):
     ``fault`` is (1,), the code of the `Fault` that stopped the arm, or 0. ``arm_state`` is (1,), a value of `ArmState`.
     ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are sent. ``not_following`` (1,) is 1 while the
     desired pose is not followed: the arm is stopped or taking over, or no valid command is available.
+
+    Args:
+        plant: Model of the arm and its payload alone, finalized; its inertia is used.
+        limits: Limits of measured and sent values.
+        period: Period of the torque commands [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float):
-        """Construct the limiter.
-
-        Args:
-            plant: Model of the arm and its payload alone, finalized; its inertia is used.
-            limits: Limits of measured and sent values.
-            period: Period of the torque commands [s], positive.
-
-        Raises:
-            InputError: If an argument is out of range.
-        """
         super().__init__()
         check_period(period)
         num_joints = plant.num_positions()

@@ -35,6 +35,18 @@ class WrenchSensor(LeafSystem):
 
     The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
     state: one sample old, zero after a reset, without direct feedthrough.
+
+    Args:
+        plant: Finalized plant, connected to this system.
+        wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
+        tool: Bodies behind the wrist, welded together.
+        centre: Centre of compliance P, fixed to the first body of `tool`.
+        R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
+        period: Sampling period [s], positive; ideally the plant's time step.
+        time_constant: τ of the filter [s]; 0 disables it.
+
+    Raises:
+        InputError: If an argument is out of range, or the first body of `tool` is not the child of the wrist.
     """
 
     def __init__(
@@ -47,20 +59,6 @@ class WrenchSensor(LeafSystem):
         period: float,
         time_constant: float,
     ):
-        """Construct the system.
-
-        Args:
-            plant: Finalized plant, connected to this system.
-            wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
-            tool: Bodies behind the wrist, welded together.
-            centre: Centre of compliance P, fixed to the first body of `tool`.
-            R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
-            period: Sampling period [s], positive; ideally the plant's time step.
-            time_constant: τ of the filter [s]; 0 disables it.
-
-        Raises:
-            InputError: If an argument is out of range, or the first body of `tool` is not the child of the wrist.
-        """
         super().__init__()
         check_period(period)
         if not 0.0 <= time_constant < np.inf:

@@ -44,18 +44,17 @@ class AttackResult:
 
 
 class Adversary:
-    """Search for the worst action sequences of a loop."""
+    """Search for the worst action sequences of a loop.
+
+    Args:
+        loop: Loop to attack.
+        can_be_corrected: Mask (N,) of the steps at which a constraint can be active; the worst sequences are searched
+            for these and for the other steps.
+        seed: Seed of all random numbers.
+        attacks_budgets: If True, the variations increase the budgets of corrections, not the quantities.
+    """
 
     def __init__(self, loop: CertifiedLoop, can_be_corrected: np.ndarray, seed: int = 0, attacks_budgets: bool = False):
-        """Prepare the search.
-
-        Args:
-            loop: Loop to attack.
-            can_be_corrected: Mask (N,) of the steps at which a constraint can be active; the worst sequences are
-                searched for these and for the other steps.
-            seed: Seed of all random numbers.
-            attacks_budgets: If True, the variations increase the budgets of corrections, not the quantities.
-        """
         primitive = loop.primitive
         self._loop, self._rng, self._attacks_budgets = loop, np.random.default_rng(seed), attacks_budgets
         self._moved = np.flatnonzero(loop.gains)

@@ -105,18 +105,17 @@ def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
 
 
 class MultiplierSearch:
-    """Greedy search for Lagrange multipliers that tighten the bound in a direction."""
+    """Greedy search for Lagrange multipliers that tighten the bound in a direction.
+
+    Args:
+        loop: Primitive in its loop.
+        middle: Motion without actions, as `reach` returns it.
+        generators: Generators of `reach`, followed by those of `residue_generators`.
+        first: First step at which a constraint can be active.
+        budget: Budget of the corrections.
+    """
 
     def __init__(self, loop: CertifiedLoop, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget):
-        """Prepare the search.
-
-        Args:
-            loop: Primitive in its loop.
-            middle: Motion without actions, as `reach` returns it.
-            generators: Generators of `reach`, followed by those of `residue_generators`.
-            first: First step at which a constraint can be active.
-            budget: Budget of the corrections.
-        """
         self._generators, self._first, self._past = generators, first, loop.primitive.history
         self._steps, outputs = loop.primitive.num_steps, loop.primitive.num_outputs
         moved = loop.gains != 0.0

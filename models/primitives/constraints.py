@@ -14,22 +14,18 @@ TOLERANCE = 1e-9
 class LinearConstraints:
     """Constraints G y ≥ c, the same at every step or different from step to step.
 
+    Args:
+        G: Rows g_f, (F, O) or (N, F, O), finite [unit of c / unit of the output].
+        c: Lower bounds, (F,) or (N, F), finite.
+
+    Raises:
+        InputError: If shapes do not match, a number is not finite, or no output satisfies all constraints of a step.
+
     Attributes:
-        G: Rows g_f, (F, O) or, for each step, (N, F, O).
-        c: Lower bounds, (F,) or (N, F).
+        G, c: Copies of the arguments, read-only.
     """
 
     def __init__(self, G: np.ndarray, c: np.ndarray):
-        """Check and store the arrays, which become read-only.
-
-        Args:
-            G: Rows g_f, (F, O) or (N, F, O), finite [unit of c / unit of the output].
-            c: Lower bounds, (F,) or (N, F), finite.
-
-        Raises:
-            InputError: If shapes do not match, a number is not finite, or no output satisfies all constraints of a
-                step.
-        """
         self.G, self.c = as_numbers(G, "G"), as_numbers(c, "c")
         if self.G.ndim not in (2, 3) or self.c.shape != self.G.shape[:-1]:
             raise InputError(

@@ -16,10 +16,18 @@ class Demonstrations:
 
     Repeated samples (same time, same outputs) are dropped.
 
-    Attributes:
-        times: M arrays (N_m,), strictly increasing [s or phase].
+    Args:
+        times: One clock (N,) for all demonstrations, or M clocks (N_m,), strictly increasing [s or phase].
         outputs: M arrays (N_m, O).
-        names: Names of the O outputs with their units, such as "x [m]".
+        names: Names of the outputs with their units, such as "x [m]"; "y1", "y2", … by default.
+
+    Raises:
+        InputError: If there is no demonstration, one has fewer than two points, shapes or dimensions differ, a number
+            is not finite, or time does not increase strictly.
+
+    Attributes:
+        times, outputs: M arrays (N_m,) and (N_m, O).
+        names: Names of the O outputs.
     """
 
     def __init__(
@@ -28,17 +36,6 @@ class Demonstrations:
         outputs: np.ndarray | Sequence[np.ndarray],
         names: Sequence[str] | None = None,
     ):
-        """Check and store the recordings.
-
-        Args:
-            times: One clock (N,) for all demonstrations, or M clocks (N_m,) [s or phase].
-            outputs: M arrays (N_m, O).
-            names: Names of the outputs; "y1", "y2", … by default.
-
-        Raises:
-            InputError: If there is no demonstration, one has fewer than two points, shapes or dimensions differ, a
-                number is not finite, or time does not increase strictly.
-        """
         self.outputs = tuple(as_numbers(y, f"demonstration {m}") for m, y in enumerate(_as_list(outputs, "outputs")))
         if not self.outputs:
             raise InputError("there is no demonstration: give at least one")

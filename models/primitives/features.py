@@ -102,15 +102,14 @@ def _conditioned(
 
 
 class KernelBasis:
-    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on as few inputs as span the others."""
+    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on as few inputs as span the others.
+
+    Args:
+        kernel: k.
+        inputs: Inputs (N, I) that the features represent up to rounding.
+    """
 
     def __init__(self, kernel: Kernel, inputs: np.ndarray):
-        """Choose the features.
-
-        Args:
-            kernel: k.
-            inputs: Inputs (N, I) that the features represent up to rounding.
-        """
         self._kernel = kernel
         self._pivots = np.zeros((0, inputs.shape[1]))
         self._triangle = np.zeros((0, 0), dtype=_Extended)

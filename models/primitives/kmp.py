@@ -24,6 +24,17 @@ class Kmp:
     state instead of time, and for via-points. The solution is stored as weights of the kernel's features, whose number
     is the rank of the kernel and not the number of points. The factor is the triangle of a QR decomposition, to which a
     via-point adds O rows. If a via-point is removed or moved, the update starts from the triangle of the reference.
+
+    Args:
+        inputs: Times or states, (N,) or (N, I).
+        means: Means (N, O).
+        covariances: Covariances (N, O, O), positive definite.
+        kernel: k; `SquaredExponential(length_scale=0.5)` by default.
+        lambda_: λ, positive.
+        covariance_lambda: λ_c, positive; λ by default.
+
+    Raises:
+        InputError: If an argument is out of range or shapes do not match.
     """
 
     def __init__(
@@ -35,19 +46,6 @@ class Kmp:
         lambda_: float = 1.0,
         covariance_lambda: float | None = None,
     ):
-        """Factor the reference.
-
-        Args:
-            inputs: Times or states, (N,) or (N, I).
-            means: Means (N, O).
-            covariances: Covariances (N, O, O), positive definite.
-            kernel: k; `SquaredExponential(length_scale=0.5)` by default.
-            lambda_: λ, positive.
-            covariance_lambda: λ_c, positive; λ by default.
-
-        Raises:
-            InputError: If an argument is out of range or shapes do not match.
-        """
         inputs = _rows(inputs)
         means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
         if means.ndim != 2 or len(inputs) != len(means) or covariances.shape != (*means.shape, means.shape[1]):

@@ -26,60 +26,42 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import StepFactor, Window
 
 
+@dataclass(slots=True, eq=False)
 class Prediction:
     """Output of a primitive at one step.
 
     Attributes:
         output: Output to execute (O,).
+        factor: Factor of the step.
+        x: History and null-space action of the prediction ((P + 1) O,).
+        correction: Smallest correction v (r,) that satisfies the constraints, or None if every constraint is slack;
+            `output_sizes` is its largest effect per norm.
+        signed_multipliers: Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower
+            bound, or None.
     """
 
-    __slots__ = ("_factor", "_signed", "_v", "_x", "output")
-
-    def __init__(
-        self,
-        output: np.ndarray,
-        factor: StepFactor,
-        x: np.ndarray,
-        v: np.ndarray | None = None,
-        signed: np.ndarray | None = None,
-    ):
-        """Store a prediction.
-
-        Args:
-            output: Output to execute (O,).
-            factor: Factor of the step.
-            x: History and null-space action of the prediction ((P + 1) O,).
-            v: Correction (r,), or None if every constraint is slack.
-            signed: The solver's multipliers of the correction (m,).
-        """
-        self.output, self._factor, self._x, self._v, self._signed = output, factor, x, v, signed
+    output: np.ndarray
+    factor: StepFactor
+    x: np.ndarray
+    correction: np.ndarray | None = None
+    signed_multipliers: np.ndarray | None = None
 
     @property
     def constrained(self) -> bool:
         """True if a constraint of the window is active."""
-        return self._v is not None
-
-    @property
-    def correction(self) -> np.ndarray | None:
-        """Smallest correction v (r,) that satisfies the constraints; `output_sizes` is its largest effect per norm."""
-        return self._v
-
-    @property
-    def signed_multipliers(self) -> np.ndarray | None:
-        """Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower bound."""
-        return self._signed
+        return self.correction is not None
 
     @property
     def multipliers(self) -> np.ndarray:
         """Multipliers α (H+1, F) ≥ 0, zero where a constraint is slack; computed at each access."""
-        if self._signed is None:
-            return np.zeros(self._factor.multipliers_shape)
-        return self._factor.multipliers(self._signed)
+        if self.signed_multipliers is None:
+            return np.zeros(self.factor.multipliers_shape)
+        return self.factor.multipliers(self.signed_multipliers)
 
     @property
     def trajectory(self) -> np.ndarray:
         """Modified window (H+1, O); computed at each access."""
-        return self._factor.trajectory(self._x, self._v)
+        return self.factor.trajectory(self.x, self.correction)
 
 
 @dataclass(frozen=True)
@@ -108,6 +90,22 @@ class LcNsKmp:
     The input is the reference's clock, so that every matrix depends on the step alone. Each step is factored at its
     first use; a prediction is two small products, and a QP only if a constraint is not slack.
 
+    Args:
+        reference: Means and covariances of the demonstrations, N steps of O outputs.
+        kernel: k; the thesis's `SquaredExponential(length_scale=0.5)` by default.
+        lambda_: Regularization λ of problem 4.5, not negative.
+        beta: Weight β of a null-space action, not negative; λ + β is positive.
+        horizon: Number of future points H after the executed one.
+        history: Number of past outputs P that the motion passes through (sKGRL); 0 for none (KGRL).
+        history_variance: Variance ρ of the past outputs [output²], positive.
+        constraints: Constraints G y ≥ c at every future point; none by default.
+        solver: "daqp", "piqp" or "osqp".
+        cache_bytes: Memory limit of factored steps, after which the oldest is dropped [bytes].
+
+    Raises:
+        InputError: If an argument is out of range, sizes do not match, or the history's variance is too small for its
+            length.
+
     Attributes:
         reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: Arguments.
         cached_bytes: Memory of the factored steps [bytes].
@@ -126,24 +124,6 @@ class LcNsKmp:
         solver: str = "daqp",
         cache_bytes: int = 2**29,
     ):
-        """Check the arguments.
-
-        Args:
-            reference: Means and covariances of the demonstrations, N steps of O outputs.
-            kernel: k; the thesis's `SquaredExponential(length_scale=0.5)` by default.
-            lambda_: Regularization λ of problem 4.5, not negative.
-            beta: Weight β of a null-space action, not negative; λ + β is positive.
-            horizon: Number of future points H after the executed one.
-            history: Number of past outputs P that the motion passes through (sKGRL); 0 for none (KGRL).
-            history_variance: Variance ρ of the past outputs [output²], positive.
-            constraints: Constraints G y ≥ c at every future point; none by default.
-            solver: "daqp", "piqp" or "osqp".
-            cache_bytes: Memory limit of factored steps, after which the oldest is dropped [bytes].
-
-        Raises:
-            InputError: If an argument is out of range, sizes do not match, or the history's variance is too small for
-                its length.
-        """
         for name, value in (("lambda_", lambda_), ("beta", beta)):
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"{name} must be finite and not negative, not {value}")

@@ -32,25 +32,21 @@ VIA_POINT_VARIANCE = 1e-4  # relative to the kernel's own: contradicting via-poi
 class ReferenceTrajectory:
     """Means and covariances of O outputs at N instants, T_r = {μ̂_n, Σ̂_n} (thesis, 2.2.7).
 
-    Attributes:
-        times: Times (N,), increasing [s or phase].
+    Args:
+        times: Times (N,), strictly increasing, at least two [s or phase].
         means: Means (N, O) [unit of the output].
-        covariances: Covariances (N, O, O), symmetric positive definite [unit²].
+        covariances: Covariances (N, O, O) [unit²].
+
+    Raises:
+        InputError: If shapes do not match, a number is not finite, times do not increase, or a covariance is not
+            symmetric or not positive definite.
+
+    Attributes:
+        times, means, covariances: Copies of the arguments, read-only; the covariances are exactly symmetric.
         uniform: True if all time steps are equal up to rounding.
     """
 
     def __init__(self, times: np.ndarray, means: np.ndarray, covariances: np.ndarray):
-        """Check and store the arrays, which become read-only.
-
-        Args:
-            times: Times (N,), strictly increasing, at least two [s or phase].
-            means: Means (N, O) [unit of the output].
-            covariances: Covariances (N, O, O) [unit²].
-
-        Raises:
-            InputError: If shapes do not match, a number is not finite, times do not increase, or a covariance is not
-                symmetric or not positive definite.
-        """
         self.times, self.means = as_numbers(times, "times"), as_numbers(means, "means")
         self.covariances = as_numbers(covariances, "covariances")
         if self.times.ndim != 1 or len(self.times) < 2:

@@ -57,6 +57,12 @@ class StepFactor:
     is linear in x; the executed point and the constrained directions are rows of it. Only those rows are stored: the
     rest of the window is solved for again on request.
 
+    Args:
+        window: Reference and constraints.
+        features: Kernel of the window's inputs, given the history.
+        lambda_: λ of problem 4.5.
+        beta: β of problem 4.5.
+
     Attributes:
         output_map, output_offset: Map (O, PO+O) and offset (O,) from x to the executed point.
         constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled by the inverse of its largest
@@ -67,14 +73,6 @@ class StepFactor:
     """
 
     def __init__(self, window: Window, features: WindowFeatures, lambda_: float, beta: float):
-        """Factor the problem.
-
-        Args:
-            window: Reference and constraints.
-            features: Kernel of the window's inputs, given the history.
-            lambda_: λ of problem 4.5.
-            beta: β of problem 4.5.
-        """
         self._window, self._features, self._hbar, self._beta = window, features, lambda_ + beta, beta
         outputs = window.means.shape[1]
         solution = self._solve()

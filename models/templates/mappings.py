@@ -20,14 +20,16 @@ class InputMapping(ABC):
     from the left, that is about the end effector's origin and expressed in the world.
     """
 
+    inputs: tuple[int, ...]
+
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         """Return ΔH during one period for all inputs of the template, each in [−1, 1]."""
 
     @property
-    @abstractmethod
     def used_inputs(self) -> tuple[int, ...]:
-        """Numbers of the inputs that the mapping uses."""
+        """Numbers of the inputs that the mapping uses, its field `inputs` by default."""
+        return self.inputs
 
     @property
     def frame_names(self) -> tuple[str, ...]:
@@ -71,11 +73,6 @@ class Translation(InputMapping):
         _require_axes(self.inputs, self.axes)
         require(self.speed_m_per_s > 0, f"speed_m_per_s must be positive, not {self.speed_m_per_s}.")
 
-    @property
-    @override
-    def used_inputs(self) -> tuple[int, ...]:
-        return self.inputs
-
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         v_FE = self.speed_m_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
@@ -99,11 +96,6 @@ class Rotation(InputMapping):
         _require_axes(self.inputs, self.axes)
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
-    @property
-    @override
-    def used_inputs(self) -> tuple[int, ...]:
-        return self.inputs
-
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         w_FE = self.speed_rad_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
@@ -126,11 +118,6 @@ class TiltTowards(InputMapping):
         require(len(self.inputs) == 2, f"tilt_towards needs two inputs, x and y, not {len(self.inputs)}.")
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
-    @property
-    @override
-    def used_inputs(self) -> tuple[int, ...]:
-        return self.inputs
-
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         p_FE = position_in(self.frame, X_WE, frames)
@@ -139,9 +126,25 @@ class TiltTowards(InputMapping):
         return RigidTransform(about(axis_W, along * self.speed_rad_per_s * period_s), np.zeros(3))
 
 
+class ScaledMapping(InputMapping):
+    """Another mapping with scaled inputs."""
+
+    of: InputMapping
+
+    @property
+    @override
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.of.used_inputs
+
+    @property
+    @override
+    def frame_names(self) -> tuple[str, ...]:
+        return (*super().frame_names, *self.of.frame_names)
+
+
 @register(INPUT_MAPPINGS, "scaled")
 @dataclass(frozen=True)
-class Scaled(InputMapping):
+class Scaled(ScaledMapping):
     """Another mapping with its inputs multiplied by a factor that depends on the distance to a frame."""
 
     frame: str  # frame of the object to which the distance is measured
@@ -157,16 +160,6 @@ class Scaled(InputMapping):
         )
         require(min(self.factor) >= 0 and max(self.factor) <= 1, "every factor must be between 0 and 1.")
 
-    @property
-    @override
-    def used_inputs(self) -> tuple[int, ...]:
-        return self.of.used_inputs
-
-    @property
-    @override
-    def frame_names(self) -> tuple[str, ...]:
-        return (*super().frame_names, *self.of.frame_names)
-
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
@@ -176,7 +169,7 @@ class Scaled(InputMapping):
 
 @register(INPUT_MAPPINGS, "uneven")
 @dataclass(frozen=True)
-class Uneven(InputMapping):
+class Uneven(ScaledMapping):
     """Another mapping with different factors for positive and negative inputs.
 
     A zero input still commands no motion, but random inputs drift in the faster direction on average. Otherwise random
@@ -189,16 +182,6 @@ class Uneven(InputMapping):
 
     def __post_init__(self) -> None:
         require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")
-
-    @property
-    @override
-    def used_inputs(self) -> tuple[int, ...]:
-        return self.of.used_inputs
-
-    @property
-    @override
-    def frame_names(self) -> tuple[str, ...]:
-        return self.of.frame_names
 
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:

@@ -17,19 +17,17 @@ class TemplateFrames:
 
     They are parameters because they are constant during an episode: a guidance diagram has the same ports as all
     guidance, and a reset moves an object with `set`.
+
+    Args:
+        system: System that gets the parameters; its outputs depend on `ticket`.
+        template: Template with the frames.
+        frames: Default poses, one for each frame's name.
+
+    Raises:
+        InputError: If a frame of the template is missing or not finite.
     """
 
     def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
-        """Declare the parameters.
-
-        Args:
-            system: System that gets the parameters; its outputs depend on `ticket`.
-            template: Template with the frames.
-            frames: Default poses, one for each frame's name.
-
-        Raises:
-            InputError: If a frame of the template is missing or not finite.
-        """
         missing = [name for name in template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {template.name} needs the frame {missing[0]}: give its pose")
