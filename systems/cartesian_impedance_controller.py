@@ -10,9 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
-from guiderail.systems.support.caching import declare_cache, declare_plant_context
+from guiderail.systems.support.declarations import declare_cache, declare_plant_context, input_getter, output_getter
 from guiderail.systems.support.last_valid_pose import LastValidPose
-from guiderail.systems.support.ports import input_getter, output_getter
 
 
 @dataclass(frozen=True)

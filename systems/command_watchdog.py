@@ -4,8 +4,8 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.last_valid_pose import LastValidPose
-from guiderail.systems.support.ports import input_getter, output_getter
 
 
 class CommandWatchdog(LeafSystem):

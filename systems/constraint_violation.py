@@ -3,8 +3,7 @@
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 class ConstraintViolation(LeafSystem):

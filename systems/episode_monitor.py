@@ -7,9 +7,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.caching import declare_cache
-from guiderail.systems.support.ports import output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, declare_cache, output_getter
 from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")

@@ -6,8 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 GuidanceFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Function of action (A,), pose (O,) and wrench (W,) that returns the desired pose (O,)."""

@@ -6,8 +6,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, Heartbeat
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 class HeartbeatMonitor(LeafSystem):

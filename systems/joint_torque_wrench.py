@@ -6,9 +6,7 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.caching import declare_plant_context
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
 
 
 class JointTorqueWrench(LeafSystem):

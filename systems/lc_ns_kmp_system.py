@@ -8,9 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Inpu
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
-from guiderail.systems.support.caching import declare_cache
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import declare_sample
+from guiderail.systems.support.declarations import declare_sample, input_getter, output_getter
 
 
 class MeanForce(LeafSystem):

@@ -7,8 +7,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.ports import output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, output_getter
 
 DEAD_ZONE = 0.1
 """Dead zone of the gamepad axes, because a released stick is rarely exactly at zero."""

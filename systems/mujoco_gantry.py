@@ -15,8 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, pose_to_transform
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 if TYPE_CHECKING:
     import mujoco

@@ -7,8 +7,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 class PolicyError(RuntimeError):

@@ -3,7 +3,7 @@
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
-from guiderail.systems.support.ports import input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class PoseWrench(LeafSystem):

@@ -7,8 +7,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.ports import output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, output_getter
 from guiderail.systems.support.signal_ports import SignalPorts
 
 

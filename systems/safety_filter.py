@@ -4,9 +4,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.systems.support.caching import declare_cache
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import declare_sample
+from guiderail.systems.support.declarations import declare_cache, declare_sample, input_getter, output_getter
 
 
 class SafetyFilter(LeafSystem):

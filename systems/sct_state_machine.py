@@ -7,8 +7,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 

@@ -7,9 +7,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
-from guiderail.systems.support.caching import declare_cache
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
 # Indices into the state, all times in s: local time of the next check, last value of the clock input; time stamp, clock
 # offset and local time of the last readable status; the last fault and its local time; the local time of the last

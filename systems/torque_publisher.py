@@ -6,8 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.ports import input_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter
 
 
 class TorquePublisher(LeafSystem):

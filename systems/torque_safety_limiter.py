@@ -9,9 +9,13 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault, damping_torque
-from guiderail.systems.support.caching import declare_cache, declare_plant_context
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import (
+    check_period,
+    declare_cache,
+    declare_plant_context,
+    input_getter,
+    output_getter,
+)
 
 # Indices into the discrete state.
 _ARM_STATE = 0  # value of `ArmState`

@@ -10,8 +10,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, L
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import external_wrench
-from guiderail.systems.support.ports import input_getter, output_getter
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 class WrenchSensor(LeafSystem):

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.declarations import check_period
 
 _TIME_TOLERANCE = 1e-6  # [s], far above the rounding error of a time of days, far below any period
 

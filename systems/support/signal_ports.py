@@ -51,16 +51,7 @@ class SignalPorts:
 
 
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
-    """Raise an InputError if a function does not accept the signals as keyword arguments.
-
-    Args:
-        function: Function of the signals.
-        names: Names of the signals.
-        what: Description of the function for the message.
-
-    Raises:
-        InputError: If the parameters of the function have other names.
-    """
+    """Raise an `InputError` if a function does not accept signals of these names; `what` names it in the message."""
     try:
         takes = signature(function)
     except (ValueError, TypeError):

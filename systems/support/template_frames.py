@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, DependencyTicket, Le
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
-from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.declarations import declare_cache
 
 
 class TemplateFrames:

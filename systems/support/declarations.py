@@ -1,0 +1,125 @@
+"""Declarations that systems share: periods, samples, cache entries and getters of ports."""
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import (
+    CacheEntry,
+    Context,
+    DependencyTicket,
+    DiscreteStateIndex,
+    DiscreteValues,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    ValueProducer,
+)
+
+from guiderail.models.common.errors import InputError
+
+
+def check_period(period: float) -> None:
+    """Raise an `InputError` unless the period [s] is positive and finite."""
+    if not 0.0 < period < np.inf:
+        raise InputError(f"a system's period must be positive and finite, not {period} s")
+
+
+def declare_sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
+    """Declare a discrete state that contains `port`, sampled at initialization and once per period.
+
+    Args:
+        system: System under construction.
+        port: Its vector input port.
+        period: Sampling period [s].
+
+    Returns:
+        Index of the discrete state.
+
+    Raises:
+        InputError: If the period is not positive and finite.
+    """
+    check_period(period)
+    state = system.DeclareDiscreteState(port.size())
+
+    def sample(context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(state, port.Eval(context))
+
+    system.DeclareInitializationDiscreteUpdateEvent(sample)
+    system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, sample)
+    return state
+
+
+def declare_cache(
+    system: LeafSystem,
+    name: str,
+    calc: Callable[[Context], object],
+    *,
+    prerequisites_of_calc: set[DependencyTicket],
+) -> CacheEntry:
+    """Declare a cache entry with a value computed by `calc`.
+
+    Args:
+        system: System under construction.
+        name: Description of the cache entry.
+        calc: Function of the system's context that returns the value.
+        prerequisites_of_calc: Tickets of the values that `calc` reads.
+    """
+    return system.DeclareCacheEntry(
+        description=name,
+        value_producer=ValueProducer(
+            allocate=Value[object], calc=lambda context, value: value.set_value(calc(context))
+        ),
+        prerequisites_of_calc=prerequisites_of_calc,
+    )
+
+
+def declare_plant_context(
+    system: LeafSystem,
+    plant: MultibodyPlant,
+    set_state: Callable[[Context, Context], None],
+    *,
+    prerequisites_of_calc: set[DependencyTicket],
+) -> CacheEntry:
+    """Declare a cache entry that contains a context of `plant`, for its kinematics and inertia.
+
+    Args:
+        system: System under construction.
+        plant: Finalized plant.
+        set_state: Function of the system's context and the plant's context that writes the plant's state.
+        prerequisites_of_calc: Tickets of the values that `set_state` reads.
+    """
+    return system.DeclareCacheEntry(
+        description="plant_context",
+        value_producer=ValueProducer(
+            allocate=lambda: Value(plant.CreateDefaultContext()),
+            calc=lambda context, value: set_state(context, value.get_mutable_value()),
+        ),
+        prerequisites_of_calc=prerequisites_of_calc,
+    )
+
+
+def input_getter(name: str, description: str) -> Callable[[LeafSystem], InputPort]:
+    """Return a method that returns the input port `name`, for the body of a system's class.
+
+    Args:
+        name: Name of the port, which the system stores as `_<name>_port`.
+        description: Signal, shape and unit, for the method's docstring.
+    """
+
+    def getter(self: LeafSystem) -> InputPort:
+        return getattr(self, f"_{name}_port")
+
+    getter.__name__, getter.__doc__ = f"get_{name}_input_port", f"Return the port of the {description}."
+    return getter
+
+
+def output_getter(name: str, description: str) -> Callable[[LeafSystem], OutputPort]:
+    """Return a method that returns the output port `name`; see `input_getter`."""
+
+    def getter(self: LeafSystem) -> OutputPort:
+        return getattr(self, f"_{name}_port")
+
+    getter.__name__, getter.__doc__ = f"get_{name}_output_port", f"Return the port of the {description}."
+    return getter
