@@ -53,7 +53,7 @@ class ImpedanceGains:
 
 
 class CartesianImpedanceController(LeafSystem):
-    """Joint torques that make the tool centre P of an arm act as a spring and damper around a desired pose.
+    """Joint torques that make the tool center P of an arm act as a spring and damper around a desired pose.
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
@@ -84,7 +84,7 @@ class CartesianImpedanceController(LeafSystem):
     Args:
         plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.
         target: Frame T, fixed in the world.
-        tool_centre: Frame P.
+        tool_center: Frame P.
         gains: Impedance parameters.
         period: Period of the command check [s], positive.
         stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the impedance is
@@ -100,7 +100,7 @@ class CartesianImpedanceController(LeafSystem):
         self,
         plant: MultibodyPlant,
         target: Frame,
-        tool_centre: Frame,
+        tool_center: Frame,
         gains: ImpedanceGains,
         *,
         period: float,
@@ -112,7 +112,7 @@ class CartesianImpedanceController(LeafSystem):
         num_joints = plant.num_positions()
         if np.shape(gains.posture) != (num_joints,):
             raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")
-        self._plant, self._target, self._tool_centre, self._gains = plant, target, tool_centre, gains
+        self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
         self._stiffness_frame = stiffness_frame
         self._compensate_gravity = compensate_gravity
         self._torque_limits = plant.GetEffortUpperLimits()
@@ -152,11 +152,11 @@ class CartesianImpedanceController(LeafSystem):
             prerequisites_of_calc=self._followed_pose.timed_out_tickets,
         )
 
-    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
     get_generalized_force_output_port = output_getter("generalized_force", "joint torques, (n,) [Nm]")
-    get_pose_output_port = output_getter("pose", "measured pose of the tool centre, (6,)")
+    get_pose_output_port = output_getter("pose", "measured pose of the tool center, (6,)")
     get_impedance_wrench_output_port = output_getter("impedance_wrench", "wrench of spring and damper, (6,)")
     get_saturation_output_port = output_getter("saturation", "flag that the wrench or a motor is at its limit, (1,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
@@ -171,13 +171,13 @@ class CartesianImpedanceController(LeafSystem):
         plant, gains = self._plant, self._gains
         plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._followed_pose.eval(context))
-        X_TP = self._tool_centre.CalcPose(plant_context, self._target)
+        X_TP = self._tool_center.CalcPose(plant_context, self._target)
         R_TAxes = None
         if self._stiffness_frame is not None:
             R_TAxes = self._stiffness_frame.CalcPose(plant_context, self._target).rotation().matrix()
         eta, epsilon = orientation_error(X_TPd.rotation(), X_TP.rotation())
         J = plant.CalcJacobianSpatialVelocity(
-            plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
+            plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
         )
         M = plant.CalcMassMatrix(plant_context)
         q, v = plant.GetPositions(plant_context), plant.GetVelocities(plant_context)
@@ -206,7 +206,7 @@ class CartesianImpedanceController(LeafSystem):
         output.SetFromVector(self._law.Eval(context).torque)
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        X_TP = self._tool_centre.CalcPose(self._plant_context.Eval(context), self._target)
+        X_TP = self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)
         output.SetFromVector(transform_to_pose(X_TP))
 
     def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:

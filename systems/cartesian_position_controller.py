@@ -22,7 +22,7 @@ from guiderail.systems.support.last_valid_pose import CommandValidity
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """Speed limits of the tool centre.
+    """Speed limits of the tool center.
 
     Attributes:
         translational: Translational speed limit [m/s], positive.
@@ -38,7 +38,7 @@ class SpeedLimits:
 
 
 class CartesianPositionController(LeafSystem):
-    """Joint position commands that move the tool centre P to a desired pose by differential inverse kinematics.
+    """Joint position commands that move the tool center P to a desired pose by differential inverse kinematics.
 
         q[k+1] = clip(q[k] + v·period),  J v = V
 
@@ -67,17 +67,17 @@ class CartesianPositionController(LeafSystem):
     ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``positions`` is (n,), measured joint
     positions [rad], read at initialization as the first joint command. ``command_time`` is (1,), the time stamp of
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
-    (n,) [rad]. ``pose`` is (6,), the pose of the tool centre at the joint command. ``stuck`` (1,) is 1 while the
+    (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 while the
     desired direction cannot be followed. ``command_timed_out`` (1,) is 1 while no valid command is available. All
     outputs depend on state alone; there is no direct feedthrough.
 
     Args:
         plant: Model of the arm alone, finalized; its joint limits are satisfied.
         target: Frame T, fixed in the world.
-        tool_centre: Frame P.
+        tool_center: Frame P.
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
         period: Period of the joint commands [s], positive.
-        speed_limits: Speed limits of the tool centre.
+        speed_limits: Speed limits of the tool center.
         posture_gain: Gain of the return to the posture [1/s], not negative.
         timeout: Age above which a desired pose is stale [s], positive.
 
@@ -89,7 +89,7 @@ class CartesianPositionController(LeafSystem):
         self,
         plant: MultibodyPlant,
         target: Frame,
-        tool_centre: Frame,
+        tool_center: Frame,
         *,
         posture: np.ndarray,
         period: float = 0.01,
@@ -106,7 +106,7 @@ class CartesianPositionController(LeafSystem):
             raise InputError(f"a position controller's posture must have {num_joints} joints")
         if not np.isfinite(posture).all():
             raise InputError(f"a position controller's posture must be finite joint positions, not {posture}")
-        self._plant, self._target, self._tool_centre = plant, target, tool_centre
+        self._plant, self._target, self._tool_center = plant, target, tool_center
         self._period, self._speed_limits = period, speed_limits
         self._posture, self._posture_gain = np.array(posture, dtype=float), posture_gain
         parameters = DifferentialInverseKinematicsParameters(num_joints, num_joints)
@@ -138,11 +138,11 @@ class CartesianPositionController(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
-    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_positions_input_port = input_getter("positions", "measured joint positions, (n,) [rad]")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
     get_joint_positions_output_port = output_getter("joint_positions", "joint command, (n,) [rad]")
-    get_pose_output_port = output_getter("pose", "pose of the tool centre at the joint command, (6,)")
+    get_pose_output_port = output_getter("pose", "pose of the tool center at the joint command, (6,)")
     get_stuck_output_port = output_getter("stuck", "flag that the desired direction cannot be followed, (1,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
@@ -168,10 +168,10 @@ class CartesianPositionController(LeafSystem):
         if not is_valid:
             return
         plant, plant_context = self._plant, self._plant_context.Eval(context)
-        X_TP = self._tool_centre.CalcPose(plant_context, self._target)
+        X_TP = self._tool_center.CalcPose(plant_context, self._target)
         V = self._desired_velocity(X_TP, pose_to_transform(self._desired_pose_port.Eval(context)))
         J = plant.CalcJacobianSpatialVelocity(
-            plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
+            plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
         # With q included, a joint outside its limits neither jumps back nor makes the problem infeasible.
@@ -207,7 +207,7 @@ class CartesianPositionController(LeafSystem):
         return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        X_TP = self._tool_centre.CalcPose(self._plant_context.Eval(context), self._target)
+        X_TP = self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)
         output.SetFromVector(transform_to_pose(X_TP))
 
 

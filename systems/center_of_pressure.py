@@ -9,7 +9,7 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class CenterOfPressure(LeafSystem):
-    """Center of pressure of a contact force along z, relative to the tool centre.
+    """Center of pressure of a contact force along z, relative to the tool center.
 
         center_of_pressure = (−τ_y, τ_x) / f_z if f_z ≥ min_force, otherwise 0
 
@@ -23,7 +23,7 @@ class CenterOfPressure(LeafSystem):
         output_ports:
         - center_of_pressure
 
-    ``wrench`` is (6,), force and torque about the tool centre [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
+    ``wrench`` is (6,), force and torque about the tool center [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
 
     Args:
         min_force: Force along z below which there is no contact [N], positive.
@@ -42,7 +42,7 @@ class CenterOfPressure(LeafSystem):
             "center_of_pressure", 2, self._calc_center_of_pressure, prerequisites_of_calc={self._wrench_port.ticket()}
         )
 
-    get_wrench_input_port = input_getter("wrench", "wrench about the tool centre, (6,) [N, Nm]")
+    get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
     get_center_of_pressure_output_port = output_getter("center_of_pressure", "center of pressure, (2,) [m]")
 
     def _calc_center_of_pressure(self, context: Context, output: BasicVector) -> None:

@@ -27,14 +27,14 @@ class JointTorqueWrench(LeafSystem):
         output_ports:
         - wrench
 
-    ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool centre P in the axes of
+    ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool center P in the axes of
     T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, without direct feedthrough.
     Samples that are not finite are skipped.
 
     Args:
         plant: Model of the arm alone, finalized.
         target: Frame T.
-        tool_centre: Frame P.
+        tool_center: Frame P.
         period: Sampling period [s], positive.
         time_constant: τ of the filter [s]; 0 disables it.
         damping: Damping of the pseudoinverse, not negative.
@@ -47,7 +47,7 @@ class JointTorqueWrench(LeafSystem):
         self,
         plant: MultibodyPlant,
         target: Frame,
-        tool_centre: Frame,
+        tool_center: Frame,
         *,
         period: float,
         time_constant: float,
@@ -58,7 +58,7 @@ class JointTorqueWrench(LeafSystem):
         if not 0.0 <= time_constant < np.inf or not damping >= 0.0:
             raise InputError("a wrench estimate's time constant and damping must not be negative")
         num_joints = plant.num_positions()
-        self._plant, self._target, self._tool_centre, self._damping = plant, target, tool_centre, damping
+        self._plant, self._target, self._tool_center, self._damping = plant, target, tool_center, damping
         self._decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
         self._external_torque_port = self.DeclareVectorInputPort("external_torque", num_joints)
@@ -84,7 +84,7 @@ class JointTorqueWrench(LeafSystem):
         J = self._plant.CalcJacobianSpatialVelocity(
             self._plant_context.Eval(context),
             JacobianWrtVariable.kV,
-            self._tool_centre,
+            self._tool_center,
             np.zeros(3),
             self._target,
             self._target,

@@ -172,9 +172,9 @@ class MujocoGantry(LeafSystem):
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_nominal_body_poses_input_port = input_getter("nominal_body_poses", "body poses of the static plant")
-    get_pose_output_port = output_getter("pose", "pose of the tool centre, (6,)")
+    get_pose_output_port = output_getter("pose", "pose of the tool center, (6,)")
     get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
     get_impedance_wrench_output_port = output_getter("impedance_wrench", "forces and torques of the six motors, (6,)")
     get_body_poses_output_port = output_getter("body_poses", "poses of all bodies of the plant")

@@ -30,7 +30,7 @@ class PoseRateLimiter(LeafSystem):
 
     Args:
         period: Sampling period [s], positive.
-        speed: Speed limit of the tool centre [m/s], positive.
+        speed: Speed limit of the tool center [m/s], positive.
         angular_speed: Speed limit of each angle [rad/s], positive.
 
     Raises:

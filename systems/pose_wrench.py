@@ -7,7 +7,7 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class PoseWrench(LeafSystem):
-    """Transform generalized forces along pose coordinates into the wrench at the tool centre.
+    """Transform generalized forces along pose coordinates into the wrench at the tool center.
 
         f = τ_xyz,  [ez, Rz(a) ey, Rz(a) Ry(b) ex]ᵀ t = τ_abc
 

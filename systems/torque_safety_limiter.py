@@ -46,7 +46,7 @@ class SafetyLimits:
         torque: Limit of the torque sent to each joint (n,) [Nm], positive.
         external_torque: Limit of the external torque of each joint (n,) [Nm], positive.
         force: Limit of the force on the tool [N], positive.
-        lower, upper: Corners of the workspace of the tool centre, in the axes of the target (3,) [m].
+        lower, upper: Corners of the workspace of the tool center, in the axes of the target (3,) [m].
         damping_time: Duration of damping in a stop, after which zero torque is sent [s], positive.
         decay_time: Decay time of the joint velocities during damping [s], at least two periods.
         ramp_time: Time in which the blend factor increases to 1 [s], positive.
@@ -213,8 +213,8 @@ class TorqueSafetyLimiter(LeafSystem):
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
     get_external_torque_input_port = input_getter("external_torque", "external joint torques, (n,) [Nm]")
     get_wrench_input_port = input_getter("wrench", "wrench of the environment on the tool, (6,), force first")
-    get_pose_input_port = input_getter("pose", "pose of the tool centre, (6,)")
-    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool centre, (6,)")
+    get_pose_input_port = input_getter("pose", "pose of the tool center, (6,)")
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
     get_status_age_input_port = input_getter("status_age", "age of the status, (1,) [s]")
     get_status_is_new_input_port = input_getter("status_is_new", "flag that a new status has been accepted, (1,)")

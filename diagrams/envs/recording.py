@@ -63,7 +63,7 @@ class DrivenStation:
         return self.station.plant.GetMyMutableContextFromRoot(self.context)
 
     def start(self, pose: np.ndarray) -> None:
-        """Put the tool centre at rest at `pose`, (6,), and initialize; call it before `run`."""
+        """Put the tool center at rest at `pose`, (6,), and initialize; call it before `run`."""
         self.station.set_pose(self.context, pose)
         self.simulator.Initialize()
 

@@ -137,7 +137,7 @@ class HardwareStation(Station):
             JointTorqueWrench(
                 model.plant,
                 model.target,
-                model.tool_centre,
+                model.tool_center,
                 period=period,
                 time_constant=self._wrench_time_constant,
             ),
@@ -316,5 +316,5 @@ class HardwareStation(Station):
         context = plant.CreateDefaultContext()
         plant.SetPositions(context, positions)
         return plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kV, arm.tool_centre, np.zeros(3), arm.target, arm.target
+            context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), arm.target, arm.target
         )

@@ -51,7 +51,7 @@ class ArmModel:
     Attributes:
         model: Model instance of the arm's joints.
         target: Target frame T.
-        tool_centre: Frame of the tool center P.
+        tool_center: Frame of the tool center P.
         wrist: Joint between flange and tool.
         tool: Bodies of tool and workpiece, the first at the wrist.
         tool_model: Model instance of the tool's joints.
@@ -60,7 +60,7 @@ class ArmModel:
 
     model: ModelInstanceIndex
     target: Frame
-    tool_centre: Frame
+    tool_center: Frame
     wrist: WeldJoint
     tool: list[RigidBody]
     tool_model: ModelInstanceIndex
@@ -90,10 +90,10 @@ def add_arm(
     tool = add_end_effector(plant, robot, arm, end_effector, as_rigid=as_rigid)
     if tool.actuators and end_effector.drives is not None:
         add_drives(tool.actuators, end_effector.drives)
-    workpiece = workcell.add_workpiece(plant, tool.tool_centre)
+    workpiece = workcell.add_workpiece(plant, tool.tool_center)
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     return ArmModel(
-        arm.model, target, tool.tool_centre, tool.wrist, [*tool.bodies, workpiece], tool.model, tool.actuators
+        arm.model, target, tool.tool_center, tool.wrist, [*tool.bodies, workpiece], tool.model, tool.actuators
     )
 
 
@@ -152,14 +152,14 @@ class ArmControllerPlant:
         return self.arm.target
 
     @property
-    def tool_centre(self) -> Frame:
+    def tool_center(self) -> Frame:
         """Frame of the tool center P."""
-        return self.arm.tool_centre
+        return self.arm.tool_center
 
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
         """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""
         arm = self.arm
-        return solve_inverse_kinematics(self.plant, arm.target, arm.tool_centre, pose_to_transform(pose), posture)
+        return solve_inverse_kinematics(self.plant, arm.target, arm.tool_center, pose_to_transform(pose), posture)
 
     def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
         """Put the arm of a station's plant at rest with its tool center at `pose`, (6,), in the root context."""
@@ -251,7 +251,7 @@ class ArmStation(Station):
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)
         )
         plant, arm = self.plant, self.arm
-        wrench = add_wrench_sensor(builder, plant, workcell, arm.wrist, arm.tool, arm.tool_centre, wrench_time_constant)
+        wrench = add_wrench_sensor(builder, plant, workcell, arm.wrist, arm.tool, arm.tool_center, wrench_time_constant)
         torque = add_impedance_control(
             builder,
             self._controller_plant,

@@ -171,7 +171,7 @@ class GantryControllerPlant:
 
     plant: MultibodyPlant
     target: Frame
-    tool_centre: Frame
+    tool_center: Frame
     posture: np.ndarray
 
 
@@ -179,8 +179,8 @@ def _controller_plant(workcell: Workcell, impedance: Impedance) -> GantryControl
     plant = MultibodyPlant(0.0)
     _add_gantry(plant, workcell, impedance, with_gains=False)
     plant.Finalize()
-    target, tool_centre = (plant.GetFrameByName(name) for name in ("target", "tool_centre"))
-    return GantryControllerPlant(plant, target, tool_centre, np.zeros(POSE_SIZE))
+    target, tool_center = (plant.GetFrameByName(name) for name in ("target", "tool_center"))
+    return GantryControllerPlant(plant, target, tool_center, np.zeros(POSE_SIZE))
 
 
 def _add_joint_control(
@@ -229,7 +229,7 @@ def _add_gantry(
             actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damps))
         parent = link.body_frame()
     inertia = UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS))
-    tool = plant.AddRigidBody("tool_centre", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))
+    tool = plant.AddRigidBody("tool_center", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))
     plant.WeldFrames(parent, tool.body_frame())
     workpiece = workcell.add_workpiece(plant, tool.body_frame())
     for weightless in (model, workpiece.model_instance()):

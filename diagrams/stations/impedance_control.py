@@ -26,7 +26,7 @@ class ControllerPlant(Protocol):
         """Target frame T."""
 
     @property
-    def tool_centre(self) -> Frame:
+    def tool_center(self) -> Frame:
         """Frame of the tool center P."""
 
     @property
@@ -58,7 +58,7 @@ def add_controller(
         CartesianImpedanceController(
             controller_plant.plant,
             controller_plant.target,
-            controller_plant.tool_centre,
+            controller_plant.tool_center,
             impedance_gains(impedance, controller_plant.posture),
             period=period,
             compensate_gravity=compensate_gravity,

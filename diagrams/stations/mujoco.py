@@ -254,7 +254,7 @@ def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Work
     fixture = plant.get_body(BodyIndex(1))
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     model = plant.AddModelInstance("gantry")
-    tool = plant.AddRigidBody("tool_centre", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
+    tool = plant.AddRigidBody("tool_center", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     plant.WeldFrames(target, tool.body_frame())
     workpiece = workcell.add_workpiece(plant, tool.body_frame())
     plant.Finalize()

@@ -258,12 +258,12 @@ def add_wrench_sensor(
     workcell: Workcell,
     wrist: WeldJoint,
     tool: list[RigidBody],
-    tool_centre: Frame,
+    tool_center: Frame,
     time_constant: float,
 ) -> OutputPort:
     """Add a sensor at the wrist, to which `tool` is attached; return the wrench as a station exports it."""
     axes = workcell.X_WT.rotation()
-    sensor = WrenchSensor(plant, wrist, tool, tool_centre, axes, plant.time_step(), time_constant)
+    sensor = WrenchSensor(plant, wrist, tool, tool_center, axes, plant.time_step(), time_constant)
     builder.AddNamedSystem("wrench_sensor", sensor)
     sensor.connect(builder, plant)
     return sensor.get_wrench_output_port()

@@ -27,7 +27,7 @@ class Workcell(Protocol):
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Add the fixture."""
 
-    def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
+    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
         """Add the workpiece, fixed to the tool center, and return its body."""
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -17,7 +17,7 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 # Towards a singular posture, the effective mass at the tool grows in the direction that is lost. Up to the first mass
 # [kg] only the impedance acts in a direction, from the second on only the posture's torque; usual are 1 to 50 kg.
 LIGHT, HEAVY = 300.0, 3000.0
-LEVER = 0.25  # distance from the tool centre that converts rotational to translational quantities [m]
+LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
 _SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 
 
@@ -134,7 +134,7 @@ def impedance_torques(
         p_error: Position error (3,), as in `spring_wrench`.
         eta: Orientation error, as in `spring_wrench`.
         epsilon: Orientation error (3,), as in `spring_wrench`.
-        J: Geometric Jacobian of the tool centre (6, n).
+        J: Geometric Jacobian of the tool center (6, n).
         M: Mass matrix (n, n), including the reflected rotor inertia.
         v: Joint velocities (n,) [rad/s].
         posture_torque: Torque (n,) that pulls the joints to their preferred posture [Nm].

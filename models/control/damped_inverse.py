@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-LEVER = 0.25  # distance from the tool centre that converts rotational to translational velocities [m]
+LEVER = 0.25  # distance from the tool center that converts rotational to translational velocities [m]
 REGULAR = (
     0.03  # smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more
 )

@@ -8,10 +8,10 @@ from guiderail.models.common.arrays import cross
 
 
 def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
-    """Compute the center of pressure (−τ_y, τ_x) / f_z relative to the tool centre, (2,) [m].
+    """Compute the center of pressure (−τ_y, τ_x) / f_z relative to the tool center, (2,) [m].
 
     Args:
-        wrench: Wrench about the tool centre (6,), force first [N, Nm].
+        wrench: Wrench about the tool center (6,), force first [N, Nm].
         min_force: Smallest normal force f_z [N]; below it the result is zero, because the quotient is not reliable.
     """
     if wrench[2] < min_force:

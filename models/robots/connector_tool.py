@@ -17,8 +17,8 @@ CONNECTOR_TOOL = register_end_effector(
         title="connector tool",
         model=Path(__file__).parent / "connector_tool.urdf",
         mount_frame="tool_body",
-        tool_centre="tool_centre",
-        bodies=("tool_body", "tool_centre"),
+        tool_center="tool_center",
+        bodies=("tool_body", "tool_center"),
         X_FlangeMount=RigidTransform(RotationMatrix.MakeZRotation(-HALF_TURN_ANGLE), [0.0, 0.0, 0.0]),
         source="this project's own design",
     )

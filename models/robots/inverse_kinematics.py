@@ -16,12 +16,12 @@ AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 def solve_inverse_kinematics(
     plant: MultibodyPlant,
     reference: Frame,
-    tool_centre: Frame,
+    tool_center: Frame,
     X: RigidTransform,
     posture: np.ndarray,
     tolerance: float = 1e-9,
 ) -> np.ndarray:
-    """Return the joint positions (n,) nearest to `posture` that put the tool centre at X in the reference frame.
+    """Return the joint positions (n,) nearest to `posture` that put the tool center at X in the reference frame.
 
     Minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`, so that the result is
     deterministic. If no solution is found from there, further searches start at random postures and the solution
@@ -30,15 +30,15 @@ def solve_inverse_kinematics(
     Args:
         plant: Finalized plant, all of whose joints are free.
         reference: Frame in which X is expressed.
-        tool_centre: Frame to place at X.
-        X: Pose of the tool centre in the reference frame.
+        tool_center: Frame to place at X.
+        X: Pose of the tool center in the reference frame.
         posture: Joint positions (n,) [rad].
         tolerance: Tolerance of the pose, translation [m] and rotation [rad] together.
 
     Raises:
         InputError: If the pose is out of reach, or reached only beyond the joint limits.
     """
-    problem = _Problem(plant, reference, tool_centre, X, np.asarray(posture, dtype=float), tolerance)
+    problem = _Problem(plant, reference, tool_center, X, np.asarray(posture, dtype=float), tolerance)
     solution = problem.search(within_limits=True)
     if solution is not None:
         return solution
@@ -55,12 +55,12 @@ class _Problem:
         self,
         plant: MultibodyPlant,
         reference: Frame,
-        tool_centre: Frame,
+        tool_center: Frame,
         X: RigidTransform,
         posture: np.ndarray,
         tolerance: float,
     ):
-        self._plant, self._reference, self._tool_centre = plant, reference, tool_centre
+        self._plant, self._reference, self._tool_center = plant, reference, tool_center
         self._X, self._posture, self._tolerance = X, posture, tolerance
         self._context = plant.CreateDefaultContext()
 
@@ -101,7 +101,7 @@ class _Problem:
             ([0.0, 1.0, 0.0], [-free, 0.0, 0.0], [free, free, 0.0]),
         ):
             ik.AddPositionConstraint(
-                frameB=self._tool_centre,
+                frameB=self._tool_center,
                 p_BQ=p_PQ,
                 frameAbar=self._reference,
                 X_AbarA=self._X,
@@ -131,9 +131,9 @@ class _Problem:
         """Return the error from the pose at `q` to X, (6,) rotation first, and the Jacobian (6, n)."""
         plant, context = self._plant, self._context
         plant.SetPositions(context, q)
-        X_now = self._tool_centre.CalcPose(context, self._reference)
+        X_now = self._tool_center.CalcPose(context, self._reference)
         turn = (self._X.rotation() @ X_now.rotation().inverse()).ToAngleAxis()
         J = plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._reference, self._reference
+            context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._reference, self._reference
         )
         return np.concatenate([turn.axis() * turn.angle(), self._X.translation() - X_now.translation()]), J

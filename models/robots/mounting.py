@@ -43,14 +43,14 @@ class MountedEndEffector:
 
     Attributes:
         wrist: Joint to the flange, at which a wrist sensor measures.
-        tool_centre: Frame P.
+        tool_center: Frame P.
         bodies: All bodies; the first is the child of `wrist`.
         model: Model instance.
         actuators: Actuators in the order of its joints; empty for a rigid tool, or a gripper added as a rigid body.
     """
 
     wrist: WeldJoint
-    tool_centre: Frame
+    tool_center: Frame
     bodies: list[RigidBody]
     model: ModelInstanceIndex
     actuators: list[JointActuator]
@@ -104,7 +104,7 @@ def add_end_effector(
     _set_opening(plant, model, end_effector)
     return MountedEndEffector(
         wrist=wrist,
-        tool_centre=plant.GetFrameByName(end_effector.tool_centre, model),
+        tool_center=plant.GetFrameByName(end_effector.tool_center, model),
         bodies=[plant.GetBodyByName(name, model) for name in end_effector.bodies],
         model=model,
         actuators=_list_actuators(plant, joints, label),
@@ -168,7 +168,7 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
 def _check_names(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
     """Refuse an end effector whose data name elements that its model file does not have."""
     for kind, names, has_name in (
-        ("frame", (end_effector.mount_frame, end_effector.tool_centre), plant.HasFrameNamed),
+        ("frame", (end_effector.mount_frame, end_effector.tool_center), plant.HasFrameNamed),
         ("body", end_effector.bodies, plant.HasBodyNamed),
         ("joint", (*end_effector.joints, *end_effector.opening), plant.HasJointNamed),
     ):
@@ -198,10 +198,10 @@ def _add_rigid_copy(
     context = gripper_plant.CreateDefaultContext()
     bodies = [gripper_plant.GetBodyByName(name, model).index() for name in end_effector.bodies]
     M = gripper_plant.CalcSpatialInertia(context, mount, bodies)
-    X_MountP = gripper_plant.GetFrameByName(end_effector.tool_centre, model).CalcPose(context, mount)
+    X_MountP = gripper_plant.GetFrameByName(end_effector.tool_center, model).CalcPose(context, mount)
 
     instance = plant.AddModelInstance(end_effector.name)
     body = plant.AddRigidBody(end_effector.bodies[0], instance, M)
     wrist = plant.WeldFrames(mounted.flange, body.body_frame(), X_FlangeMount)
-    tool_centre = plant.AddFrame(FixedOffsetFrame(end_effector.tool_centre, body.body_frame(), X_MountP, instance))
-    return MountedEndEffector(wrist, tool_centre, [body], instance, [])
+    tool_center = plant.AddFrame(FixedOffsetFrame(end_effector.tool_center, body.body_frame(), X_MountP, instance))
+    return MountedEndEffector(wrist, tool_center, [body], instance, [])

@@ -10,8 +10,8 @@ PARALLEL_GRIPPER = register_end_effector(
         title="gripper with two parallel fingers",
         model=Path(__file__).parent / "parallel_gripper.urdf",
         mount_frame="gripper_body",
-        tool_centre="tool_centre",
-        bodies=("gripper_body", "left_finger", "right_finger", "tool_centre"),
+        tool_center="tool_center",
+        bodies=("gripper_body", "left_finger", "right_finger", "tool_center"),
         joints=("left_finger_joint",),
         opening={"left_finger_joint": 0.04, "right_finger_joint": 0.04},
         # One drive moves both fingers.

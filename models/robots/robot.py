@@ -108,7 +108,7 @@ class EndEffector:
         title: Name for users.
         model: URDF or SDF file.
         mount_frame: Frame that is mounted to the flange.
-        tool_centre: Name of the frame P that a station commands: the centre of compliance, z towards the flange, fixed
+        tool_center: Name of the frame P that a station commands: the centre of compliance, z towards the flange, fixed
             to the mount.
         bodies: Names of all bodies, that of the mount first.
         X_FlangeMount: Pose of the mount on the flange turned by the robot's `tool_turn`.
@@ -122,7 +122,7 @@ class EndEffector:
     title: str
     model: Path
     mount_frame: str
-    tool_centre: str
+    tool_center: str
     bodies: tuple[str, ...]
     X_FlangeMount: RigidTransform = field(default_factory=RigidTransform)
     joints: tuple[str, ...] = ()

@@ -50,18 +50,18 @@ class FreeArm:
             )
         self.plant.Finalize()
         self.model, arm = controller_model(WORKCELL)
-        self.tool_centre, self.target = arm.tool_centre, arm.target
+        self.tool_center, self.target = arm.tool_center, arm.target
         frame = None
         if turned_axes is not None:
             self.model, arm = _with_axes(turned_axes)
-            self.tool_centre, self.target = arm.tool_centre, arm.target
+            self.tool_center, self.target = arm.tool_center, arm.target
             frame = self.model.GetFrameByName("axes")
         gains = gains or ImpedanceGains(STIFFNESS, LIMITS, np.array(q, dtype=float))
         self.controller = builder.AddSystem(
             CartesianImpedanceController(
                 self.model,
                 self.target,
-                self.tool_centre,
+                self.tool_center,
                 gains,
                 period=time_step,
                 stiffness_frame=frame,
@@ -81,7 +81,7 @@ class FreeArm:
         self.command(self.pose())
 
     def pose(self):
-        X_TP = self.plant.GetFrameByName("tool_centre").CalcPose(
+        X_TP = self.plant.GetFrameByName("tool_center").CalcPose(
             self.plant_context, self.plant.GetFrameByName("target")
         )
         return transform_to_pose(X_TP)
@@ -93,7 +93,7 @@ class FreeArm:
 
     def push(self, force, torque=(0, 0, 0)):
         applied = ExternallyAppliedSpatialForce()
-        body = self.plant.GetBodyByName("tool_centre")
+        body = self.plant.GetBodyByName("tool_center")
         applied.body_index = body.index()
         applied.p_BoBq_B = np.zeros(3)
         applied.F_Bq_W = SpatialForce(tau=np.array(torque, dtype=float), f=np.array(force, dtype=float))
@@ -304,7 +304,7 @@ def test_constructor_refuses_arguments_out_of_range(wrong):
 def test_ports_and_feedthrough():
     model, arm = controller_model(WORKCELL)
     system = CartesianImpedanceController(
-        model, arm.target, arm.tool_centre, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7)), period=0.005
+        model, arm.target, arm.tool_center, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7)), period=0.005
     )
     assert [system.get_input_port(i).get_name() for i in range(3)] == [
         "desired_pose",

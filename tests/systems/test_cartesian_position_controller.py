@@ -28,11 +28,11 @@ class Commanded:
         self.plant, model = arm
         if q_start is None:
             q_start = solve_inverse_kinematics(
-                self.plant, model.target, model.tool_centre, pose_to_transform(START), READY_POSTURE
+                self.plant, model.target, model.tool_center, pose_to_transform(START), READY_POSTURE
             )
         self.q_start = q_start
         self.system = CartesianPositionController(
-            self.plant, model.target, model.tool_centre, posture=READY_POSTURE, **options
+            self.plant, model.target, model.tool_center, posture=READY_POSTURE, **options
         )
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
@@ -140,7 +140,7 @@ def beyond(arm, posture, joint, by):
     inside[joint] = plant.GetPositionUpperLimits()[joint] - by
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, inside)
-    return outside, transform_to_pose(model.tool_centre.CalcPose(context, model.target))
+    return outside, transform_to_pose(model.tool_center.CalcPose(context, model.target))
 
 
 BENT, STRETCHED = READY_POSTURE, np.zeros(7)
@@ -240,7 +240,7 @@ def test_time_stamps_change_nothing_when_commands_are_current(arm):
 def test_constructor_refuses_arguments_out_of_range(arm, wrong):
     plant, model = arm
     with pytest.raises(InputError):
-        CartesianPositionController(plant, model.target, model.tool_centre, **({"posture": READY_POSTURE} | wrong))
+        CartesianPositionController(plant, model.target, model.tool_center, **({"posture": READY_POSTURE} | wrong))
 
 
 def test_speed_limits_refuse_values_out_of_range():
@@ -259,14 +259,14 @@ class SixJoints(Commanded):
         known = ArmControllerPlant(BncWorkcell(), "ur5e")
         self.plant, self.q_start = known.plant, SINGULAR
         self.system = CartesianPositionController(
-            known.plant, known.arm.target, known.arm.tool_centre, posture=known.posture
+            known.plant, known.arm.target, known.arm.tool_center, posture=known.posture
         )
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.system.get_positions_input_port().FixValue(self.context, SINGULAR)
         context = known.plant.CreateDefaultContext()
         known.plant.SetPositions(context, SINGULAR)
-        self.start = transform_to_pose(known.arm.tool_centre.CalcPose(context, known.arm.target))
+        self.start = transform_to_pose(known.arm.tool_center.CalcPose(context, known.arm.target))
         self.desired = self.system.get_desired_pose_input_port().FixValue(self.context, self.start + shift)
         self.simulator.Initialize()
 

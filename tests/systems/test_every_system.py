@@ -67,8 +67,8 @@ def built():
     browser = SimpleNamespace(AddSlider=lambda *arguments: None)
     instances = [
         systems.ActiveConstraintProjector(template, frames, PERIOD),
-        systems.CartesianImpedanceController(plant, arm.target, arm.tool_centre, gains, period=PERIOD),
-        systems.CartesianPositionController(plant, arm.target, arm.tool_centre, posture=np.zeros(7), period=PERIOD),
+        systems.CartesianImpedanceController(plant, arm.target, arm.tool_center, gains, period=PERIOD),
+        systems.CartesianPositionController(plant, arm.target, arm.tool_center, posture=np.zeros(7), period=PERIOD),
         systems.CommandDisturbance(2, PERIOD, loss_probability=0.5, delay=1),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
@@ -82,7 +82,7 @@ def built():
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),
-        systems.JointTorqueWrench(plant, arm.target, arm.tool_centre, period=PERIOD, time_constant=0.0),
+        systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
         systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
@@ -101,7 +101,7 @@ def built():
         systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
         systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD),
-        systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_centre, RotationMatrix(), PERIOD, 0.0),
+        systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_center, RotationMatrix(), PERIOD, 0.0),
     ]
     return {type(instance).__name__: instance for instance in instances}
 

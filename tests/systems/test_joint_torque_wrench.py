@@ -23,10 +23,10 @@ def estimate(arm, wrench, seconds=0.005, **options):
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, READY_POSTURE)
     J = plant.CalcJacobianSpatialVelocity(
-        context, JacobianWrtVariable.kV, model.tool_centre, np.zeros(3), model.target, model.target
+        context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), model.target, model.target
     )
     system = JointTorqueWrench(
-        plant, model.target, model.tool_centre, **({"period": 0.01, "time_constant": 0.0} | options)
+        plant, model.target, model.tool_center, **({"period": 0.01, "time_constant": 0.0} | options)
     )
     simulator = Simulator(system)
     system.get_positions_input_port().FixValue(simulator.get_mutable_context(), READY_POSTURE)
@@ -58,7 +58,7 @@ def test_constructor_refuses_arguments_out_of_range(arm, wrong):
 @pytest.mark.parametrize("port", ["positions", "external_torque"])
 def test_sample_is_skipped_when_it_is_not_finite(arm, port):
     plant, model = arm
-    system = JointTorqueWrench(plant, model.target, model.tool_centre, period=0.01, time_constant=0.1)
+    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.1)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     sound = {"positions": READY_POSTURE, "external_torque": np.linspace(-1.0, 1.0, 7)}

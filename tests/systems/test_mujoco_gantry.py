@@ -106,6 +106,6 @@ def test_step_is_nominal_when_the_modulus_is_at_most_one(station):
 @pytest.mark.parametrize(("period", "constant"), [(PLANT_PERIOD * 1.0001, 0.0), (PLANT_PERIOD, -1.0), (0.0, 0.0)])
 def test_constructor_refuses_arguments_out_of_range(station, period, constant):
     plant = station.plant
-    moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_centre", "plug")))
+    moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_center", "plug")))
     with pytest.raises(InputError):
         MujocoGantry(station.gantry.model, plant, moved, BncWorkcell().X_WT, period, constant)

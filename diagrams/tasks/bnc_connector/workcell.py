@@ -82,10 +82,10 @@ class BncWorkcell:
         below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])
         plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOUR)
 
-    def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
+    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
         """Add the plug, on a frame that `set_grasp_offset` moves."""
         model = add_model(plant, self._folder() / PLUG_SDF.name)
-        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
+        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_center, RigidTransform()))
         plug = plant.GetBodyByName("plug", model)
         plant.WeldFrames(grasp, plug.body_frame())
         return plug

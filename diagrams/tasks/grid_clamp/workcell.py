@@ -74,10 +74,10 @@ class GridClampWorkcell:
         mount = plant.AddFrame(FixedOffsetFrame("table_mount", plant.world_frame(), self.X_WG))
         plant.WeldFrames(mount, plant.GetFrameByName("table", model))
 
-    def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
+    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
         """Add the clamp, on a frame that `set_grasp_offset` moves."""
         model = add_model(plant, folder_of(self.dimensions, self.friction) / CLAMP_SDF.name)
-        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
+        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_center, RigidTransform()))
         clamp = plant.GetBodyByName("clamp", model)
         plant.WeldFrames(grasp, clamp.body_frame())
         return clamp

@@ -51,10 +51,10 @@ class PartWorkcell:
         for file in self.scenario:
             add_models(plant, file)
 
-    def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
+    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
         """Add the plug, on a frame that `set_grasp_offset` moves."""
         model = add_model(plant, self.plug_sdf)
-        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
+        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_center, RigidTransform()))
         plug = plant.GetBodyByName(PLUG, model)
         plant.WeldFrames(grasp, plug.body_frame())
         return plug

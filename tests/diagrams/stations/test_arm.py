@@ -45,7 +45,7 @@ class Held:
 
     def push(self, wrench):
         applied = ExternallyAppliedSpatialForce()
-        applied.body_index = self.plant.GetBodyByName("tool_centre").index()
+        applied.body_index = self.plant.GetBodyByName("tool_center").index()
         applied.p_BoBq_B = np.zeros(3)
         applied.F_Bq_W = SpatialForce(tau=np.array(wrench[3:], dtype=float), f=np.array(wrench[:3], dtype=float))
         self.plant.get_applied_spatial_force_input_port().FixValue(self.plant_context, Value([applied]))
@@ -54,7 +54,7 @@ class Held:
         self.simulator.AdvanceTo(self.context.get_time() + seconds)
 
     def X_TP(self):
-        return self.arm.tool_centre.CalcPose(self.plant_context, self.arm.target)
+        return self.arm.tool_center.CalcPose(self.plant_context, self.arm.target)
 
     def put(self, q):
         """Put the arm at rest in a posture, which it holds."""
@@ -218,10 +218,10 @@ class BlockOnATable:
         plant.RegisterCollisionGeometry(self.block, RigidTransform(), Box(0.04, 0.04, 0.04), "block", material)
         plant.SetDefaultFloatingBaseBodyPose(self.block, RigidTransform([0.5, 0.0, 0.2]))
 
-    def add_workpiece(self, plant, tool_centre):
+    def add_workpiece(self, plant, tool_center):
         instance = plant.AddModelInstance("nothing")
         nothing = plant.AddRigidBody("nothing", instance, SpatialInertia.SolidSphereWithMass(1e-3, 0.005))
-        plant.WeldFrames(tool_centre, nothing.body_frame())
+        plant.WeldFrames(tool_center, nothing.body_frame())
         return nothing
 
     def filter_contacts(self, plant, scene_graph):
@@ -277,5 +277,5 @@ def test_pose_equals_the_transform_in_the_workspace():
     context = known.plant.CreateDefaultContext()
     pose = np.array([0.03, -0.02, 0.08, 0.9, 0.15, -0.2])
     known.plant.SetPositions(context, known.solve(pose, known.posture))
-    X = known.arm.tool_centre.CalcPose(context, known.arm.target)
+    X = known.arm.tool_center.CalcPose(context, known.arm.target)
     np.testing.assert_allclose(X.GetAsMatrix4(), pose_to_transform(pose).GetAsMatrix4(), atol=1e-9)

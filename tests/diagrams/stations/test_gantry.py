@@ -38,7 +38,7 @@ class Held:
 
     def push(self, wrench):
         applied = ExternallyAppliedSpatialForce()
-        applied.body_index = self.plant.GetBodyByName("tool_centre").index()
+        applied.body_index = self.plant.GetBodyByName("tool_center").index()
         applied.p_BoBq_B = np.zeros(3)
         applied.F_Bq_W = SpatialForce(tau=np.array(wrench[3:], dtype=float), f=np.array(wrench[:3], dtype=float))
         self.plant.get_applied_spatial_force_input_port().FixValue(self.plant_context, Value([applied]))

@@ -43,7 +43,7 @@ def test_the_plug_in_the_tool_is_tilted():
     _, info = env.reset(seed=0)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
-    tool, plug = plant.GetBodyByName("tool_centre"), plant.GetBodyByName("plug")
+    tool, plug = plant.GetBodyByName("tool_center"), plant.GetBodyByName("plug")
     tilt = plug.body_frame().CalcRotationMatrix(context, tool.body_frame()).ToAngleAxis().angle()
     assert tilt == pytest.approx(np.linalg.norm(info["grasp_offset"][2:]), rel=1e-3)
 

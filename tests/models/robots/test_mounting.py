@@ -53,8 +53,8 @@ def test_add_end_effector_as_rigid_adds_one_open_body():
     rigid_M = rigid.bodies[0].CalcSpatialInertiaInBodyFrame(rigid_context)
     np.testing.assert_allclose(rigid_M.CopyToFullMatrix6(), M.CopyToFullMatrix6(), atol=1e-12)
     np.testing.assert_allclose(
-        rigid.tool_centre.CalcPoseInWorld(rigid_context).GetAsMatrix4(),
-        tool.tool_centre.CalcPoseInWorld(context).GetAsMatrix4(),
+        rigid.tool_center.CalcPoseInWorld(rigid_context).GetAsMatrix4(),
+        tool.tool_center.CalcPoseInWorld(context).GetAsMatrix4(),
         atol=1e-12,
     )
     # Open, both fingers of it: one of them mimics the other.
@@ -133,7 +133,7 @@ def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
     ("wrong", "sentence"),
     [
         ({"mount_frame": "flange"}, "has no frame 'flange'"),
-        ({"tool_centre": "tip"}, "has no frame 'tip'"),
+        ({"tool_center": "tip"}, "has no frame 'tip'"),
         ({"bodies": ("gripper_body", "thumb")}, "has no body 'thumb'"),
         ({"opening": {"left_finger_joint": 0.0, "thumb_joint": 0.0}}, "has no joint 'thumb_joint'"),
     ],
