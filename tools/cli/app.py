@@ -63,7 +63,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
 
 
 class Command(typer.core.TyperCommand):
-    """Command whose help expands `{name}` to the choices that exist when the help is printed."""
+    """Command with a help text that expands `{name}` to the choices that exist when the help is printed."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Expand the choices, then format the options."""

@@ -78,7 +78,7 @@ def sim_driver(
     seconds: Annotated[float, option("Duration in simulated time [s].")] = 3600.0,
     command_timeout: Annotated[float, option("Longest wait for a command [s].")] = 5.0,
     task: Annotated[
-        str, option("Task whose fixture is in front of the robot: {tasks}.", choices="tasks")
+        str, option("Task with the fixture in front of the robot: {tasks}.", choices="tasks")
     ] = "BncConnector",
     rate: Annotated[
         float | None, option("Follow the wall clock at this rate, at most 1, without waiting for commands.")
@@ -105,7 +105,9 @@ def sim_driver(
 def safety_monitor(
     url: Url = "",
     robot: Annotated[str, option("Robot arm.", choices="robots")] = "iiwa14",
-    task: Annotated[str, option("Task whose workpiece the arm carries: {tasks}.", choices="tasks")] = "BncConnector",
+    task: Annotated[
+        str, option("Task with the workpiece that the arm carries: {tasks}.", choices="tasks")
+    ] = "BncConnector",
     imports: cli.Imports = None,
 ) -> None:
     """Bring a robot to rest when torque commands stop arriving.

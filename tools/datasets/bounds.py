@@ -12,7 +12,7 @@ from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import Bounds, PartTaskFile, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.bounds import DemonstratedBounds, compute_bounds
-from guiderail.tools.datasets.paths import check_new, is_there, load_demonstrations
+from guiderail.tools.datasets.paths import check_new, load_demonstrations, path_exists
 from guiderail.tools.files import check_picture, check_writable, write_atomically
 
 
@@ -37,7 +37,7 @@ def fit_bounds(
         outputs: Indices of the bounded outputs; all by default.
         draw: Picture to write.
         out: YAML file to write; it must not exist.
-        task: Task folder whose bounds are replaced.
+        task: Task folder; its bounds are replaced.
 
     Raises:
         InputError: If an argument is invalid.
@@ -45,7 +45,7 @@ def fit_bounds(
     if draw is not None:
         check_picture(draw)
     if out is not None:
-        if not is_there(out) and not out.parent.is_dir():
+        if not path_exists(out) and not out.parent.is_dir():
             raise InputError(f"there is no folder {out.parent}: make it first")
         check_new(out, "file")
         check_writable(out)

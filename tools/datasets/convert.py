@@ -1,4 +1,4 @@
-"""`guiderail import` and `guiderail export`: demonstrations from and to the formats of others."""
+"""Import of demonstrations from LeRobot datasets, ROS 2 bags and CSV files, and export to the first two."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_NUMBERS
 from guiderail.tools.datasets.formats.csv_layouts import read_csv_files
 from guiderail.tools.datasets.formats.lerobot import INFO, read_lerobot, write_lerobot
-from guiderail.tools.datasets.formats.recorded import Recorded, from_zero
+from guiderail.tools.datasets.formats.recorded import describe_time_shift
 from guiderail.tools.datasets.formats.ros_bag import find_bags, read_bags, write_mcap
-from guiderail.tools.datasets.paths import ENDINGS, check_new, is_there, load_demonstrations
+from guiderail.tools.datasets.paths import ENDINGS, check_new, load_demonstrations, path_exists
 
 WRITERS: dict[str, Callable[[Path, Demonstrations], list[str]]] = {"lerobot": write_lerobot, "mcap": write_mcap}
-"""What demonstrations are exported to, by name."""
+"""Export formats by name."""
 
 
 def import_recording(
@@ -29,42 +29,43 @@ def import_recording(
     signal: str | None = None,
     target: Sequence[float] | None = None,
     rate: float | None = None,
-    **of_csv: str | None,
+    **csv_options: str | None,
 ) -> dict[str, Any]:
-    """Writes demonstrations from a LeRobot dataset, bags or CSV files; returns what was found and what was assumed.
+    """Write demonstrations from a LeRobot dataset, bags or CSV files; return a summary with the assumptions made.
 
     Args:
-        source: a file or a folder.
-        out: .npz or .csv; it must not exist.
-        signal: a topic or a feature, of which a CSV file has none; found out unless given.
-        target: pose of the task's target in the recording's frame, [x y z] in metres and [rx ry rz] in degrees.
-        rate: to resample to [1/s]; as recorded unless given.
-        of_csv: unit, time_unit, quaternion and angles, see `read_csv_files`.
+        source: File or folder.
+        out: File to write, .npz or .csv; it must not exist.
+        signal: Topic or feature; the only candidate by default. A CSV file has none.
+        target: Pose of the task's target in the recording's frame, [x y z] in metres and [rx ry rz] in degrees.
+        rate: Sampling rate of the result [1/s]; that of the recording by default.
+        csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
 
     Raises:
-        InputError: if it can't be read, doesn't say what only whoever recorded it knows, or `out` can't be written.
+        InputError: If the source cannot be read, does not state a unit or a signal that has to be given, or `out`
+            cannot be written.
     """
     if out.suffix not in ENDINGS:
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
     check_new(out, "file")
-    if not is_there(source):
+    if not path_exists(source):
         raise InputError(f"there is no {source}: name a LeRobot dataset, a bag, an .mcap or .csv file, or a folder")
     if (source / INFO).is_file():
-        found, kind = read_lerobot(source, signal), "a LeRobot dataset"
+        recorded, kind = read_lerobot(source, signal), "a LeRobot dataset"
         if target is not None:
-            raise InputError("a LeRobot dataset does not say which numbers are a pose: leave --target out")
+            raise InputError("a LeRobot dataset does not state which numbers are a pose: leave --target out")
     elif source.suffix == ".mcap" or (source.is_dir() and find_bags(source)):
-        found, kind = read_bags(source, signal, target), "ROS 2 bags"
+        recorded, kind = read_bags(source, signal, target), "ROS 2 bags"
     elif source.suffix == ".csv" or (source.is_dir() and any(source.glob("*.csv"))):
         if signal is not None:
             raise InputError("a CSV file holds one motion and no signals to choose from: leave --signal out")
-        found, kind = read_csv_files(source, target=target, **of_csv), "CSV files"
+        recorded, kind = read_csv_files(source, target=target, **csv_options), "CSV files"
     else:
-        raise InputError(f"{source} is no LeRobot dataset, bag, .mcap or .csv file, nor a folder of them")
-    given = [name for name, value in of_csv.items() if value is not None]
+        raise InputError(f"{source} is not a LeRobot dataset, a bag, an .mcap or .csv file, or a folder of them")
+    given = [name for name, value in csv_options.items() if value is not None]
     if given and kind != "CSV files":
-        raise InputError(f"{kind} say themselves what --{given[0].replace('_', '-')} would: leave it out")
-    demonstrations = Demonstrations(found.times, found.outputs, found.names)
+        raise InputError(f"{kind} state what --{given[0].replace('_', '-')} would: leave it out")
+    demonstrations = Demonstrations(recorded.times, recorded.outputs, recorded.names)
     if rate is not None:
         demonstrations = _at_rate(demonstrations, rate)
     numbers = sum(len(t) + y.size for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True))
@@ -73,37 +74,37 @@ def import_recording(
     demonstrations.save(out)
     return (
         {"out": str(out), "from": kind}
-        | _described(demonstrations)
-        | {"assumed": "; ".join(found.assumed) or "nothing"}
+        | _summarize(demonstrations)
+        | {"assumed": "; ".join(recorded.assumptions) or "nothing"}
     )
 
 
 def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None = None) -> dict[str, Any]:
-    """Writes demonstrations in another format; returns what was written.
+    """Write demonstrations in another format; return a summary.
 
     Args:
-        source: of demonstrations.
-        out: a folder that does not exist.
-        kind: one of `WRITERS`.
-        rate: to resample to [1/s]; as recorded unless given.
+        source: File of demonstrations, or a folder of files.
+        out: Folder to write; it must not exist.
+        kind: Key of `WRITERS`.
+        rate: Sampling rate of the result [1/s]; that of the demonstrations by default.
 
     Raises:
-        InputError: for an unknown format, demonstrations that it can't hold, or a place that can't be written to.
+        InputError: For an unknown format, demonstrations that it cannot represent, or a folder that cannot be written.
     """
     if kind not in WRITERS:
         raise InputError(f"there is no format {kind!r}: {did_you_mean(kind, WRITERS)}")
     check_new(out, "folder")
     demonstrations, notes = load_demonstrations(source), []
     if rate is not None:
-        notes = from_zero(demonstrations)
+        notes = describe_time_shift(demonstrations)
         demonstrations = _at_rate(demonstrations, rate)
     notes = WRITERS[kind](out, demonstrations) + notes
-    return {"out": str(out), "to": kind} | _described(demonstrations) | {"note": "; ".join(notes)}
+    return {"out": str(out), "to": kind} | _summarize(demonstrations) | {"note": "; ".join(notes)}
 
 
 def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
     if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"--rate is samples in a second and must be positive, not {rate}")
+        raise InputError(f"--rate is in samples per second and must be positive, not {rate}")
     samples = sum(float(t[-1] - t[0]) * rate for t in demonstrations.times)
     if samples * (1 + demonstrations.num_outputs) > MAX_NUMBERS:
         raise InputError(
@@ -117,16 +118,13 @@ def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
     return Demonstrations(times, outputs, demonstrations.names)
 
 
-def _described(demonstrations: Demonstrations) -> dict[str, Any]:
+def _summarize(demonstrations: Demonstrations) -> dict[str, Any]:
     rates = [float(1.0 / np.median(np.diff(t))) for t in demonstrations.times]
     return {
         "demonstrations": demonstrations.num_demonstrations,
         "outputs": list(demonstrations.names),
         "samples": [len(t) for t in demonstrations.times],
-        "samples a second": f"{min(rates):.4g} to {max(rates):.4g}"
+        "samples per second": f"{min(rates):.4g} to {max(rates):.4g}"
         if max(rates) - min(rates) > 0.01
         else f"{rates[0]:.4g}",
     }
-
-
-__all__ = ["Recorded", "export_demonstrations", "import_recording"]

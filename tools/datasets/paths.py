@@ -1,4 +1,4 @@
-"""Where recordings are read from and written to."""
+"""Paths of demonstrations: existing files, new files, and files in the order of their numbers."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.files import check_writable
 
 
-def is_there(path: Path) -> bool:
-    """Whether there is a file or a folder.
+def path_exists(path: Path) -> bool:
+    """Return True if there is a file or a folder.
 
     Raises:
-        InputError: if that can't be found out, as of a name that is too long.
+        InputError: If the file system refuses the path, as for a name that is too long.
     """
     try:
         return path.exists()
     except OSError as error:
-        raise InputError(f"the path {brief(str(path))} can't be read ({error.strerror}): check it") from error
+        raise InputError(f"the path {brief(str(path))} cannot be read ({error.strerror}): check it") from error
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Sorted by name, and numbers in a name by their size: recording_2 comes before recording_10."""
+    """Return paths sorted by name, numbers in names by value: recording_2 precedes recording_10."""
 
     def key(path: Path) -> list[tuple[int, str]]:
         return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
@@ -33,12 +33,16 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_new(out: Path, what: str) -> None:
-    """Refuses a place that nothing can be written to, before anything is done for it; `what` is what it would be.
+    """Refuse a path that exists or cannot be written, before anything is computed for it.
+
+    Args:
+        out: Path.
+        what: Noun for the message, such as "file".
 
     Raises:
-        InputError: if something is there already, or nothing can be written above it.
+        InputError: If the path exists, or its folder cannot be written to.
     """
-    if is_there(out):
+    if path_exists(out):
         raise InputError(f"{out} already exists: name another {what}")
     check_writable(out)
 
@@ -47,14 +51,14 @@ ENDINGS = (".npz", ".csv")
 
 
 def load_demonstrations(path: Path) -> Demonstrations:
-    """The demonstrations of a file, or of all files of a folder by their names.
+    """Return the demonstrations of a file, or of all .npz and .csv files of a folder.
 
-    A file is read as `Demonstrations.load` does: what is checked or exported can be learned from.
+    Files are read by `Demonstrations.load`, so that validated and exported demonstrations can be learned from.
 
     Raises:
-        InputError: if there are none, or what is there makes no sense.
+        InputError: If there are none, or a file is invalid.
     """
-    if is_there(path) and path.is_dir():
+    if path_exists(path) and path.is_dir():
         files = in_order(file for file in path.iterdir() if file.suffix in ENDINGS)
         if not files:
             raise InputError(f"there is no file {' or '.join(ENDINGS)} in {path}: name a folder of demonstrations")
@@ -65,6 +69,6 @@ def load_demonstrations(path: Path) -> Demonstrations:
                     f"{file} has the outputs {', '.join(part.names)}, and {files[0].name} {', '.join(parts[0].names)}: "
                     "record the same ones in all of them"
                 )
-        times, outputs = ([one for part in parts for one in getattr(part, of)] for of in ("times", "outputs"))
+        times, outputs = ([array for part in parts for array in getattr(part, name)] for name in ("times", "outputs"))
         return Demonstrations(times, outputs, parts[0].names)
     return Demonstrations.load(path)

@@ -11,7 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
-from guiderail.tools.datasets.paths import ENDINGS, is_there, load_demonstrations
+from guiderail.tools.datasets.paths import ENDINGS, load_demonstrations, path_exists
 from guiderail.tools.files import check_picture
 
 
@@ -56,7 +56,7 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
     """
     if draw is not None:
         check_picture(draw)
-    if not is_there(file):
+    if not path_exists(file):
         raise InputError(f"there is no file {file}: name demonstrations (.npz, .csv or a folder of them)")
     if file.suffix not in ENDINGS and not file.is_dir():
         raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv")
@@ -150,11 +150,11 @@ def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
     from guiderail.models.templates.schema import shipped_templates
     from guiderail.models.templates.validate import validate
 
-    if not is_there(file) and str(file) not in shipped_templates():
+    if not path_exists(file) and str(file) not in shipped_templates():
         raise InputError(
             f"there is no file {file}: name a template (.yaml), or one of {', '.join(shipped_templates())}"
         )
-    if is_there(file) and file.suffix not in TEMPLATE_ENDINGS:
+    if path_exists(file) and file.suffix not in TEMPLATE_ENDINGS:
         raise InputError(f"{file} has the ending {file.suffix!r}: a template is .yaml")
     template = load_template(file)
     findings = validate(template)

@@ -101,7 +101,7 @@ zero_policy: MakePolicy = partial(BaselinePolicy, zero)
 
 
 def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
-    """Return the policy whose action (A,) is the same in every episode."""
+    """Return the policy with the same action (A,) in every episode."""
     return BaselinePolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)
 
 

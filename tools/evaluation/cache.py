@@ -1,4 +1,4 @@
-"""Stored tables of evaluated episodes: each is a CSV file whose name identifies everything that decides its rows."""
+"""Stored tables of evaluated episodes: CSV files, each named after everything that decides its rows."""
 
 import hashlib
 import json

@@ -147,7 +147,7 @@ def evaluate_once(
 
 
 class _IncompatibleError(Exception):
-    """Policy whose observations or actions are not those of an environment."""
+    """Policy with other observations or actions than an environment."""
 
 
 def _make_compatible(make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:
@@ -209,7 +209,7 @@ def evaluate(
     Returns:
         `evaluation_scope`, what the result is valid for; the statistics `COMPARED`, each also as
         `demonstration_<name>` (None without a demonstration) and `<baseline>_<name>`; `baselines`, the names of the
-        baseline policies evaluated, and `skipped_baselines`, those whose observation or action does not match;
+        baseline policies evaluated, and `skipped_baselines`, those with another observation or action;
         `episodes` and `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run;
         `saved`, the number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is.
         Collisions are None if the task declares no collision signal.

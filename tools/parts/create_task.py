@@ -1,4 +1,4 @@
-"""From two mesh files to a task folder: contact geometry, motion, success and demonstrations, measured."""
+"""Insertion task from two mesh files: contact geometry, motion, success criterion and demonstrations, all measured."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.files import atomic_folder, check_writable
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
-MODULI = (2e9, 1e10, 3e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
-SNAP_MODULI = (2e7, 5e7, 5e6)  # [Pa] of a body that has to give way
-PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded below the target, as little as seats the plug
-MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets of the socket at which it must block the plug [m]
-TIME_STEPS = (None, 0.005)  # [s] of the simulation: its own, and half of it where parts are too deep in each other
-FAST_ENOUGH = 4.0  # times real time, from which the other side is not tried
-BEARABLE = 2.0  # times real time, which is not given up to be less deep
-DENSITY = 2700.0  # [kg/m³] of a part, aluminium's; rails carry no weight
-CLEAR = 3.0 * MM
+MODULI = (2e9, 1e10, 3e10)  # moduli of the compliant part [Pa], tried in this order until it is stiff enough
+SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
+PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded depth below the target; the first that seats the plug is used
+MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug
+TIME_STEPS = (None, 0.005)  # time steps of the simulation [s]: the default, and half of it against deep penetration
+FAST_ENOUGH = 4.0  # real-time factor from which the other part is not tried as the compliant one
+MIN_SPEED = 2.0  # real-time factor below which less penetration does not count
+DENSITY = 2700.0  # density of a part, that of aluminum [kg/m³]; a gantry is weightless
+CLEAR = 3.0 * MM  # height of the start above the rim
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Which part is compliant, and in how many pieces.
+    """Contact geometry: the compliant part and its convex pieces.
 
     Attributes:
-        compliant: "plug" or "socket".
-        bodies: its convex pieces, for each of its bodies.
-        modulus: of those that don't snap [Pa].
-        snap_modulus: of those that do [Pa].
-        snapping: numbers of the bodies that do.
-        time_step: of the simulation [s], its own unless given.
+        compliant: Name of the compliant part, "plug" or "socket".
+        bodies: Convex pieces of each of its bodies.
+        modulus: Modulus of the bodies that do not snap [Pa].
+        snap_modulus: Modulus of the snapping bodies [Pa].
+        snapping: Indices of the snapping bodies.
+        time_step: Time step of the simulation [s]; the default if None.
     """
 
     compliant: str
@@ -64,16 +64,16 @@ class Contact:
 
     @property
     def pieces(self) -> list[tuple[str, float, Any]]:
-        """Each piece's file, modulus [Pa] and solid."""
-        found = []
+        """File, modulus [Pa] and solid of each piece."""
+        pieces = []
         for number, body in enumerate(self.bodies):
             modulus = self.snap_modulus if number in self.snapping else self.modulus
-            found += [(modulus, solid) for solid in body]
-        return [(f"{self.compliant}_{i}.obj", modulus, solid) for i, (modulus, solid) in enumerate(found)]
+            pieces += [(modulus, solid) for solid in body]
+        return [(f"{self.compliant}_{i}.obj", modulus, solid) for i, (modulus, solid) in enumerate(pieces)]
 
     @property
     def snapping_pieces(self) -> frozenset[str]:
-        """Names of the geometries that give way."""
+        """Names of the snapping geometries."""
         numbers = [number for number, body in enumerate(self.bodies) for _ in body]
         return frozenset(f"piece_{i}" for i, number in enumerate(numbers) if number in self.snapping)
 
@@ -81,27 +81,29 @@ class Contact:
 def read_parts(
     plug: Path, socket: Path, unit: str | None, plug_pose: Sequence[float], axis: str, centre: Sequence[float] | None
 ) -> tuple[Part, Part]:
-    """Both parts in the target frame: z out of the socket, its origin on the axis at the plug's lower end.
+    """Return both parts in the target frame: z points out of the socket, the origin is at the plug's lower end.
 
     Args:
-        plug, socket: the files.
-        unit: of both files' numbers; None where their formats say it.
-        plug_pose: [x y z] in the files' unit and [rx ry rz] in degrees by which the plug's file is moved into the
-            socket's; zeros where both are drawn assembled.
-        axis: which way the plug comes out, in the socket's file.
-        centre: a point on the axis, in the socket's file; the plug's centre of mass unless given.
+        plug: Mesh file of the part in the tool.
+        socket: Mesh file of the part in the world.
+        unit: Unit of both files; None if their formats state it.
+        plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the files' unit, [rx ry rz] in degrees.
+        axis: Direction in which the plug is removed, in the socket's file.
+        centre: Point on the axis, in the socket's file; the plug's center of mass by default.
 
     Raises:
-        InputError: if a file can't be used, or an argument makes no sense.
+        InputError: If a file cannot be used, or an argument is invalid.
     """
     if axis not in AXES:
-        raise InputError(f"--axis is one of {', '.join(AXES)}, not {axis!r}: the way the plug comes out")
+        raise InputError(
+            f"--axis is one of {', '.join(AXES)}, not {axis!r}: the direction in which the plug is removed"
+        )
     units = [find_unit(path, unit) for path in (plug, socket)]
     if None in units:
         raise InputError(
             f"{(plug, socket)[units.index(None)].name} does not say its unit: give --unit {', '.join(UNITS)}"
         )
-    first, second = (load_part(path, str(one)) for path, one in zip((plug, socket), units, strict=True))
+    first, second = (load_part(path, str(known)) for path, known in zip((plug, socket), units, strict=True))
     scale = UNITS[str(units[1])]
     first = first.transform(_rotation(np.asarray(plug_pose[3:]) * DEGREE), np.asarray(plug_pose[:3]) * scale)
     z = np.array(AXES[axis], dtype=float)
@@ -133,26 +135,31 @@ def create_task(
     force_limit: float = COLLISION_FORCE,
     friction: float = 0.2,
     scenario: Sequence[Path] = (),
-    say: Callable[[str], None] = lambda words: None,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> dict[str, Any]:
-    """Makes a task folder, and returns what was measured.
+    """Create a task folder and return its measured properties.
 
     Args:
-        plug, socket, unit, plug_pose, axis, centre: see `read_parts`.
-        out: the folder; it must not exist.
-        turn: of the plug at the bottom [degrees], counter-clockwise as seen from outside; it is drawn turned.
-        force_limit: more than that ends an episode [N].
-        friction: of all surfaces.
-        scenario: files of Drake model directives of what else stands there.
-        say: is told what was found while it goes on.
+        plug: See `read_parts`.
+        socket: See `read_parts`.
+        unit: See `read_parts`.
+        plug_pose: See `read_parts`.
+        axis: See `read_parts`.
+        centre: See `read_parts`.
+        out: Folder; it must not exist.
+        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; drawn turned.
+        force_limit: Contact force that ends an episode as a collision [N].
+        friction: Friction coefficient of all surfaces.
+        scenario: Files of Drake model directives of the surroundings.
+        say: Called with a sentence on each intermediate result.
 
     Raises:
-        InputError: if the parts can't be used, in a sentence with the remedy; nothing is left then.
+        InputError: If the parts cannot be used; no folder is left then.
     """
     if out.exists():
         raise InputError(f"{out} already exists: name another folder with --out, or remove it")
     check_writable(out)
-    _check_given(friction, scenario)
+    _check_arguments(friction, scenario)
     parts = read_parts(plug, socket, unit, plug_pose, axis, centre)
     check_target(*parts)
     path = plan_motion(*parts, turn * DEGREE, CLEAR)
@@ -160,13 +167,13 @@ def create_task(
     snapping = _snapping(*parts, path)
     say(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
-    with atomic_folder(out) as made:
-        measured = _make(made, out.name, parts, path, clearance, snapping, force_limit, friction, scenario, say)
+    with atomic_folder(out) as folder:
+        measured = _write_task(folder, out.name, parts, path, clearance, snapping, force_limit, friction, scenario, say)
     return {"task": str(out), **measured, "page": str(out / "preview.html")}
 
 
-def _check_given(friction: float, scenario: Sequence[Path]) -> None:
-    """Raises an InputError for what would be found out only after minutes."""
+def _check_arguments(friction: float, scenario: Sequence[Path]) -> None:
+    """Raise InputError for arguments that would be refused only after minutes."""
     from guiderail.diagrams.envs.options import validate_options
     from guiderail.diagrams.tasks.part.file import FILE_NAME, Piece
 
@@ -176,16 +183,16 @@ def _check_given(friction: float, scenario: Sequence[Path]) -> None:
         if not file.is_file():
             raise InputError(f"there is no scenario {file}")
         if file.suffix.lower() not in (".yaml", ".yml") or file.name == FILE_NAME:
-            raise InputError(f"{file} is no scenario: that is a .yaml file of Drake model directives, not {FILE_NAME}")
+            raise InputError(f"{file} is not a scenario: name a .yaml file of Drake model directives, not {FILE_NAME}")
         if names.count(file.name) > 1:
             raise InputError(f"two scenarios are called {file.name}, and both go into one folder: rename one")
 
 
 def _snapping(plug: Part, socket: Part, path: InsertionMotion) -> frozenset[int]:
-    """Numbers of the plug's bodies that overlap the socket on the way.
+    """Return the indices of the plug's bodies that overlap the socket on the way.
 
     Raises:
-        InputError: if that is all there is of the plug: a rigid part that doesn't fit.
+        InputError: If all bodies do: the plug is a rigid part that does not fit.
     """
     ways = find_obstructions(plug, socket, path)
     blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > MAX_RESTING_OVERLAP)
@@ -193,13 +200,13 @@ def _snapping(plug: Part, socket: Part, path: InsertionMotion) -> frozenset[int]
         depth, height = max(ways)
         raise InputError(
             f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
-            f"{1e3 * depth:.2g} mm; say with --turn and --centre by how much it turns about what, or draw what "
-            "gives way as a body of its own"
+            f"{1e3 * depth:.2g} mm; give its rotation with --turn and --centre, or draw the part that deflects as a "
+            "separate body"
         )
     return blocked
 
 
-def _make(
+def _write_task(
     folder: Path,
     name: str,
     parts: tuple[Part, Part],
@@ -214,21 +221,20 @@ def _make(
     from guiderail.diagrams.tasks.part.file import write_task_file
     from guiderail.tools.parts.trial import demonstrate, insert, write_preview
 
-    for part, of in zip(parts, ("plug", "socket"), strict=True):
-        (folder / f"{of}.obj").write_text(obj_text(*_whole(part)), encoding="utf-8")
+    for part, part_name in zip(parts, ("plug", "socket"), strict=True):
+        (folder / f"{part_name}.obj").write_text(obj_text(*_merge_bodies(part)), encoding="utf-8")
     for file in scenario:
         shutil.copy(file, folder / file.name)
     numbers = {"name": name, "force_limit": force_limit, "friction": friction, "scenario": scenario, "path": path}
-    same, near = find_symmetries(*parts, path)
-    numbers |= {"sides": same, "rim_sides": near}
-    say(f"symmetry: {len(same)} of 7 candidate rotations and reflections, {len(near)} more approximately on the rim")
+    exact, approximate = find_symmetries(*parts, path)
+    numbers |= {"sides": exact, "rim_sides": approximate}
+    say(f"symmetry: {len(exact)} of 7 candidate rotations and reflections, {len(approximate)} more on the rim")
     contact, push, aligned = _choose_contact(folder, parts, numbers, clearance, snapping, say)
     file = _task_file(parts, contact, push, numbers)
-    off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in MISALIGNMENTS]
-    say(
-        f"misaligned by 1.5 mm: {'seated, but must be blocked' if any(t.success for t in off) else 'blocked (as required)'}"
-    )
-    penetration = max(trial.penetration for trial in (aligned, *off))
+    misaligned = [insert(folder, file, offset=xy, snapping=contact.snapping_pieces) for xy in MISALIGNMENTS]
+    is_blocked = not any(trial.success for trial in misaligned)
+    say(f"misaligned by 1.5 mm: {'blocked (as required)' if is_blocked else 'seated, but must be blocked'}")
+    penetration = max(trial.penetration for trial in (aligned, *misaligned))
     succeeded, page = demonstrate(folder, file), folder / "preview.html"
     measured = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
@@ -237,12 +243,12 @@ def _make(
         "modulus": contact.modulus,
         "time_step_ms": None if contact.time_step is None else 1e3 * contact.time_step,
         "inserted": aligned.success,
-        "inserted_1.5_mm_off": [trial.success for trial in off],
+        "inserted_1.5_mm_off": [trial.success for trial in misaligned],
         "force": round(aligned.peak_force, 2),
         "penetration_mm": round(1e3 * aligned.penetration, 4),
         "penetration_pushed_on_the_rim_mm": round(1e3 * penetration, 4),
         "snap_mm": round(1e3 * aligned.snap, 4),
-        "real_time_factor": round(min(trial.real_time_factor for trial in (aligned, *off)), 2),
+        "real_time_factor": round(min(trial.real_time_factor for trial in (aligned, *misaligned)), 2),
         "demonstrations_seated": f"{succeeded} of 5",
     }
     file = file.model_copy(update={"measured": measured})
@@ -259,17 +265,17 @@ def _choose_contact(
     snapping: frozenset[int],
     say: Callable[[str], None],
 ) -> tuple[Contact, float, Any]:
-    """The contact geometry that inserts, by `rank`, with its push and its trial."""
+    """Return the best contact geometry by `rank`, with its push depth and its trial."""
     from guiderail.tools.parts.trial import insert
 
     allowed = 0.5 * clearance if np.isfinite(clearance) else 5e-5
-    found: list[tuple[tuple[bool, bool, bool, float], Contact, float, Any]] = []
+    candidates: list[tuple[tuple[bool, bool, bool, float], Contact, float, Any]] = []
     for side, part in zip(("plug", "socket"), parts, strict=True):
         if snapping and side == "socket":
-            continue  # what gives way is in the plug
+            continue  # the snapping bodies belong to the plug
         cut = [cut_into_convex_pieces(solid) for solid in make_solids(part)]
         if any(body is None for body in cut):
-            say(f"{side}: too intricate to be cut into convex pieces")
+            say(f"{side}: too intricate for convex pieces")
             continue
         bodies = tuple(tuple(body or ()) for body in cut)
         for modulus, time_step in itertools.product(MODULI, TIME_STEPS):
@@ -277,40 +283,41 @@ def _choose_contact(
             trial, contact, push = _first_that_seats(folder, parts, contact, numbers)
             deepest = trial.penetration
             if trial.success:
-                # Pressed on the rim it is deepest: there an edge meets an edge.
+                # Penetration is largest on the rim, where edges meet.
                 file = _task_file(parts, contact, push, numbers)
-                deepest = max(deepest, *(insert(folder, file, offset=one).penetration for one in MISALIGNMENTS))
+                deepest = max(deepest, *(insert(folder, file, offset=xy).penetration for xy in MISALIGNMENTS))
             say(
                 f"{side} compliant, {len(contact.pieces)} convex pieces, {modulus:.0e} Pa"
                 f"{f', {1e3 * time_step:g} ms a step' if time_step else ''}: "
                 f"{'seats' if trial.success else 'does not seat'}, {trial.peak_force:.1f} N, "
-                f"{1e3 * deepest:.3f} mm deep, {trial.real_time_factor:.1f} × real time"
+                f"penetration {1e3 * deepest:.3f} mm, {trial.real_time_factor:.1f} × real time"
             )
-            found.append((rank(trial.success, deepest, allowed, trial.real_time_factor), contact, push, trial))
-            if found[-1][0][1]:
+            candidates.append((rank(trial.success, deepest, allowed, trial.real_time_factor), contact, push, trial))
+            if candidates[-1][0][1]:
                 break
-        if found and found[-1][0][1] and found[-1][-1].real_time_factor >= FAST_ENOUGH:
+        if candidates and candidates[-1][0][1] and candidates[-1][-1].real_time_factor >= FAST_ENOUGH:
             break
-    if not found:
+    if not candidates:
         raise InputError(
-            "both parts are too intricate to be cut into convex pieces: leave out what never touches, such as threads, "
-            "fillets and lettering, and export them again"
+            "both parts are too intricate for convex pieces: remove details without contact, such as threads and "
+            "lettering, and export them again"
         )
-    _, contact, push, trial = max(found, key=lambda one: one[0])
+    _, contact, push, trial = max(candidates, key=lambda candidate: candidate[0])
     _write_pieces(folder, parts, contact)
     return contact, push, trial
 
 
 def rank(seats: bool, deepest: float, allowed: float, speed: float) -> tuple[bool, bool, bool, float]:
-    """The larger the better: the fastest of what is nowhere too deep, or else the least deep that is fast enough.
+    """Return a sort key, larger is better: the fastest without deep penetration, else the least penetration.
 
     Args:
-        seats: whether the plug was at the target.
-        deepest, allowed: of one part in the other [m].
-        speed: times real time.
+        seats: Whether the plug reached the target.
+        deepest: Largest penetration [m].
+        allowed: Largest allowed penetration [m].
+        speed: Real-time factor; below `MIN_SPEED` penetration counts less.
     """
-    good = seats and deepest <= allowed
-    return seats, good, speed >= BEARABLE, speed if good else -deepest
+    is_shallow = seats and deepest <= allowed
+    return seats, is_shallow, speed >= MIN_SPEED, speed if is_shallow else -deepest
 
 
 def _first_that_seats(
@@ -319,7 +326,7 @@ def _first_that_seats(
     contact: Contact,
     numbers: dict[str, Any],
 ) -> tuple[Any, Contact, float]:
-    """The first trial that seats, over how far is pushed and how soft a snap is; the last one if none does."""
+    """Return the first trial over snap moduli and push depths that seats the plug; the last one if none does."""
     from guiderail.tools.parts.trial import insert
 
     for soft in SNAP_MODULI if contact.snapping else (contact.modulus,):
@@ -354,7 +361,7 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
             ]
         else:
             pieces = [Piece.model_validate({"file": f"{name}.obj", "friction": friction})]
-        vertices = _whole(part)[0]
+        vertices = _merge_bodies(part)[0]
         middle = part.bounds.mean(axis=0)
         models[name] = PartModel(
             source=part.path.name,
@@ -385,7 +392,7 @@ def _plain_name(name: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "_.-" else "_" for letter in name)
 
 
-def _whole(part: Part) -> tuple[np.ndarray, np.ndarray]:
+def _merge_bodies(part: Part) -> tuple[np.ndarray, np.ndarray]:
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in part.bodies)])
     triangles = [t + start for (_, t), start in zip(part.bodies, starts, strict=False)]
     return np.concatenate([vertices for vertices, _ in part.bodies]), np.concatenate(triangles)
@@ -396,14 +403,14 @@ def _size(part: Part) -> str:
 
 
 def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
-    """The unit, asked for at a terminal where neither an argument nor the format says it."""
+    """Return the unit; ask for it on a terminal if neither an argument nor the format states it."""
     if given is not None or all(find_unit(path, None) for path in paths) or not sys.stdin.isatty():
         return given
     if any(not path.is_file() for path in paths):
-        return given  # which is said better where the files are read
+        return given  # the reader of the files has the better message
     try:
-        # Not by input(), whose question may go where a program reads the result.
+        # The prompt goes to standard error: standard output may be read by a program.
         print(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ", end="", file=sys.stderr, flush=True)
         return input().strip() or "mm"
     except EOFError:
-        return None  # as where nobody can be asked
+        return None

@@ -1,4 +1,4 @@
-"""Demonstrations of a scripted hand that searches the rim, recorded on rails."""
+"""Scripted insertions on a gantry: trials of a contact geometry, demonstrations, and the preview of a task."""
 
 from __future__ import annotations
 
@@ -31,21 +31,22 @@ from guiderail.models.parts.demonstrator import (
 from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
 
-_CORNERS = 8  # of a contact surface, those of the highest pressure, whose depth is measured
+_VERTICES = 8  # number of vertices of a contact surface, those of the highest pressure, for which depth is measured
+_INTERVAL = 4  # simulator steps between two measurements of depth
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One scripted insertion.
+    """Result of a scripted insertion.
 
     Attributes:
-        success: whether the plug was at the target in the end.
-        pose: of the plug in the socket then, position and rotation vector (6,) [m, rad].
-        peak_force: of the impedance [N].
-        penetration: how deep one part was in the other at most [m], what snaps left out.
-        snap: the same of what snaps [m].
-        real_time_factor: simulated seconds for each second of one core.
-        recording: poses, wrench and force at the control steps.
+        success: Whether the plug reached the target.
+        pose: Final pose of the plug in the socket, position and rotation vector (6,) [m, rad].
+        peak_force: Largest contact force [N].
+        penetration: Largest penetration of the parts [m], without snapping pieces.
+        snap: Largest penetration of snapping pieces [m].
+        real_time_factor: Simulated time per CPU time.
+        recording: Poses, wrench and force at the control steps.
     """
 
     success: bool
@@ -58,25 +59,31 @@ class Trial:
 
 
 class Depths:
-    """How deep parts are in each other, measured from Drake's own contact surfaces at the control steps.
+    """Penetration of the parts, measured from Drake's contact surfaces.
 
-    A contact surface lies in the rigid part's surface; each of its corners is as deep as it is far from the surface of
+    A contact surface lies in the surface of the rigid part; the depth of a vertex is its distance from the surface of
     the compliant part.
+
+    Attributes:
+        deepest: Largest penetration so far [m], without snapping pieces.
+        deepest_snap: Largest penetration of snapping pieces so far [m].
+        seconds: CPU time of the measurements [s].
     """
 
     def __init__(self, station: GantryStation, surfaces: dict[str, np.ndarray], snapping: set[str]):
-        """
+        """Construct the measurement.
+
         Args:
-            station: of the parts.
-            surfaces: triangles (T, 3, 3) [m] of each compliant body, by name, in its own frame.
-            snapping: full names of geometries that overlap on purpose.
+            station: Station with the parts.
+            surfaces: Triangles (T, 3, 3) [m] of each compliant body by name, in its own frame.
+            snapping: Names of geometries that overlap on purpose.
         """
         self._station, self._surfaces, self._snapping = station, surfaces, snapping
         self.deepest = self.deepest_snap = 0.0
-        self.seconds = 0.0  # of measuring, which is no part of the simulation
+        self.seconds = 0.0
 
     def monitor(self, root_context: Any) -> EventStatus:
-        """Looks at the contact there is now."""
+        """Measure the current contacts."""
         start = time.process_time()
         plant = self._station.plant
         context = plant.GetMyContextFromRoot(root_context)
@@ -87,7 +94,7 @@ class Depths:
             mesh = surface.tri_mesh_W() if surface.is_triangle() else surface.poly_mesh_W()
             field = surface.tri_e_MN() if surface.is_triangle() else surface.poly_e_MN()
             pressures = np.array([field.EvaluateAtVertex(i) for i in range(mesh.num_vertices())])
-            points = np.array([mesh.vertex(int(i)) for i in np.argsort(pressures)[-_CORNERS:]])
+            points = np.array([mesh.vertex(int(i)) for i in np.argsort(pressures)[-_VERTICES:]])
             ids = (surface.id_M(), surface.id_N())
             for geometry in ids:
                 body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
@@ -114,24 +121,24 @@ def insert(
     snapping: frozenset[str] = frozenset(),
     measure_depth: bool = True,
 ) -> Trial:
-    """Drives the plug along the script on rails, with the socket off by `offset` [m], and judges the end.
+    """Move the plug along a scripted motion on a gantry, and return the result.
 
     Args:
-        folder: with the meshes.
-        file: of the task, which need not be written yet.
-        offset: of the socket.
-        motion: times and poses; straight in unless given.
-        snapping: names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
-        measure_depth: whether depths are measured, which takes longer than the simulation.
+        folder: Folder with the meshes.
+        file: Task file, which need not be written yet.
+        offset: Offset (x, y) of the socket [m].
+        motion: Times and poses; straight in by default.
+        snapping: Names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
+        measure_depth: Whether penetration is measured, which takes longer than the simulation.
     """
     numbers = file.motion
     times, poses = (
         plan_straight_insertion(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
     )
-    world = write_workcell(folder, file)
-    station = GantryStation(world, time_step=file.time_step)
+    workcell = write_workcell(folder, file)
+    station = GantryStation(workcell, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
-    world.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
+    workcell.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {
         name: triangles_of(folder / part.visual)
         for name, part in ((PLUG, file.plug), (SOCKET, file.socket))
@@ -140,23 +147,19 @@ def insert(
     depths = Depths(station, compliant, set(snapping))
     driven.start(poses[0])
     if measure_depth:
-        watch = [0]
+        steps = [0]
 
         def monitor(root_context: Any) -> EventStatus:
-            watch[0] += 1
-            return depths.monitor(root_context) if watch[0] % 4 == 0 else EventStatus.DidNothing()
+            steps[0] += 1
+            return depths.monitor(root_context) if steps[0] % _INTERVAL == 0 else EventStatus.DidNothing()
 
         driven.simulator.set_monitor(monitor)
     start = time.process_time()
     recording = driven.run()
     spent = time.process_time() - start - depths.seconds
-    plant, context = station.plant, driven.plant_context
-    X = plant.GetFrameByName(PLUG).CalcPose(context, plant.GetFrameByName(SOCKET))
-    turn = X.rotation().ToAngleAxis()
-    pose = np.concatenate([X.translation(), turn.angle() * turn.axis()])
-    judge: Any = type("Judge", (PartInsertion,), {"file": file})
+    pose = _plug_pose(driven)
     return Trial(
-        success=judge.is_seated(pose),
+        success=_is_seated(file, pose),
         pose=pose,
         peak_force=float(recording["contact_force"].max()),
         penetration=depths.deepest,
@@ -166,8 +169,21 @@ def insert(
     )
 
 
+def _plug_pose(driven: DrivenStation) -> np.ndarray:
+    """Return the pose of the plug in the socket, position and rotation vector (6,) [m, rad]."""
+    plant = driven.station.plant
+    X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
+    rotation = X.rotation().ToAngleAxis()
+    return np.concatenate([X.translation(), rotation.angle() * rotation.axis()])
+
+
+def _is_seated(file: PartTaskFile, pose: np.ndarray) -> bool:
+    task: Any = type("Task", (PartInsertion,), {"file": file})
+    return bool(task.is_seated(pose))
+
+
 def triangles_of(path: Path) -> np.ndarray:
-    """The triangles (T, 3, 3) [m] of an OBJ file that onboarding wrote."""
+    """Return the triangles (T, 3, 3) [m] of an OBJ file of a task folder."""
     vertices, corners = [], []
     for line in path.read_text(encoding="utf-8").splitlines():
         kind, *rest = line.split()
@@ -179,11 +195,11 @@ def triangles_of(path: Path) -> np.ndarray:
 
 
 _SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}
-_SCALE = 10.0  # a part of two centimetres is too near for the page's camera
+_SCALE = 10.0  # enlarges parts of some centimeters, which are too close to the page's camera
 
 
 def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
-    """Writes the page: parts in their colours, pieces that touch each in one of its own, hidden until asked for."""
+    """Write the page of a trial: the parts, and hidden at first the contact pieces, each in its own color."""
     try:
         meshcat = Meshcat(MeshcatParams(host="localhost"))
     except RuntimeError as error:
@@ -212,29 +228,25 @@ def _show(meshcat: Any, path: str, file: Path, colour: Any) -> None:
     meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), colour)
 
 
-MOST_SESSIONS = 3  # of five attempts, until five have seated the plug
+MAX_SESSIONS = 3  # sessions of five attempts, until five attempts have seated the plug
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
-    """Writes the demonstrations' file; returns how many of them seat the plug."""
+    """Write the demonstrations; return how many of them seat the plug."""
     numbers = file.motion
     script = plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
-    good: list[np.ndarray] = []
-    bad: list[np.ndarray] = []
-    for seed in range(MOST_SESSIONS):
+    seated: list[np.ndarray] = []
+    others: list[np.ndarray] = []
+    for seed in range(MAX_SESSIONS):
         for motion in demonstrator_motions(seed, script, numbers.rim - numbers.press - 1e-3, times):
-            if len(good) < NUM_DEMONSTRATIONS:
-                (good if _seats(folder, file, times, motion) else bad).append(motion)
-    shown = (good + bad)[:NUM_DEMONSTRATIONS]
-    Demonstrations([times] * len(shown), shown, NAMES).save(folder / file.demonstrations.file)
-    return len(good)
+            if len(seated) < NUM_DEMONSTRATIONS:
+                (seated if _seats(folder, file, times, motion) else others).append(motion)
+    chosen = (seated + others)[:NUM_DEMONSTRATIONS]
+    Demonstrations([times] * len(chosen), chosen, NAMES).save(folder / file.demonstrations.file)
+    return len(seated)
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
     driven, _ = drive_along(GantryStation(write_workcell(folder, file), time_step=file.time_step), times, motion)
-    plant = driven.station.plant
-    X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
-    turn = X.rotation().ToAngleAxis()
-    judge: Any = type("Judge", (PartInsertion,), {"file": file})
-    return judge.is_seated(np.concatenate([X.translation(), turn.angle() * turn.axis()]))
+    return _is_seated(file, _plug_pose(driven))

@@ -15,7 +15,7 @@ from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above,
 
 SIZE = (4.6, 3.0)  # [in]; two side by side, or one below the other on a phone
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 9.0}
-DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that equal curves are told apart
+DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that equal curves can be distinguished
 
 
 def curve(gathered: Gathered, task: str, column: str, label: str) -> str:

@@ -56,7 +56,7 @@ WORDS = st.sampled_from(
         "sac",
     ]
 )
-WHAT_IS_TYPED = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(",".join) | st.text(max_size=8)
+TYPED = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(",".join) | st.text(max_size=8)
 BOMB = (
     "{a: &a [1,1,1,1,1,1,1,1,1], b: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a], c: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b], d: [*c,*c,*c]}"
 )
@@ -65,35 +65,35 @@ SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "al
 
 @given(
     st.sampled_from(sorted(PRESETS)),
-    st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), WHAT_IS_TYPED), min_size=1, max_size=2),
+    st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), TYPED), min_size=1, max_size=2),
 )
 @example("tqc_contact", [("ent_coef", "inf")])
 @example("tqc_contact", [("net_arch", "1000000,1000000")])
 @example("tqc_contact", [("batch_size", "1e20")])
 @example("tqc_contact", [("layer_norm", "7")])
-def test_settings_of_a_learner(preset, pairs):
+def test_configure_accepts_or_refuses_any_learner_setting(preset, pairs):
     given = dict(pairs)
     config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=given))
     if config is None:
         return
-    for name, said in given.items():
+    for name, text in given.items():
         found = getattr(config.learner, name)
         if isinstance(found, bool):
-            assert str(said).lower() in (
+            assert str(text).lower() in (
                 ("1", "true", "yes", "on", "t", "y") if found else ("0", "false", "no", "off", "f", "n")
             )
         elif isinstance(found, str):
-            assert found == said
+            assert found == text
         elif isinstance(found, tuple):
-            assert found == tuple(int(float(one)) for one in said.split(","))
+            assert found == tuple(int(float(one)) for one in text.split(","))
         else:
-            assert found == float(said)
+            assert found == float(text)
     for name, other in PRESETS[preset].__dict__.items():
         assert name in given or name == "algorithm" or getattr(config.learner, name) == other
 
 
 def options_of(task):
-    """All options that its environments can have, with their defaults as they are typed."""
+    """Return all options of a task's environments, with their defaults as typed."""
     config = EnvConfig.resolve(task, {})
     models = option_models(TASKS.get(task), config.guidance, config.station).values()
     return {name: str(field.default) for model in models for name, field in model.model_fields.items()}
@@ -108,31 +108,31 @@ def environments(draw):
     for _ in range(draw(st.integers(1, 3))):
         name = draw(st.sampled_from([*OPTIONS[task]] * 3 + ["guidance", "fixture_offset", "x", "", "render_mode"]))
         sound = st.just(OPTIONS[task].get(name) or "kmp") | st.floats(0, 1).map(repr) | st.integers(1, 50).map(str)
-        typed[name] = draw(sound | sound | WHAT_IS_TYPED)
+        typed[name] = draw(sound | sound | TYPED)
     return task, typed
 
 
 @given(environments())
 @example(("NarrowPassage", {"action_repeat": BOMB}))
 @example(("NarrowPassage", {"action_repeat": "2001-99-99"}))
-def test_options_of_an_environment(chosen):
+def test_check_environment_accepts_or_refuses_any_option(chosen):
     task, typed = chosen
     found = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in typed.items()}))
     if found is None:
         return
-    for name, said in typed.items():
-        value, read = found[name], yaml.safe_load(said) if said.strip() else None
+    for name, text in typed.items():
+        value, read = found[name], yaml.safe_load(text) if text.strip() else None
         if isinstance(value, bool):
-            assert said.strip().lower() in (
+            assert text.strip().lower() in (
                 ("1", "true", "yes", "on", "1.0") if value else ("0", "false", "no", "off", "0.0", "-0")
             )
         elif isinstance(value, tuple):
-            numbers = read if isinstance(read, list) else [one for one in str(said).split(",") if one.strip()]
+            numbers = read if isinstance(read, list) else [one for one in str(text).split(",") if one.strip()]
             assert list(value) == [float(one) for one in numbers]
         elif isinstance(value, int | float):
-            assert value == float(said)
+            assert value == float(text)
         else:
-            assert value == read or (value is None and read is None) or str(value) == said.strip()
+            assert value == read or (value is None and read is None) or str(value) == text.strip()
 
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3)
@@ -151,7 +151,7 @@ def env(request):
 
 
 @given(st.data())
-def test_options_of_a_reset(env, data):
+def test_reset_accepts_or_refuses_any_option(env, data):
     task = env.task.declaration.name
     names = st.sampled_from(RESETS[task]) | st.sampled_from(RESETS[task]) | st.text(max_size=3)
     options = data.draw(st.dictionaries(names, VALUES | st.floats(-0.1, 0.1).map(lambda x: [x, -x]), max_size=2))
@@ -162,8 +162,8 @@ def test_options_of_a_reset(env, data):
     observation, info = begun
     assert np.isfinite(observation).all()
     assert info["fallback"] in (False, 0, None) if "fallback" in info else True
-    for name, said in options.items():
-        if name in info and said is not None:
-            # A position is asked for where a thing is believed to be, and told where it is.
+    for name, text in options.items():
+        if name in info and text is not None:
+            # The option is the estimated position; the info has the true one.
             believed = np.asarray(info[name], float) + (info.get("mug_error", 0.0) if name == "mug_position" else 0.0)
-            np.testing.assert_allclose(believed, [float(one) for one in said], rtol=0, atol=1e-15)
+            np.testing.assert_allclose(believed, [float(one) for one in text], rtol=0, atol=1e-15)

@@ -1,8 +1,8 @@
-"""Demonstrations that this package wrote, read by the formats' own libraries: LeRobot's, and MCAP's for ROS 2.
+"""Read exported demonstrations with the libraries of the formats: LeRobot's, and MCAP's for ROS 2.
 
-`python tests/tools/recording/read_back.py --environment FOLDER [--interpreter python3.12]` makes an environment there
-with both libraries, which can't be installed beside this package (5 GB, and minutes), or uses the one that it finds. It
-ends with 1 where a number that comes back differs by more than its format rounds.
+`python tests/tools/datasets/read_back.py --environment FOLDER [--interpreter python3.12]` creates an environment
+there with both libraries, which cannot be installed together with this package (5 GB), or uses an existing one. The exit
+code is 1 if a number differs by more than the rounding of its format.
 """
 
 import argparse
@@ -21,7 +21,7 @@ NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 
 
 def read_lerobot(folder: Path) -> list[list[list[float]]]:
-    """The rows of each episode."""
+    """Return the rows of each episode."""
     from lerobot.datasets import LeRobotDataset
 
     dataset = LeRobotDataset("guiderail/shown", root=folder)
@@ -33,7 +33,7 @@ def read_lerobot(folder: Path) -> list[list[list[float]]]:
 
 
 def read_mcap(folder: Path) -> list[list[list[float]]]:
-    """The rows of each bag."""
+    """Return the rows of each bag."""
     from mcap_ros2.reader import read_ros2_messages
 
     return [
@@ -46,7 +46,7 @@ READERS = {"lerobot": read_lerobot, "mcap": read_mcap}
 
 
 def environment(folder: Path, interpreter: str) -> Path:
-    """The interpreter of an environment that has the libraries."""
+    """Return the interpreter of an environment with the libraries."""
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([interpreter, "-m", "venv", folder], check=True)
@@ -55,7 +55,7 @@ def environment(folder: Path, interpreter: str) -> Path:
 
 
 def differences(python: Path) -> dict[str, float]:
-    """By how much what comes back differs from what was written at most, by format, as a share of the number."""
+    """Return the largest relative difference between written and read numbers of each format."""
     from guiderail.models.primitives import Demonstrations
     from guiderail.tools.datasets.convert import export_demonstrations
 
@@ -84,8 +84,8 @@ def differences(python: Path) -> dict[str, float]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--environment", type=Path, help="folder of the libraries' own environment")
-    parser.add_argument("--interpreter", default=sys.executable, help="that makes it")
-    parser.add_argument("--read", choices=READERS, help="prints what a folder holds: called in that environment")
+    parser.add_argument("--interpreter", default=sys.executable, help="interpreter of a new environment")
+    parser.add_argument("--read", choices=READERS, help="print the contents of a folder (internal)")
     parser.add_argument("--folder", type=Path)
     given = parser.parse_args()
     if given.read:

@@ -28,7 +28,7 @@ def file(tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "tolerance", "library"), [("lerobot", 1e-6, "pyarrow"), ("mcap", 1e-15, "rosbags")])
-def test_a_round_trip_is_equal_to_rounding(kind, tolerance, library, file, tmp_path):
+def test_export_and_import_return_the_demonstrations(kind, tolerance, library, file, tmp_path):
     pytest.importorskip(library)
     export_demonstrations(file, tmp_path / kind, kind)
     signal = "action" if kind == "lerobot" else None
@@ -40,7 +40,7 @@ def test_a_round_trip_is_equal_to_rounding(kind, tolerance, library, file, tmp_p
         np.testing.assert_allclose(one, other, rtol=0, atol=max(tolerance, 1e-9 if one.ndim == 1 else 0))
 
 
-def test_a_dataset_is_laid_out_as_version_3_says(file, tmp_path):
+def test_lerobot_dataset_has_the_layout_of_version_3(file, tmp_path):
     import pyarrow.parquet as parquet
 
     export_demonstrations(file, tmp_path / "set", "lerobot")
@@ -55,13 +55,13 @@ def test_a_dataset_is_laid_out_as_version_3_says(file, tmp_path):
     assert list(tasks["task_index"]) == [0]
 
 
-def test_a_dataset_that_has_a_command_and_a_measurement_gives_the_command(file, tmp_path):
+def test_import_prefers_the_commanded_feature(file, tmp_path):
     export_demonstrations(file, tmp_path / "set", "lerobot")
     found = import_recording(tmp_path / "set", tmp_path / "back.csv")
-    assert "action is what was commanded" in found["assumed"]
+    assert "action is the commanded motion" in found["assumed"]
 
 
-def test_several_rates_need_one(tmp_path):
+def test_lerobot_export_refuses_several_rates(tmp_path):
     t = np.array([0.0, 0.1, 0.3])
     Demonstrations(t, [np.ones((3, 1))]).save(tmp_path / "uneven.npz")
     with pytest.raises(InputError, match="--rate"):
@@ -98,7 +98,7 @@ def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, 
 
 
 @pytest.mark.parametrize(("topic", "frame"), LAYOUTS.items())
-def test_a_bag_of_an_arm(topic, frame, tmp_path):
+def test_import_reads_the_bag_of_an_arm(topic, frame, tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {topic: frame})
     found = import_recording(tmp_path / "bag", tmp_path / "kept.npz")
@@ -112,18 +112,18 @@ def test_a_bag_of_an_arm(topic, frame, tmp_path):
     np.testing.assert_allclose(moved[2], [0, -0.02, 0.1, np.deg2rad(-70), 0, 0], atol=1e-12)
 
 
-def test_a_bag_with_two_measured_poses_is_asked_about(tmp_path):
+def test_import_refuses_two_measured_poses_without_signal(tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {"/a/pose": "base", "/b/pose": "base"})
-    with pytest.raises(InputError, match=r"/a/pose, /b/pose, and does not say which.*--signal"):
+    with pytest.raises(InputError, match=r"/a/pose, /b/pose, and does not state which.*--signal"):
         import_recording(tmp_path / "bag", tmp_path / "x.npz")
     assert import_recording(tmp_path / "bag", tmp_path / "x.npz", signal="/b/pose")["samples"] == [5]
 
 
-def test_without_stamps_time_is_the_recorders(tmp_path):
+def test_bag_time_is_that_of_the_recorder_without_stamps(tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {"/a/pose": "base"}, stamped=False)
-    assert "when the recorder got" in import_recording(tmp_path / "bag", tmp_path / "x.npz")["assumed"]
+    assert "when the recorder received" in import_recording(tmp_path / "bag", tmp_path / "x.npz")["assumed"]
     np.testing.assert_allclose(Demonstrations.load(tmp_path / "x.npz").times[0], 0.011 * np.arange(5), atol=1e-9)
 
 
@@ -131,7 +131,7 @@ def write_table(path, header, rows):
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
 
 
-def test_named_columns_say_all_that_matters(tmp_path):
+def test_csv_import_needs_no_option_when_columns_are_named(tmp_path):
     rows = [(n * 10, 1 + n, 2, 3, 0, 0, np.sin(0.1 * n), np.cos(0.1 * n)) for n in range(4)]
     write_table(tmp_path / "a.csv", "time_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw", rows)
     import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
@@ -149,7 +149,7 @@ def test_named_columns_say_all_that_matters(tmp_path):
         ("t,x_m,y_m,z_m,roll,pitch,yaw", (0.01, 1, 2, 3, 0, 0, 1), "is in degrees", {"angles": "deg"}),
     ],
 )
-def test_what_a_table_does_not_say_is_asked_for(header, row, asks, remedy, tmp_path):
+def test_csv_import_names_the_missing_option(header, row, asks, remedy, tmp_path):
     rows = [(n * row[0], row[1] + n, *row[2:]) for n in range(4)]
     write_table(tmp_path / "a.csv", header, rows)
     with pytest.raises(InputError, match=asks):
@@ -161,23 +161,23 @@ def test_what_a_table_does_not_say_is_asked_for(header, row, asks, remedy, tmp_p
         assert outputs[0, 3] == pytest.approx(angle)
 
 
-def test_a_quaternion_that_is_none_is_refused(tmp_path):
+def test_csv_import_refuses_a_quaternion_of_wrong_length(tmp_path):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m,qx,qy,qz,qw", [(0.01 * n, 0, 0, 0, 0, 0, 0, 3) for n in range(3)])
     with pytest.raises(InputError, match="length 3"):
         import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
 
 
-def test_what_is_no_recording_is_refused(tmp_path):
-    for source, words in ((tmp_path / "none", "there is no"), (tmp_path, "is no LeRobot dataset, bag")):
+def test_import_refuses_other_files(tmp_path):
+    for source, words in ((tmp_path / "none", "there is no"), (tmp_path, "is not a LeRobot dataset")):
         with pytest.raises(InputError, match=words):
             import_recording(source, tmp_path / "a.npz")
     (tmp_path / "bad.mcap").write_bytes(b"nothing")
     pytest.importorskip("rosbags")
-    with pytest.raises(InputError, match="can't be read as a bag"):
+    with pytest.raises(InputError, match="cannot be read as a bag"):
         import_recording(tmp_path / "bad.mcap", tmp_path / "a.npz")
 
 
-def test_a_turn_past_half_a_circle_is_the_same_in_all_demonstrations(tmp_path):
+def test_angles_beyond_pi_agree_between_demonstrations(tmp_path):
     for name, degrees in (("a", 175), ("b", -175), ("c", 178)):
         rows = [(0.01 * n, 0, 0, 0, 0, 0, np.deg2rad(degrees + n)) for n in range(4)]
         write_table(tmp_path / f"{name}.csv", "t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad", rows)
@@ -186,7 +186,7 @@ def test_a_turn_past_half_a_circle_is_the_same_in_all_demonstrations(tmp_path):
     assert starts == pytest.approx([175, 185, 178])
 
 
-def test_a_feature_of_one_number_is_an_output(tmp_path):
+def test_lerobot_feature_of_one_number_is_an_output(tmp_path):
     import pyarrow.parquet as parquet
 
     t = 0.1 * np.arange(5)
@@ -200,20 +200,20 @@ def test_a_feature_of_one_number_is_an_output(tmp_path):
     np.testing.assert_allclose(Demonstrations.load(tmp_path / "back.npz").outputs[0][:, 0], t, atol=1e-6)
 
 
-def test_two_publishers_on_a_topic_are_not_mixed(tmp_path):
+def test_import_refuses_two_publishers_on_a_topic(tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {"/a/pose": "base"}, beside="geometry_msgs/msg/Pose")
     with pytest.raises(InputError, match="2 publishers on /a/pose"):
         import_recording(tmp_path / "bag", tmp_path / "x.npz")
 
 
-def test_bounds_go_into_a_folder_that_is_there(file, tmp_path):
+def test_fit_bounds_refuses_a_missing_folder(file, tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         fit_bounds(file, out=tmp_path / "none" / "bounds.yaml")
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])
-def test_an_export_that_fails_on_the_way_can_be_tried_again(kind, file, tmp_path, monkeypatch):
+def test_failed_export_can_be_repeated(kind, file, tmp_path, monkeypatch):
     pytest.importorskip("rosbags")
     out = tmp_path / "out"
 
@@ -231,7 +231,7 @@ def test_an_export_that_fails_on_the_way_can_be_tried_again(kind, file, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])
-def test_where_nothing_can_be_written_is_said_before_anything_is_read(kind, file, tmp_path):
+def test_export_checks_its_folder_before_it_reads(kind, file, tmp_path):
     (tmp_path / "damaged.csv").write_text("nothing")
     for place in (file / "set", file / "new" / "set"):
         with pytest.raises(InputError, match="cannot be written"):
@@ -240,7 +240,7 @@ def test_where_nothing_can_be_written_is_said_before_anything_is_read(kind, file
             import_recording(tmp_path / "damaged.csv", place.with_suffix(".npz"))
 
 
-def test_a_start_that_resampling_leaves_is_said(tmp_path):
+def test_export_states_a_shifted_start_when_resampled(tmp_path):
     t = 0.1 * np.arange(5)
     Demonstrations([t - 0.2], [t[:, None]]).save(tmp_path / "early.npz")
     found = export_demonstrations(tmp_path / "early.npz", tmp_path / "set", "lerobot", rate=20)
@@ -248,13 +248,13 @@ def test_a_start_that_resampling_leaves_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("rate", [1e15, 1e308])
-def test_more_samples_than_a_file_holds_are_refused(rate, tmp_path):
+def test_import_refuses_more_samples_than_a_file_holds(rate, tmp_path):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
     with pytest.raises(InputError, match="give a lower one"):
         import_recording(tmp_path / "a.csv", tmp_path / "a.npz", rate=rate)
 
 
-def test_what_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
+def test_import_writes_no_file_that_cannot_be_read(tmp_path, monkeypatch):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
     monkeypatch.setattr("guiderail.tools.datasets.convert.MAX_NUMBERS", 15)
     with pytest.raises(InputError, match=r"16 numbers.*--rate"):
@@ -263,21 +263,21 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])
-def test_what_is_for_tables_is_refused_of_others(kind, file, tmp_path):
+def test_import_refuses_csv_options_for_other_formats(kind, file, tmp_path):
     export_demonstrations(file, tmp_path / "set", kind)
-    with pytest.raises(InputError, match="say themselves what --unit would"):
+    with pytest.raises(InputError, match="state what --unit would"):
         import_recording(tmp_path / "set", tmp_path / "again.npz", unit="mm")
     assert not (tmp_path / "again.npz").exists()
 
 
-def test_a_signal_is_refused_of_a_table(tmp_path):
+def test_csv_import_refuses_a_signal(tmp_path):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
     with pytest.raises(InputError, match="leave --signal out"):
         import_recording(tmp_path / "a.csv", tmp_path / "a.npz", signal="foo")
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])
-def test_a_dozen_demonstrations_keep_their_order(kind, tmp_path):
+def test_twelve_demonstrations_keep_their_order(kind, tmp_path):
     t = 0.1 * np.arange(6)
     Demonstrations([t] * 12, [np.full((6, 1), float(k)) for k in range(12)]).save(tmp_path / "many.npz")
     export_demonstrations(tmp_path / "many.npz", tmp_path / "set", kind)

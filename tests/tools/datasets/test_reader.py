@@ -20,14 +20,14 @@ def write(path, index=0, header="t,x,y,z"):
     return path
 
 
-def test_a_table_with_a_line_of_names_is_one_demonstration(tmp_path):
+def test_csv_file_is_one_demonstration(tmp_path):
     read = load_demonstrations(write(tmp_path / "one.csv"))
     assert read.names == ("x", "y", "z")
     np.testing.assert_array_equal(read.times[0], CLOCK)
     np.testing.assert_array_equal(read.outputs[0], motion())
 
 
-def test_a_folder_is_all_of_its_files_whatever_they_are(tmp_path):
+def test_folder_contains_the_demonstrations_of_all_files(tmp_path):
     for index in (2, 0, 1):
         write(tmp_path / f"{index}.csv", index)
     Demonstrations(CLOCK, [motion(3), motion(4)], ["x", "y", "z"]).save(tmp_path / "3.npz")
@@ -38,12 +38,12 @@ def test_a_folder_is_all_of_its_files_whatever_they_are(tmp_path):
         np.testing.assert_array_equal(outputs, motion(index))
 
 
-def test_what_guiderail_itself_writes_is_read_as_before(tmp_path):
+def test_saved_csv_file_is_read_again(tmp_path):
     Demonstrations(CLOCK, [motion(0), motion(1)]).save(tmp_path / "two.csv")
     assert load_demonstrations(tmp_path / "two.csv").num_demonstrations == 2
 
 
-def test_a_mark_at_the_beginning_is_no_part_of_the_first_name(tmp_path):
+def test_byte_order_mark_is_not_part_of_the_first_name(tmp_path):
     rows = [f"{m},{t},{m + t}" for m in range(2) for t in range(3)]
     text = "\n".join(["demonstration,time,x", *rows])
     (tmp_path / "marked.csv").write_text(text, encoding="utf-8-sig")  # as Excel writes it
@@ -52,7 +52,7 @@ def test_a_mark_at_the_beginning_is_no_part_of_the_first_name(tmp_path):
 
 @pytest.mark.parametrize("read", [validate_demonstrations, load_demonstrations, fit_bounds])
 @pytest.mark.parametrize("ending", ["", ".csv", ".npz"])
-def test_a_name_that_no_file_can_have_is_refused(read, ending, tmp_path):
+def test_readers_refuse_a_name_that_is_too_long(read, ending, tmp_path):
     with pytest.raises(InputError, match="File name too long"):
         read(tmp_path / ("x" * 300 + ending))
 
@@ -70,7 +70,7 @@ def test_a_name_that_no_file_can_have_is_refused(read, ending, tmp_path):
         ("t,x\n1,1\n0,2\n", "does not increase"),
     ],
 )
-def test_what_is_no_demonstration_is_one_sentence(tmp_path, text, words):
+def test_load_demonstrations_refuses_invalid_tables(tmp_path, text, words):
     (tmp_path / "wrong.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         load_demonstrations(tmp_path / "wrong.csv")
@@ -78,7 +78,7 @@ def test_what_is_no_demonstration_is_one_sentence(tmp_path, text, words):
         Demonstrations.load(tmp_path / "wrong.csv")  # whoever learns from it is told the same
 
 
-def test_a_folder_without_any_or_of_several_kinds_is_refused(tmp_path):
+def test_folder_without_files_or_of_mixed_outputs_is_refused(tmp_path):
     with pytest.raises(InputError, match="no file"):
         load_demonstrations(tmp_path)
     write(tmp_path / "a.csv")
@@ -88,7 +88,7 @@ def test_a_folder_without_any_or_of_several_kinds_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("ending", "magic"), [(".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")])
-def test_demonstrations_are_drawn_in_the_format_that_is_asked_for(tmp_path, ending, magic):
+def test_picture_has_the_format_of_its_ending(tmp_path, ending, magic):
     for index in range(3):
         write(tmp_path / f"{index}.csv", index)
     picture = tmp_path / f"drawn{ending}"

@@ -1,8 +1,8 @@
-"""The six parts that nobody tuned for: drawn, onboarded and learned by the commands alone, and judged.
+"""Learn six parts that no parameter was tuned for: create their tasks, train and evaluate with the commands alone.
 
-`python tests/tools/onboard/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60] [--judged 100]
-[--seed 0] [--processes 2]`; `--episodes 0` onboards alone. What is finished in the folder is used again, and a run that
-was interrupted goes on: the same command makes the rest. It leaves `table.md` and, for each part, a log.
+`python tests/tools/parts/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60] [--held-out 100]
+[--seed 0] [--processes 2]`; `--episodes 0` creates the tasks only. The same command resumes an interrupted run. It writes `table.md` and a
+log of each part.
 """
 
 import argparse
@@ -25,12 +25,12 @@ COMMAND = [sys.executable, "-c", "from guiderail.tools.cli.main import main; mai
 COLUMNS = (
     "part", "real-time factor", "deepest [mm]", "allowed [mm]", "aligned", "1.5 mm off", "demonstrations alone",
     "uniform_random",
-    "held out", "converged after", "episodes", "minutes",
+    "held out", "episodes to convergence", "episodes", "minutes",
 )  # fmt: skip
 
 
 def guiderail(log: Path, *words: object) -> str:
-    """Runs a command, its words and what it says in a log; returns what it printed."""
+    """Run a command, log it with its messages, and return its output."""
     with log.open("a", encoding="utf-8") as file:
         file.write(f"\n$ guiderail {' '.join(map(str, words))}\n")
         file.flush()
@@ -45,7 +45,7 @@ def guiderail(log: Path, *words: object) -> str:
 
 
 def finished(kept: Path, make) -> dict:
-    """What a step came to, with the minutes that it took: from its file, where there is one."""
+    """Return the result of a step with its duration [min], from its file if it exists."""
     if not kept.exists():
         start = time.perf_counter()
         found = make()
@@ -53,8 +53,8 @@ def finished(kept: Path, make) -> dict:
     return json.loads(kept.read_text(encoding="utf-8"))
 
 
-def onboarded(name: str, out: Path, log: Path) -> dict:
-    """Draws a part and makes it a task."""
+def create_task(name: str, out: Path, log: Path) -> dict:
+    """Draw a part and create its task."""
     part, drawn, task = PARTS[name](), out / "drawn" / name, out / "tasks" / name
     drawn.mkdir(parents=True, exist_ok=True)
     plug, socket = part.write(drawn)
@@ -64,8 +64,8 @@ def onboarded(name: str, out: Path, log: Path) -> dict:
     return yaml.safe_load((task / "task.yaml").read_text(encoding="utf-8"))["measured"]
 
 
-def learned(name: str, out: Path, log: Path, episodes: int, seed: int) -> dict:
-    """Trains with what the task recommends, and nothing else said."""
+def train(name: str, out: Path, log: Path, episodes: int, seed: int) -> dict:
+    """Train with the task's own defaults."""
     run = out / "runs" / name
     if not (run / "policy.safetensors").exists():
         how = ["--resume", "--out", run] if (run / "config.yaml").exists() else [out / "tasks" / name, "--out", run]
@@ -74,28 +74,28 @@ def learned(name: str, out: Path, log: Path, episodes: int, seed: int) -> dict:
     return {"episodes": len(rows), "training_minutes": rows["wall_time"].sum() / 60}
 
 
-def judged(name: str, out: Path, log: Path, episodes: int) -> dict:
-    """Held-out places that training never drew."""
+def evaluate(name: str, out: Path, log: Path, episodes: int) -> dict:
+    """Evaluate on held-out conditions."""
     said = guiderail(
         log, "evaluate", out / "runs" / name, "--episodes", episodes, "--baselines", "uniform_random", "--json"
     )
     return json.loads(said.strip().splitlines()[-1])
 
 
-def all_of(name: str, out: Path, episodes: int, seed: int, held_out: int) -> list[object]:
-    """A part's row of the table."""
+def table_row(name: str, out: Path, episodes: int, seed: int, held_out: int) -> list[object]:
+    """Return the row of a part in the table."""
     log, kept = out / "logs" / f"{name}.txt", out / "kept"
-    measured = finished(kept / f"{name}-onboarded.json", lambda: onboarded(name, out, log))
+    measured = finished(kept / f"{name}-task.json", lambda: create_task(name, out, log))
     deepest = max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"])
     clearance = measured["clearance_mm"]
     row: list[object] = [name, measured["real_time_factor"], deepest, round(clearance / 2, 4), measured["inserted"]]
     row.append("/".join("in" if one else "stopped" for one in measured["inserted_1.5_mm_off"]))
     if not episodes:
         return [*row, *[""] * 5, f"{measured['minutes']:.1f}"]
-    trained = finished(kept / f"{name}-learned.json", lambda: learned(name, out, log, episodes, seed))
-    found = finished(kept / f"{name}-judged.json", lambda: judged(name, out, log, held_out))
+    trained = finished(kept / f"{name}-training.json", lambda: train(name, out, log, episodes, seed))
+    found = finished(kept / f"{name}-evaluation.json", lambda: evaluate(name, out, log, held_out))
     minutes = measured["minutes"] + trained["training_minutes"] + found["minutes"]
-    whose = ("demonstration_success_rate", "white_success_rate", "success_rate")
+    whose = ("demonstration_success_rate", "uniform_random_success_rate", "success_rate")
     alone, uniform_random, success = (f"{found[which] * found['episodes']:.0f}" for which in whose)
     return [
         *row,
@@ -109,12 +109,12 @@ def all_of(name: str, out: Path, episodes: int, seed: int, held_out: int) -> lis
 
 
 def main() -> None:
-    """Does what is not there yet, and prints the table as far as it goes."""
+    """Run all unfinished steps, and print the table after each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--parts", default=",".join(PARTS))
     parser.add_argument("--episodes", type=int, default=60)
-    parser.add_argument("--judged", type=int, default=100)
+    parser.add_argument("--held-out", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args()
@@ -123,7 +123,7 @@ def main() -> None:
     rows, failed = {}, {}
     with ThreadPoolExecutor(given.processes) as pool:
         asked = {
-            name: pool.submit(all_of, name, given.out, given.episodes, given.seed, given.judged)
+            name: pool.submit(table_row, name, given.out, given.episodes, given.seed, given.held_out)
             for name in given.parts.split(",")
         }
         for name, one in asked.items():

@@ -42,7 +42,7 @@ def folder(tmp_path_factory):
         gymnasium.registry.pop(environment_id(name), None)
 
 
-def test_what_was_measured_is_what_was_drawn(folder):
+def test_measured_properties_are_those_of_the_drawing(folder):
     measured = yaml.safe_load((folder / "task.yaml").read_text())["measured"]
     assert measured["clearance_mm"] == pytest.approx(0.1, abs=1e-3)
     assert measured["inserted"] is True
@@ -54,7 +54,7 @@ def test_what_was_measured_is_what_was_drawn(folder):
     assert len(page) > 100_000
 
 
-def test_scenarios_that_would_lie_on_each_other_or_on_the_tasks_own_files_are_refused(tmp_path):
+def test_scenarios_with_conflicting_names_are_refused(tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     for name in ("a/table.yaml", "b/table.yaml", "a/task.yaml", "a/plug.obj"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -62,21 +62,21 @@ def test_scenarios_that_would_lie_on_each_other_or_on_the_tasks_own_files_are_re
     for names, words in (
         (("a/table.yaml", "b/table.yaml"), "two scenarios are called table.yaml"),
         (("a/task.yaml",), "not task.yaml"),
-        (("a/plug.obj",), "is no scenario"),
+        (("a/plug.obj",), "is not a scenario"),
     ):
         with pytest.raises(InputError, match=words):
             create_task(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
     assert not (tmp_path / "peg").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_refused_in_a_sentence(tmp_path):
+def test_create_task_refuses_a_folder_below_a_file(tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
         create_task(plug, socket, tmp_path / "file" / "peg", unit="mm")
 
 
-def test_a_question_is_no_part_of_the_result(tmp_path, monkeypatch, capsys):
+def test_unit_is_asked_for_on_standard_error(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "cm\n"))
     files = [tmp_path / "plug.stl", tmp_path / "socket.stl"]
     assert ask_unit(files, None) is None, "of files that are missing nothing is asked"
@@ -86,7 +86,7 @@ def test_a_question_is_no_part_of_the_result(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_of_contacts_the_fastest_is_chosen_that_is_nowhere_too_deep_or_else_the_least_deep():
+def test_rank_prefers_seating_then_shallow_then_fast_contacts():
     allowed = 1e-4
     tried = {
         "fast": rank(True, 0.9e-4, allowed, 3.0),
@@ -99,7 +99,7 @@ def test_of_contacts_the_fastest_is_chosen_that_is_nowhere_too_deep_or_else_the_
     assert sorted(tried, key=tried.get, reverse=True) == list(tried)
 
 
-def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
+def test_created_folder_is_a_task(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(replay, "EPISODES", 1)
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
@@ -109,7 +109,7 @@ def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
     assert (tmp_path / "run/replay.html").is_file()
 
 
-def test_it_is_learned_as_its_folder_recommends(folder):
+def test_created_task_trains_with_its_own_learner(folder):
     from guiderail.diagrams.envs.config import EnvConfig
     from guiderail.tools.environments import task_named
     from guiderail.tools.learning.train import configure, with_defaults
@@ -128,12 +128,12 @@ def test_it_is_learned_as_its_folder_recommends(folder):
             validate_options(PartTaskFile, changed | wrong, "task.yaml")
 
 
-def test_its_options_are_listed(folder, capsys):
+def test_options_of_a_created_task_are_listed(folder, capsys):
     call("list", folder)
     assert "offset_range" in capsys.readouterr().out
 
 
-def test_bounds_from_demonstrations_become_its_own(folder, capsys):
+def test_fitted_bounds_become_those_of_the_task(folder, capsys):
     from guiderail.diagrams.envs.config import EnvConfig
     from guiderail.diagrams.envs.make import make_env
 
@@ -153,7 +153,7 @@ def test_bounds_from_demonstrations_become_its_own(folder, capsys):
         (folder / "task.yaml").write_text(before)
 
 
-def test_bounds_that_cannot_be_written_leave_the_task_as_it_was(folder, monkeypatch, capsys):
+def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, capsys):
     def fail(*paths):
         raise OSError(28, "No space left on device")
 
@@ -164,7 +164,7 @@ def test_bounds_that_cannot_be_written_leave_the_task_as_it_was(folder, monkeypa
     assert (folder / "task.yaml").read_text() == before
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_the_task_as_it_was(folder, tmp_path, monkeypatch, capsys):
+def test_task_is_unchanged_when_bounds_cannot_be_drawn(folder, tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise InputError("no room")
 
@@ -185,7 +185,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_task_as_it_was(folder, tmp_pa
         (lambda text: "format: other\n", "is no task"),
     ],
 )
-def test_an_edited_number_is_checked(change, says, folder, capsys):
+def test_edited_task_file_is_validated(change, says, folder, capsys):
     before = (folder / "task.yaml").read_text()
     try:
         (folder / "task.yaml").write_text(change(before))
@@ -195,7 +195,7 @@ def test_an_edited_number_is_checked(change, says, folder, capsys):
         (folder / "task.yaml").write_text(before)
 
 
-def test_what_makes_no_sense_is_refused_and_leaves_nothing(folder, tmp_path, capsys):
+def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
     plug, socket = PARTS["bayonet"]().write(tmp_path)
     for arguments, says in (
         ((), "does not say its unit"),
@@ -213,7 +213,7 @@ def test_what_makes_no_sense_is_refused_and_leaves_nothing(folder, tmp_path, cap
         assert sorted(path.name for path in tmp_path.iterdir()) == ["plug.stl", "socket.stl"]
 
 
-def test_a_part_from_another_direction_is_the_same_task(tmp_path):
+def test_parts_drawn_in_another_pose_give_the_same_task(tmp_path):
     """Drawn lying along x, and the plug apart from its socket: --axis and --plug-pose bring both to the target frame."""
     from guiderail.tools.parts.create_task import read_parts
 

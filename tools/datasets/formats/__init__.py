@@ -1,1 +1,1 @@
-"""Recordings of others: CSV as people have it, ROS 2 bags and MCAP, LeRobot datasets."""
+"""Formats of recordings: CSV files, ROS 2 bags and MCAP, LeRobot datasets."""

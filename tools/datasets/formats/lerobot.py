@@ -1,4 +1,4 @@
-"""LeRobot datasets of version 3, read and written with pyarrow: the library itself asks for other versions."""
+"""LeRobot datasets of version 3, read and written with pyarrow: LeRobot itself requires other versions of packages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.formats.recorded import Recorded, choose_signal, from_zero
+from guiderail.tools.datasets.formats.recorded import Recorded, choose_signal, describe_time_shift
 from guiderail.tools.files import atomic_folder
 
 VERSION = "v3.0"
@@ -27,14 +27,14 @@ _CLOCKS = {
 
 
 def read_lerobot(folder: Path, signal: str | None) -> Recorded:
-    """One demonstration an episode.
+    """Return one demonstration per episode of a dataset.
 
     Args:
-        folder: of the dataset.
-        signal: a feature of one dimension, such as action; found out unless given.
+        folder: Folder of the dataset.
+        signal: Feature of one dimension, such as action; the only candidate by default.
 
     Raises:
-        InputError: if it is no such dataset, or does not say what is meant.
+        InputError: If it is not such a dataset, or several features could be imported.
     """
     import pyarrow.parquet as parquet
 
@@ -43,12 +43,12 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
         version, features, fps = str(info["codebase_version"]), dict(info["features"]), float(info["fps"])
         vectors = [name for name, feature in features.items() if _is_vector(name, feature)]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise InputError(f"{folder} is no LeRobot dataset: its {INFO} is missing or damaged") from error
+        raise InputError(f"{folder} is not a LeRobot dataset: its {INFO} is missing or damaged") from error
     if not 0.0 < fps < np.inf:
         raise InputError(f"{folder} has {fps:g} frames a second: correct fps in its {INFO}")
     if not version.startswith("v3"):
         raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
-    chosen, assumed = choose_signal(sorted(vectors), signal, str(folder), "--signal")
+    chosen, assumptions = choose_signal(sorted(vectors), signal, str(folder), "--signal")
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
         raise InputError(f"{folder} has no data/*.parquet: copy the whole dataset")
@@ -63,17 +63,17 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder} holds data that its {INFO} does not describe: {error}") from error
     names = _names(features[chosen], values.shape[1])
-    assumed += [
-        f"time is the frame's number by {fps:g} frames a second",
-        "numbers are kept as they are: a LeRobot dataset does not say their unit or frame",
+    assumptions += [
+        f"time is the frame index at {fps:g} frames per second",
+        "numbers are kept as they are: a LeRobot dataset does not state their unit or frame",
     ]
-    found = Recorded([], [], names, assumed)
+    recorded = Recorded([], [], names, assumptions)
     for episode in np.unique(episodes):
         rows = np.flatnonzero(episodes == episode)
         rows = rows[np.argsort(frames[rows], kind="stable")]
-        found.times.append(frames[rows] / fps)
-        found.outputs.append(values[rows])
-    return found
+        recorded.times.append(frames[rows] / fps)
+        recorded.outputs.append(values[rows])
+    return recorded
 
 
 def _is_vector(name: str, feature: dict[str, Any]) -> bool:
@@ -91,11 +91,10 @@ def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
 
 
 def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
-    """Writes a dataset whose action is what was commanded.
+    """Write a dataset with the demonstrated motion as its action; return remarks.
 
     Raises:
-        InputError: if the demonstrations have no common rate, which a dataset must have, a value is beyond 32 bits, or
-            it can't be written.
+        InputError: If the demonstrations have no common rate, a value exceeds 32 bits, or the folder cannot be written.
     """
     import pandas as pd
     import pyarrow as arrow
@@ -109,13 +108,13 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         )
     fps = round(1.0 / period, 6)
     if fps == 0.0:
-        raise InputError(f"a LeRobot dataset counts frames in a second, and these are {period:g} s apart: give --rate")
+        raise InputError(f"a LeRobot dataset has frames per second, and these are {period:g} s apart: give --rate")
     fps = int(fps) if float(fps).is_integer() else fps
     size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
     outputs = np.concatenate(demonstrations.outputs)
     largest = np.abs(outputs).max()
     if largest > np.finfo(np.float32).max:
-        raise InputError(f"a LeRobot dataset holds numbers of 32 bits, which a value of {largest:g} is beyond")
+        raise InputError(f"a LeRobot dataset holds numbers of 32 bits, which a value of {largest:g} exceeds")
     values = outputs.astype(np.float32)
     frames = np.concatenate([np.arange(n) for n in lengths])
     episodes = np.repeat(np.arange(len(lengths)), lengths)
@@ -161,26 +160,26 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         "video_path": None,
         "features": features,
     }
-    with atomic_folder(folder) as made:
+    with atomic_folder(folder) as part:
         for path, table in (
             (DATA_PATH.format(chunk_index=0, file_index=0), columns),
             ("meta/episodes/chunk-000/file-000.parquet", describe_options),
         ):
-            (made / path).parent.mkdir(parents=True)
-            parquet.write_table(arrow.table(table), made / path)
+            (part / path).parent.mkdir(parents=True)
+            parquet.write_table(arrow.table(table), part / path)
         tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task"))
-        tasks.to_parquet(made / "meta" / "tasks.parquet")
-        (made / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
+        tasks.to_parquet(part / "meta" / "tasks.parquet")
+        (part / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
         stats = json.dumps(_statistics(columns, values), indent=4)
-        (made / "meta" / "stats.json").write_text(stats, encoding="utf-8")
-    notes = ["action and observation.state are both what was demonstrated, as 32-bit numbers"]
-    return notes + from_zero(demonstrations)
+        (part / "meta" / "stats.json").write_text(stats, encoding="utf-8")
+    notes = ["action and observation.state are both the demonstrated motion, as 32-bit numbers"]
+    return notes + describe_time_shift(demonstrations)
 
 
 def _statistics(columns: dict[str, Any], values: np.ndarray) -> dict[str, Any]:
-    found = {}
+    statistics = {}
     for name, column in columns.items():
         numbers = values.astype(float) if name in ("action", "observation.state") else column.to_numpy()[:, None]
         reduced = {"min": numbers.min(0), "max": numbers.max(0), "mean": numbers.mean(0), "std": numbers.std(0)}
-        found[name] = {key: value.tolist() for key, value in reduced.items()} | {"count": [len(numbers)]}
-    return found
+        statistics[name] = {key: value.tolist() for key, value in reduced.items()} | {"count": [len(numbers)]}
+    return statistics

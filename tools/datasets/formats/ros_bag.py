@@ -1,4 +1,4 @@
-"""ROS 2 bags, and MCAP files with ROS 2 messages, read and written by rosbags."""
+"""ROS 2 bags and MCAP files with ROS 2 messages, read and written with rosbags."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from guiderail.tools.datasets.formats.recorded import (
     POSE_NAMES,
     Recorded,
     choose_signal,
-    from_zero,
+    describe_time_shift,
     poses_in_target,
     rotations_of,
 )
 from guiderail.tools.datasets.paths import in_order
 from guiderail.tools.files import atomic_folder
 
-# Where a pose is in a message of each type that robots commonly publish.
+# Attributes that lead to the pose in a message, by its type.
 POSES = {
     "geometry_msgs/msg/PoseStamped": ("pose",),
     "geometry_msgs/msg/Pose": (),
@@ -35,7 +35,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 TOPIC = "/demonstration/commanded_pose"
 DATA = "std_msgs/msg/Float64MultiArray"
 _NANO = 1e-9
-_LATEST = 9e9  # [s]: a bag counts nanoseconds in 63 bits
+_MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bits
 
 
 def _rosbags() -> Any:
@@ -47,35 +47,38 @@ def _rosbags() -> Any:
 
 
 def find_bags(path: Path) -> list[Path]:
-    """The bags at a path: itself, or those in the folder, sorted by name."""
+    """Return the bag at a path, or those in the folder, sorted by name."""
     if path.suffix == ".mcap" or (path / "metadata.yaml").is_file():
         return [path]
     return in_order(one for one in path.iterdir() if one.suffix == ".mcap" or (one / "metadata.yaml").is_file())
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
-    """One demonstration a bag.
+    """Return one demonstration per bag.
 
     Args:
-        path: a bag, an MCAP file, or a folder of them.
-        topic: which is meant; found out unless given.
-        target: see `poses_in_target`.
+        path: Bag, MCAP file, or a folder of them.
+        topic: Topic; the only candidate by default.
+        target: See `poses_in_target`.
 
     Raises:
-        InputError: if there is none, or it does not say what is meant.
+        InputError: If a bag cannot be read, or several topics could be imported.
     """
-    found = Recorded([], [], ())
+    recorded = Recorded([], [], ())
     for bag in find_bags(path):
-        times, outputs, names, assumed = _read_bag(bag, topic, target, found.outputs[0] if found.outputs else None)
-        if sorted(names) == sorted(found.names):  # joints come in any order
-            names, outputs = found.names, outputs[:, [names.index(name) for name in found.names]]
-        if found.names and names != found.names:
-            raise InputError(f"{bag} has {', '.join(names)}, the bag before {', '.join(found.names)}: record the same")
-        found.times.append(times)
-        found.outputs.append(outputs)
-        found.names = names
-        found.assumed += [one for one in assumed if one not in found.assumed]
-    return found
+        like = recorded.outputs[0] if recorded.outputs else None
+        times, outputs, names, assumptions = _read_bag(bag, topic, target, like)
+        if sorted(names) == sorted(recorded.names):  # the order of joints may differ
+            names, outputs = recorded.names, outputs[:, [names.index(name) for name in recorded.names]]
+        if recorded.names and names != recorded.names:
+            raise InputError(
+                f"{bag} has {', '.join(names)}, the bag before {', '.join(recorded.names)}: record the same outputs"
+            )
+        recorded.times.append(times)
+        recorded.outputs.append(outputs)
+        recorded.names = names
+        recorded.assumptions += [text for text in assumptions if text not in recorded.assumptions]
+    return recorded
 
 
 def _read_bag(
@@ -87,28 +90,28 @@ def _read_bag(
     try:
         reader = highlevel.AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
-    except Exception as error:  # whatever a damaged bag makes its reader raise
-        raise InputError(f"{bag} can't be read as a bag: {brief(str(error))}") from error
+    except Exception as error:  # the reader raises many types for damaged bags
+        raise InputError(f"{bag} cannot be read as a bag: {brief(str(error))}") from error
     try:
         kinds = {one.topic: one.msgtype for one in reader.connections}
-        known = [name for name, kind in kinds.items() if kind in POSES or kind in (JOINTS, DATA)]
-        chosen, assumed = choose_signal(sorted(known), topic, str(bag), "--signal")
+        candidates = [name for name, kind in kinds.items() if kind in POSES or kind in (JOINTS, DATA)]
+        chosen, assumptions = choose_signal(sorted(candidates), topic, str(bag), "--signal")
         connections = [one for one in reader.connections if one.topic == chosen]
         if len(connections) > 1:
             raise InputError(
-                f"{bag} has {len(connections)} publishers on {chosen}, whose motions would be mixed: record one of them"
+                f"{bag} has {len(connections)} publishers on {chosen}, which would be mixed: record one of them"
             )
         rows = [(stamp, reader.deserialize(raw, kinds[chosen])) for _, stamp, raw in reader.messages(connections)]
     except InputError:
         raise
-    except Exception as error:  # as above, of a message
-        raise InputError(f"{bag} holds a message that can't be read: {brief(str(error))}") from error
+    except Exception as error:  # as above
+        raise InputError(f"{bag} holds a message that cannot be read: {brief(str(error))}") from error
     finally:
         reader.close()
     if len(rows) < 2:
         raise InputError(f"{bag} has {len(rows)} messages on {chosen}: a motion needs at least two")
-    times, of_time = _clock(rows)
-    assumed += of_time
+    times, remarks = _clock(rows)
+    assumptions += remarks
     messages = [message for _, message in rows]
     if kinds[chosen] == DATA:
         names = tuple(dimension.label for dimension in messages[0].layout.dim) or POSE_NAMES
@@ -118,28 +121,28 @@ def _read_bag(
                     f"message {number} on {chosen} of {bag} has {len(message.data)} numbers, and not {len(names)}: "
                     "record as many in each"
                 )
-        return times, np.array([message.data for message in messages]), names, assumed
+        return times, np.array([message.data for message in messages]), names, assumptions
     if kinds[chosen] == JOINTS:
-        assumed.append("joints are revolute, so that their positions are in radians")
+        assumptions.append("joints are revolute, so that their positions are in radians")
         names = tuple(f"{name} [rad]" for name in messages[0].name)
-        return times, _joint_positions(messages, f"on {chosen} of {bag}"), names, assumed
+        return times, _joint_positions(messages, f"on {chosen} of {bag}"), names, assumptions
     poses = [_within(message, POSES[kinds[chosen]]) for message in messages]
     positions = np.array([_xyz(pose) for pose in poses])
-    turns = [getattr(pose, "orientation", None) or pose.rotation for pose in poses]
-    rotations = rotations_of(np.array([(q.x, q.y, q.z, q.w) for q in turns]), str(bag))
+    orientations = [getattr(pose, "orientation", None) or pose.rotation for pose in poses]
+    rotations = rotations_of(np.array([(q.x, q.y, q.z, q.w) for q in orientations]), str(bag))
     frame = _frame(messages[0], POSES[kinds[chosen]])
-    assumed.append("positions are in metres and quaternions by their fields' names, as ROS has them (REP 103)")
+    assumptions.append("positions are in metres, and quaternions follow the names of their fields (REP 103)")
     if target is None:
-        assumed.append(f"poses stay in the frame {frame!r}: --target says where the task's target is in it")
-    return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumed
+        assumptions.append(f"poses stay in the frame {frame!r}: --target gives the pose of the task's target in it")
+    return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumptions
 
 
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
-    """Positions (N, J) in the order of the first message's names: every message has its own.
+    """Return positions (N, J) in the order of the first message's names; the order may differ in every message.
 
-    Messages of other joints are refused and not left out: which of two devices came first is chance.
+    Messages of other joints are refused and not left out, because the first message decides by chance.
     """
-    wanted = list(messages[0].name)
+    expected = list(messages[0].name)
     rows = []
     for number, message in enumerate(messages):
         names = list(message.name)
@@ -148,24 +151,26 @@ def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
                 f"message {number} {where} has {len(message.position)} positions of {len(names)} joints: record a "
                 "position of each"
             )
-        if sorted(names) != sorted(wanted):
+        if sorted(names) != sorted(expected):
             raise InputError(
-                f"message {number} {where} is of {', '.join(names)}, and the first of {', '.join(wanted)}: record each "
-                "device on a topic of its own"
+                f"message {number} {where} is of {', '.join(names)}, and the first of {', '.join(expected)}: record "
+                "each device on a topic of its own"
             )
-        rows.append(np.asarray(message.position)[[names.index(name) for name in wanted]])
+        rows.append(np.asarray(message.position)[[names.index(name) for name in expected]])
     return np.array(rows)
 
 
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
-    """Seconds since the first message, by the stamps of whoever measured where there are some."""
+    """Return the time since the first message [s] (N,), by its stamps where they increase, with remarks."""
     headers: list[Any] = [getattr(message, "header", None) for _, message in rows]
     if all(header is not None for header in headers):
         stamps = np.array([header.stamp.sec * 10**9 + header.stamp.nanosec for header in headers], dtype=np.int64)
         if (np.diff(stamps) > 0).all():
             return (stamps - stamps[0]) * _NANO, []
     received = np.array([stamp for stamp, _ in rows], dtype=np.int64)
-    return (received - received[0]) * _NANO, ["time is when the recorder got a message: its stamps say nothing"]
+    return (received - received[0]) * _NANO, [
+        "time is when the recorder received a message, because the stamps do not increase"
+    ]
 
 
 def _within(message: Any, path: Sequence[str]) -> Any:
@@ -188,10 +193,10 @@ def _frame(message: Any, path: Sequence[str]) -> str:
 
 
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
-    """A folder of ROS 2 bags in MCAP, one a demonstration, as arrays of doubles with named dimensions.
+    """Write a folder of ROS 2 bags in MCAP, one per demonstration, as arrays with named dimensions; return remarks.
 
     Raises:
-        InputError: if a bag can't hold their time, or it can't be written.
+        InputError: If a bag cannot represent their time, or the folder cannot be written.
     """
     _rosbags()
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -203,9 +208,9 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
     )
     dims = [dimension(label=name, size=1, stride=1) for name in demonstrations.names]
     stamps, notes = _stamps(demonstrations)
-    with atomic_folder(path) as made:
+    with atomic_folder(path) as folder:
         for number, (clock, outputs) in enumerate(zip(stamps, demonstrations.outputs, strict=True)):
-            with Writer(made / f"demonstration_{number}", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            with Writer(folder / f"demonstration_{number}", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 connection = writer.add_connection(TOPIC, DATA, typestore=store)
                 for stamp, y in zip(clock.tolist(), outputs, strict=True):
                     message = array(layout=layout(dim=dims, data_offset=0), data=y)
@@ -217,15 +222,15 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
 
 
 def _stamps(demonstrations: Demonstrations) -> tuple[list[np.ndarray], list[str]]:
-    """Whole nanoseconds (N_m,) of each, which a bag can't count from before zero; a sentence if they were shifted."""
+    """Return times in nanoseconds (N_m,) of each demonstration, shifted if one is negative, with remarks."""
     times, notes = list(demonstrations.times), []
     if min(t[0] for t in times) < 0.0:
-        times, notes = [t - t[0] for t in times], from_zero(demonstrations)
+        times, notes = [t - t[0] for t in times], describe_time_shift(demonstrations)
     stamps = []
     for number, t in enumerate(times):
-        if t[-1] > _LATEST:
+        if t[-1] > _MAX_TIME:
             raise InputError(
-                f"demonstration {number} ends at {t[-1]:g} s, and a bag's time at {_LATEST:g}: subtract an offset"
+                f"demonstration {number} ends at {t[-1]:g} s, and a bag's time at {_MAX_TIME:g}: subtract an offset"
             )
         stamps.append(np.rint(t / _NANO).astype(np.int64))
         if (np.diff(stamps[-1]) <= 0).any():

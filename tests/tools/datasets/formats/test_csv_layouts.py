@@ -1,4 +1,4 @@
-"""Every column is in the unit that its own name says; what makes no motion is refused in a sentence."""
+"""Tests of CSV layouts: columns have the units of their names, and invalid tables are refused."""
 
 import numpy as np
 import pytest
@@ -28,12 +28,12 @@ def file(tmp_path):
         ("t,x_mm,y,z", "mm", (1e-3, 1e-3, 1e-3)),
     ],
 )
-def test_each_position_is_in_its_own_unit(header, given, scales, file):
+def test_positions_have_the_unit_of_their_column(header, given, scales, file):
     found = read_csv_files(write(file, header, 9, 8, 7), unit=given)
     np.testing.assert_allclose(found.outputs[0][0], np.array([9, 8, 7]) * scales)
 
 
-def test_each_angle_is_in_its_own_unit(file):
+def test_angles_have_the_unit_of_their_column(file):
     header = "t,x_m,y_m,z_m,roll_rad,pitch [deg],yaw (degrees)"
     found = read_csv_files(write(file, header, 0, 0, 0, 0.1, 10, 20))
     np.testing.assert_allclose(found.outputs[0][0, 3:], [np.deg2rad(20), np.deg2rad(10), 0.1])
@@ -49,59 +49,59 @@ def test_each_angle_is_in_its_own_unit(file):
         ("t,x_m,y_m,z_m,roll_rad,pitch_deg,yaw_rad", {"angles": "rad"}),
     ],
 )
-def test_a_unit_that_the_table_contradicts_is_refused(header, given, file):
+def test_unit_that_contradicts_a_column_is_refused(header, given, file):
     write(file, header, *range(header.count(",")))
     with pytest.raises(InputError, match=f"says {next(iter(given.values()))}: leave it out"):
         read_csv_files(file, **given)
 
 
 @pytest.mark.parametrize("option", ["unit", "time_unit", "angles"])
-def test_a_unit_that_there_is_none_of_is_refused(option, file):
+def test_unknown_unit_is_refused(option, file):
     write(file, "t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad", *range(6))
     with pytest.raises(InputError, match="is one of"):
         read_csv_files(file, **{option: "furlong"})
 
 
-def test_a_unit_that_one_column_says_is_not_that_of_the_others(file):
+def test_unit_of_one_column_does_not_hold_for_others(file):
     with pytest.raises(InputError, match="unit of y and z"):
         read_csv_files(write(file, "t,x_mm,y,z", 1, 2, 3))
 
 
-def test_a_mark_at_the_beginning_is_no_part_of_the_first_name(file):
+def test_byte_order_mark_is_not_part_of_the_first_name(file):
     text = write(file, "t,x_m,y_m,z_m", 1, 2, 3).read_text()
-    file.write_text(text, encoding="utf-8-sig")  # as Excel writes it
+    file.write_text(text, encoding="utf-8-sig")  # as Excel writes
     np.testing.assert_allclose(read_csv_files(file).times[0], CLOCK)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
-        ("", "no table of numbers"),
+        ("", "not a table of numbers"),
         ("t,x_m,y_m,z_m\n", "fewer than two lines"),
         ("t,x_m,y_m,z_m\n0,1,2,3\n", "fewer than two lines"),
     ],
 )
-def test_what_holds_no_motion_is_refused(text, words, file):
+def test_table_without_two_samples_is_refused(text, message, file):
     file.write_text(text)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         read_csv_files(file, time_unit="s")
 
 
-def test_a_quaternion_that_is_no_number_is_refused(file):
+def test_quaternion_with_nan_is_refused(file):
     write(file, "t,x_m,y_m,z_m,qx,qy,qz,qw", 0, 0, 0, 0, 0, 0, "nan")
     with pytest.raises(InputError, match=r"length nan at sample 0.*cut such samples out"):
         read_csv_files(file)
 
 
 @pytest.mark.parametrize("row", ["0,0,0,3,5", "0,0,0,3,", "0,0,0"])
-def test_a_line_with_other_fields_than_the_header_is_refused(row, file):
+def test_line_with_another_number_of_fields_is_refused(row, file):
     file.write_text(f"t,x,y,z\n{row}\n" + 3 * "0.1,1,2,3\n")
     with pytest.raises(InputError, match=f"line 2 has {row.count(',') + 1} fields, the header has 4"):
         read_csv_files(file, unit="m")
 
 
 @pytest.mark.parametrize("between", [",", ", ", ";", "\t", " "])
-def test_fields_are_parted_as_other_programs_part_them(between, file):
+def test_common_delimiters_are_detected(between, file):
     lines = [("t", "x_m", "y_m", "z_m", "note"), *((0.1 * n, 1, 2, 3, 4 if between == " " else "") for n in range(3))]
     file.write_text("\n\n".join(between.join(map(str, line)) for line in lines))
     np.testing.assert_array_equal(read_csv_files(file).outputs[0], [[1, 2, 3]] * 3)
@@ -110,17 +110,17 @@ def test_fields_are_parted_as_other_programs_part_them(between, file):
 @pytest.mark.parametrize(
     ("header", "named"),
     [
-        ("t,x [m],y [m],z [m],x [mm]", r"x \[m\] and x \[mm\], and does not say which of them is x"),
+        ("t,x [m],y [m],z [m],x [mm]", r"x \[m\] and x \[mm\], and does not state which of them is x"),
         ("t,x (cmd) [m],y [m],z [m],x [m]", r"x \(cmd\) \[m\] and x \[m\]"),
         ("t,x_m,y_m,z_m,y [m]", r"y_m and y \[m\]"),
         ("t,x_m,y_m,z_m,z_m", "z_m and z_m"),
-        ("t,time,x_m,y_m,z_m", "t and time, and does not say which of them is time"),
+        ("t,time,x_m,y_m,z_m", "t and time, and does not state which of them is time"),
         ("t,is.x_m,is.y_m,is.z_m,set.x_m,set.y_m,set.z_m", "is.x_m and set.x_m"),
         ("t,x_m,y_m,z_m,qx,qx,qy,qz,qw", "qx and qx"),
         ("t,x_m,y_m,z_m,q1,q2,q3,q4,q4", "q4 and q4"),
     ],
 )
-def test_two_columns_that_mean_the_same_are_both_named(header, named, file):
+def test_ambiguous_columns_are_both_named(header, named, file):
     write(file, header, *range(header.count(",")))
     with pytest.raises(InputError, match=named):
         read_csv_files(file)
@@ -129,14 +129,14 @@ def test_two_columns_that_mean_the_same_are_both_named(header, named, file):
 @pytest.mark.parametrize(
     ("header", "given", "refused"),
     [
-        ("time [min],x_m,y_m,z_m", {}, r"time \[min\], whose unit is none of s, ms, us, ns"),
-        ("t,x [in],y [in],z [in]", {}, r"x \[in\], whose unit is none of m, cm, mm"),
-        ("t,x [in],y [in],z [in]", {"unit": "m"}, r"x \[in\], whose unit is none"),
-        ("t,x [m],y (foo),z [m]", {}, r"y \(foo\), whose unit is none"),
-        ("t,x_m,y_m,z_m,roll [gon],pitch [deg],yaw [deg]", {}, r"roll \[gon\], whose unit is none of deg, rad"),
+        ("time [min],x_m,y_m,z_m", {}, r"time \[min\], whose unit is not one of s, ms, us, ns"),
+        ("t,x [in],y [in],z [in]", {}, r"x \[in\], whose unit is not one of m, cm, mm"),
+        ("t,x [in],y [in],z [in]", {"unit": "m"}, r"x \[in\], whose unit is not one of"),
+        ("t,x [m],y (foo),z [m]", {}, r"y \(foo\), whose unit is not one of"),
+        ("t,x_m,y_m,z_m,roll [gon],pitch [deg],yaw [deg]", {}, r"roll \[gon\], whose unit is not one of deg, rad"),
     ],
 )
-def test_a_unit_that_is_not_known_is_none_that_is_not_said(header, given, refused, file):
+def test_unknown_unit_in_a_name_is_refused(header, given, refused, file):
     write(file, header, *range(header.count(",")))
     with pytest.raises(InputError, match=refused):
         read_csv_files(file, **given)
@@ -145,7 +145,7 @@ def test_a_unit_that_is_not_known_is_none_that_is_not_said(header, given, refuse
 @pytest.mark.parametrize(
     ("unit", "scale"), [("µs", 1e-6), ("\u03bcs", 1e-6), ("us", 1e-6), ("sec", 1), ("Seconds", 1), ("MS", 1e-3)]
 )
-def test_a_unit_has_more_names_than_one(unit, scale, file):
+def test_spellings_of_units_are_recognized(unit, scale, file):
     write(file, f"t [{unit}],x [metres],y (M),Z [m] (raw)", 1, 2, 3)
     found = read_csv_files(file)
     np.testing.assert_allclose(found.times[0], CLOCK * scale)
@@ -153,26 +153,26 @@ def test_a_unit_has_more_names_than_one(unit, scale, file):
 
 
 @pytest.mark.parametrize("option", ["unit", "time_unit", "quaternion", "angles"])
-def test_a_word_that_an_option_does_not_have_is_refused_where_nothing_needs_it(option, file):
+def test_unused_option_is_validated_too(option, file):
     write(file, "t [s],x_m,y_m,z_m", 1, 2, 3)
     with pytest.raises(InputError, match=rf"--{option.replace('_', '-')} is one of .*, not 'foo'"):
         read_csv_files(file, **{option: "foo"})
 
 
 @pytest.mark.parametrize("header", ["t,x_m,y_m,z_m", "t [s],x_m,y_m,z_m"])
-def test_time_that_goes_back_or_stands_still_is_said(header, file):
-    for clock, words in ((-CLOCK, "goes back at sample 1"), (0 * CLOCK, "stands still")):
+def test_time_that_does_not_increase_is_refused(header, file):
+    for clock, words in ((-CLOCK, "goes back at sample 1"), (0 * CLOCK, "does not increase")):
         with pytest.raises(InputError, match=f"time, which is {header.split(',')[0][0]}.*{words}"):
             read_csv_files(write(file, header, 1, 2, 3, clock=clock))
 
 
-def test_a_recorder_that_logs_every_sample_twice_still_says_its_clock(file):
+def test_duplicated_samples_do_not_change_the_time_unit(file):
     found = read_csv_files(write(file, "t,x_m,y_m,z_m", 1, 2, 3, clock=np.repeat(CLOCK, 2)))
-    assert "t is in seconds, 100 samples in each" in found.assumed
+    assert "t is in seconds, 100 samples in each" in found.assumptions
 
 
 @pytest.mark.parametrize("prefix", ["v.", "vel_", "tcp_velocity_", "twist.linear.", "wrench.force."])
-def test_a_velocity_or_a_force_is_no_position(prefix, file):
+def test_velocity_and_force_columns_are_not_positions(prefix, file):
     others = ",".join(prefix + axis for axis in "xyz")
     found = read_csv_files(write(file, f"t,pos_x_mm,pos_y_mm,pos_z_mm,{others}", 1, 2, 3, 4, 5, 6))
     np.testing.assert_allclose(found.outputs[0][0], [1e-3, 2e-3, 3e-3])
@@ -180,11 +180,11 @@ def test_a_velocity_or_a_force_is_no_position(prefix, file):
         read_csv_files(write(file, f"t,{others}", 4, 5, 6), unit="m")
 
 
-def test_what_is_left_out_is_named(file):
+def test_unused_columns_are_listed(file):
     found = read_csv_files(write(file, "t [s],x_m,y_m,z_m,rx,ry,rz", *range(6)))
-    assert found.assumed == ["there is no orientation", "rx, ry and rz are left out"]
+    assert found.assumptions == ["there is no orientation", "rx, ry and rz are left out"]
     many = ",".join(f"f{n}" for n in range(20))
     found = read_csv_files(write(file, f"t [s],x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,{many}", *range(26)))
-    assert found.assumed[-1] == "f0, f1, f2, f3, f4, f5, f6, f7 and 12 more are left out"
+    assert found.assumptions[-1] == "f0, f1, f2, f3, f4, f5, f6, f7 and 12 more are left out"
     found = read_csv_files(write(file, "t [s],x_m,y_m,z_m,force", *range(4)))
-    assert found.assumed[-1] == "force is left out"
+    assert found.assumptions[-1] == "force is left out"

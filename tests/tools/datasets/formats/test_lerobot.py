@@ -28,27 +28,27 @@ def dataset(tmp_path):
         ({"fps": float("nan")}, "nan frames a second"),
     ],
 )
-def test_a_description_that_makes_no_sense_is_refused(changed, words, dataset):
+def test_invalid_description_is_refused(changed, words, dataset):
     info = json.loads((dataset / INFO).read_text())
     (dataset / INFO).write_text(json.dumps(info | changed))
     with pytest.raises(InputError, match=words):
         read_lerobot(dataset, "action")
 
 
-def test_the_start_that_a_dataset_does_not_keep_is_said(dataset, tmp_path):
+def test_lerobot_export_states_a_shifted_start(dataset, tmp_path):
     notes = write_lerobot(tmp_path / "later", Demonstrations([CLOCK - 0.2], [CLOCK[:, None]]))
     assert "where it was -0.2" in notes[-1]
     np.testing.assert_allclose(read_lerobot(tmp_path / "later", "action").times[0], CLOCK)
     assert "where it was" not in " ".join(write_lerobot(tmp_path / "zero", Demonstrations([CLOCK], [CLOCK[:, None]])))
 
 
-def test_samples_too_far_apart_to_be_counted_in_a_second_are_refused(tmp_path):
+def test_lerobot_export_refuses_samples_too_far_apart(tmp_path):
     with pytest.raises(InputError, match="give --rate"):
         write_lerobot(tmp_path / "set", Demonstrations([np.array([0.0, 1e8])], [np.ones((2, 1))]))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_numbers_that_32_bits_do_not_hold_are_refused(tmp_path):
-    with pytest.raises(InputError, match="1e\\+39 is beyond"):
+def test_lerobot_export_refuses_numbers_beyond_32_bits(tmp_path):
+    with pytest.raises(InputError, match="1e\\+39 exceeds"):
         write_lerobot(tmp_path / "set", Demonstrations([CLOCK], [np.full((5, 1), -1e39)]))
     assert list(tmp_path.iterdir()) == []

@@ -47,14 +47,14 @@ def array(types, values):
     return types["Float64MultiArray"](layout=layout, data=np.array(values, dtype=float))
 
 
-def test_every_message_has_its_own_order_of_joints(tmp_path):
+def test_joint_order_may_differ_between_messages(tmp_path):
     orders = [("abc", (1, 2, 3)), ("cab", (3, 1, 2)), ("bca", (2, 3, 1)), ("abc", (1, 2, 3))]
     found = read_bags(write(tmp_path / "bag", JOINTS, joints, orders), None, None)
     assert found.names == ("a [rad]", "b [rad]", "c [rad]")
     np.testing.assert_array_equal(found.outputs[0], [[1, 2, 3]] * 4)
 
 
-def test_every_bag_has_its_own_order_of_joints(tmp_path):
+def test_joint_order_may_differ_between_bags(tmp_path):
     for name, order in (("0", ("abc", (1, 2, 3))), ("1", ("cab", (3, 1, 2)))):
         write(tmp_path / name, JOINTS, joints, [order] * 2)
     found = read_bags(tmp_path, None, None)
@@ -77,7 +77,7 @@ def test_messages_of_other_joints_are_refused(other, words, tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.5, np.nan])
-def test_a_quaternion_that_is_no_rotation_is_refused(wrong, tmp_path):
+def test_bag_quaternion_of_wrong_length_is_refused(wrong, tmp_path):
     bag = write(tmp_path / "bag", POSE, pose, [1.0, wrong, 1.0])
     with pytest.raises(InputError, match=r"at sample 1, .*cut such samples out \(1 of 3\)"):
         read_bags(bag, None, None)
@@ -89,7 +89,7 @@ def test_arrays_of_other_sizes_are_refused(tmp_path):
         read_bags(bag, None, None)
 
 
-def test_time_before_zero_is_counted_from_the_start_and_said(tmp_path):
+def test_bag_export_shifts_negative_time(tmp_path):
     t = 0.1 * np.arange(5)
     notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
     assert "first sample, where it was -0.2 to 0.3" in notes[-1]
@@ -102,7 +102,7 @@ def test_time_before_zero_is_counted_from_the_start_and_said(tmp_path):
     ("times", "words"),
     [([0.0, 1e10], "ends at 1e\\+10 s"), ([0.0, 1e-12], "less than a nanosecond apart")],
 )
-def test_time_that_a_bag_cannot_count_is_refused_and_leaves_nothing(times, words, tmp_path):
+def test_bag_export_refuses_time_out_of_range(times, words, tmp_path):
     with pytest.raises(InputError, match=words):
         write_mcap(tmp_path / "bags", Demonstrations([np.array(times)], [np.ones((2, 1))]))
     assert list(tmp_path.iterdir()) == []
