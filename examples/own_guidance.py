@@ -47,5 +47,5 @@ class KgrlAlong(Guidance):
 env = make_env("NarrowPassage", guidance="kgrl_along", angle=30.0)
 env.reset(seed=0)
 for _ in range(10):
-    *_, info = env.step(np.array([1.0]))
+    info = env.step(np.array([1.0]))[-1]
 print("after", info["control_steps"], "control steps the worst commanded violation is", info["constraint_violation"])

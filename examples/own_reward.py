@@ -25,6 +25,6 @@ env = gr.make_env("examples/Hurry", guidance="sct", action_repeat=10)
 env.reset(seed=0)
 sums = dict.fromkeys(("time_cost", "jump_cost"), 0.0)
 for _ in range(10):
-    *_, info = env.step(np.array([0.0, 0.0, -1.0]))
+    info = env.step(np.array([0.0, 0.0, -1.0]))[-1]
     sums = {name: value + info[name] for name, value in sums.items()}
 print({name: round(value, 3) for name, value in sums.items()}, "of", sorted(name for name in info if "_cost" in name))

@@ -114,37 +114,38 @@ def test_reference_has_no_local_path(reference):
 def test_robot_page_has_the_limits_of_the_code():
     """Compare the table of limits with the constants."""
     import numpy as np
-    from pydrake.lcm import DrakeLcm
 
-    from guiderail.diagrams.hardware.station import EXTERNAL_SHARE, TORQUE_SHARE, VELOCITY_SHARE, HardwareStation
+    from guiderail.diagrams.hardware.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE
+    from guiderail.diagrams.hardware.station import HardwareStation
     from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
     from guiderail.models.common.units import MM
     from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
     from guiderail.models.objects.insertion import COLLISION_FORCE
     from guiderail.tools.hardware.sim_driver import START
 
-    page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("## What each limit is for")[2]
-    rows = dict(re.findall(r"^\| ([^|]+) \| (.+) \|$", page.partition("\n## ")[0], re.MULTILINE))
-    station = HardwareStation(BncWorkcell(), DrakeLcm("memq://"))
+    page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("\n## Limits\n")[2].partition("\n## ")[0]
+    rows = {row[0]: row[1] for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.MULTILINE)}
+    effects = dict(re.findall(r"^\| ([^|]+) \| [^|]+ \| ([^|]+) \|$", page, re.MULTILINE))
+    station = HardwareStation(BncWorkcell(), lcm_url="memq://")
     limits, status, force = station.limits, station.status_limits, np.array(station.impedance.limits[:3])
-    load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture)).max()
+    load = station.max_torque_shares(station.controller_plant.solve(START, station.controller_plant.posture)).max()
     age = f"{status.max_age / MM:.0f} ms"
     expected = {
-        "age of a status": f"{MAX_MISSED_MESSAGES} periods: {age} |",
-        "clock of statuses": f"{status.max_lead / MM:.0f} ms behind the last one, or ahead |",
+        "age of a status": f"{MAX_MISSED_MESSAGES} periods: {age}",
+        "time stamps of statuses": f"within {status.max_lead / MM:.0f} ms of the previous one",
         "jump of a position": f"{status.position_jump} rad ",
         "jump of a velocity": f"{status.velocity_jump} rad/s",
-        "this program's own delay": f"{status.max_check_interval / MM:.0f} ms ",
-        "the deputy": f"{age} without a command; a robot's clock that goes back by {age}; "
+        "delay of this program": f"{status.max_check_interval / MM:.0f} ms ",
+        "safety monitor": f"{age} without a command; a robot clock that goes back by {age}; "
         f"{2 * MAX_MISSED_MESSAGES * station.period / MM:.0f} ms without",
-        "a joint's speed": f"{VELOCITY_SHARE:.0%} of its limit".replace("%", " %"),
-        "place of the tool, and of where it is sent": f"±{limits.upper[0]} m beside, −{-limits.lower[2]} to "
+        "joint speed": f"{VELOCITY_SHARE:.0%} of its limit".replace("%", " %"),
+        "position of the tool and of the command": f"±{limits.upper[0]} m lateral, −{-limits.lower[2]} to "
         f"{limits.upper[2]} m above",
-        "force on the tool": f"{limits.force:.0f} N felt; the impedance pushes with {force.max():.0f} N at most along "
-        f"each axis of the target, {np.linalg.norm(force):.0f} N askew",
-        "external torque of a joint": f"{EXTERNAL_SHARE:.0%} of".replace("%", " %"),
-        "torque that is sent": f"{TORQUE_SHARE:.0%} of that".replace("%", " %"),
-        "task's force": f"the task's own, {COLLISION_FORCE:.0f} N",
+        "force on the tool": f"{limits.force:.0f} N measured; the impedance is limited to {force.max():.0f} N along "
+        f"each axis of the target, {np.linalg.norm(force):.0f} N along",
+        "external joint torque": f"{EXTERNAL_TORQUE_SHARE:.0%} of".replace("%", " %"),
+        "commanded torque": f"{TORQUE_SHARE:.0%} of that".replace("%", " %"),
+        "task force": f"the task's own, {COLLISION_FORCE:.0f} N",
     }
-    assert [name for name, words in expected.items() if words not in rows[name] + " |"] == []
-    assert f"up to {100 * load:.0f} % of it" in rows["torque that is sent"]
+    assert [name for name, text in expected.items() if text not in rows[name]] == []
+    assert f"up to {100 * load:.0f} % of it" in effects["commanded torque"]

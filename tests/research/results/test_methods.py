@@ -102,7 +102,7 @@ def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
     assert rows(readme_table(tmp_path))[0][-1] == "– / –"
 
 
-def test_success_in_training_is_marked_when_nothing_was_evaluated(tmp_path):
+def test_training_success_is_marked_when_not_evaluated(tmp_path):
     (tmp_path / "narrow_passage.csv").write_text(
         "method,seed,after_episodes,eval_set,training_episodes,training_success_rate,training_episodes_to_convergence,"
         "training_max_commanded_violation,training_violating_episodes,training_peak_force\n"

@@ -56,7 +56,7 @@ def test_page_has_the_rows_of_a_study_without_evaluation(finished, tmp_path):
     assert "| skgrl | 40 | – | – | 12, never | none | 2 | 1.00 |" in page
 
 
-def test_sweep_has_a_picture_and_the_breaking_point_of_each_method(tmp_path):
+def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     rates = {"rl_sct": (1.0, 1.0, 0.95, 0.85, 0.6, 0.0), "uniform_random": (0.05,) * 6}
     rows = [
         {"method": method, "after_episodes": 100 * learned, "eval_set": one.name, "seed": 110, "episodes": 40,
