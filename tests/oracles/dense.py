@@ -1,7 +1,7 @@
-"""Problem 4.5 the textbook way, in extended precision, sharing nothing with the implementation.
+"""Dense reference solution of problem 4.5 in extended precision, independent of the implementation.
 
-Every matrix is formed as the equations print it (errata of equations 4.7 and 4.17 mended), and factored by a plain
-Cholesky in `longdouble`: slow, and good to about 1e-19 times the condition number.
+Every matrix is formed as in the equations (with the errata of equations 4.7 and 4.17), and factored by a Cholesky
+decomposition in `longdouble`: slow, and accurate to about 1e-19 times the condition number.
 """
 
 from functools import cached_property
@@ -12,7 +12,7 @@ Extended = np.longdouble
 
 
 def cholesky(A):
-    """The lower factor of symmetric positive definite A, in its precision."""
+    """Compute the lower factor of a symmetric positive definite A in its precision."""
     n = len(A)
     L = np.zeros_like(A)
     for j in range(n):
@@ -22,7 +22,7 @@ def cholesky(A):
 
 
 def solve(L, B):
-    """A⁻¹ B for A = L Lᵀ."""
+    """Compute A⁻¹ B for A = L Lᵀ."""
     n = len(L)
     X = np.array(B, dtype=L.dtype)
     for j in range(n):
@@ -41,16 +41,17 @@ def block_diagonal(blocks):
 
 
 def cholesky_solve(A, B):
-    """A⁻¹ B for symmetric positive definite A, in A's precision."""
+    """Compute A⁻¹ B for a symmetric positive definite A in its precision."""
     return solve(cholesky(A), B)
 
 
 class DenseWindow:
-    """One window of one problem.
+    """Dense solution of one window of one problem.
 
     Attributes:
-        y: (N·O,), equation 4.18's free window (history first); S: K A Σ, formed where a constraint pushes.
-        first: where the executed point starts.
+        y: Window of equation 4.18 without constraints (N·O,), history first.
+        S: K A Σ, computed if a constraint is active.
+        first: Index of the executed point's first output.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class DenseWindow:
         precision=Extended,
         at=None,
     ):
-        """`at`: where the actions are, (J,) indices of the inputs; at the executed point alone unless given."""
+        """Solve the window; `at` are the indices (J,) of the inputs with actions, the executed point by default."""
         t = np.asarray(inputs, dtype=precision)
         mu = np.asarray(means, dtype=precision)
         o = mu.shape[1]
@@ -97,7 +98,7 @@ class DenseWindow:
         return (S + S.T) / 2
 
     def corrected(self, G, alpha):
-        """y + S Ḡ α, for constraints on the points from the executed one on, (H+1, O)."""
+        """Compute y + S Ḡ α (H+1, O), for constraints on the executed point and those after it."""
         o, start = self.outputs, self.first * self.outputs
         push = np.einsum("nfo,nf->no", np.asarray(G, Extended), np.asarray(alpha, Extended)).ravel()
         full = np.zeros(len(self.y), dtype=self.y.dtype)

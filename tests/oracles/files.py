@@ -1,4 +1,4 @@
-"""Readers that share nothing with those of the project: what an accepted file must mean."""
+"""Independent readers, the reference for the content of accepted files."""
 
 import csv
 from decimal import Decimal
@@ -9,7 +9,7 @@ import yaml
 
 
 def npz_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(times, outputs) of each demonstration, by NumPy's own reader."""
+    """Read times and outputs of each demonstration by NumPy's own reader."""
     with np.load(path, allow_pickle=False) as file:
         times, outputs = file["times"], file["outputs"]
         if "lengths" in file:
@@ -22,7 +22,7 @@ def npz_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def csv_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(times, outputs) of each demonstration, every number by way of decimal arithmetic."""
+    """Read times and outputs of each demonstration by decimal arithmetic."""
     text = path.read_bytes().decode("utf-8").removeprefix("\ufeff")
     rows = list(csv.reader(text.splitlines())) if '"' in text else [line.split(",") for line in text.splitlines()]
     header, body = [name.strip() for name in rows[0]], [row for row in rows[1:] if row not in ([], [""])]
@@ -68,6 +68,6 @@ def _doubles(values: np.ndarray) -> np.ndarray:
 
 
 def _once(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Without samples that repeat the one before, time and all."""
+    """Drop samples that repeat their predecessor, time included."""
     kept = [n for n in range(len(t)) if n == 0 or t[n] != t[n - 1] or (y[n] != y[n - 1]).any()]
     return t[kept], y[kept]

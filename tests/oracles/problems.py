@@ -1,4 +1,4 @@
-"""Random and real problems for the primitive, each with everything that the textbook solution needs."""
+"""Random problems for the primitive, with the data of their dense reference solution."""
 
 from dataclasses import dataclass
 
@@ -45,9 +45,9 @@ def random_problem(
     length_scale: float | None = None,
     box: bool = False,
 ) -> Problem:
-    """O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances, horizons past the end, constraints that bite.
+    """Return a problem with O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances and active constraints.
 
-    With `box`, two parallel planes for some of the rows instead of one, in any order.
+    With `box`, some of the rows are pairs of parallel planes, in any order.
     """
     rng = np.random.default_rng(seed)
     outputs, rows, H, P = rng.integers(1, 7), rng.integers(0, 9), rng.integers(5, 61), rng.integers(0, 16)
@@ -60,7 +60,7 @@ def random_problem(
     mix = rng.standard_normal((outputs, outputs)) * 0.4 + np.eye(outputs)
     width = scale * (0.05 + 0.3 * np.sin(np.pi * t[:, None] / t[-1]) ** 2)
     covariances = np.einsum("ni,ij,kj,nk->nik", width, mix, mix, width)
-    # Constraints that the mean violates here and there, but that a point within a few deviations satisfies.
+    # Constraints that the mean violates at some steps, and that a point within a few deviations satisfies.
     inside = means.mean(axis=0)
     G = rng.standard_normal((rows, outputs)) / scale
     c = G @ inside - rng.uniform(0.1, 0.8, rows)

@@ -11,7 +11,7 @@ from guiderail.tools.certify import _declared_start, certify_skill
 from guiderail.tools.environments import check_environment
 
 
-def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tight_it_is(tmp_path):
+def test_certify_skill_writes_an_accepted_certificate(tmp_path):
     found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=2000)
     assert found["checker"] == "yes"
     assert found["always_upper"][0] <= found["while_free_upper"][0]
@@ -25,7 +25,7 @@ def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tigh
     assert (tmp_path / "attack.csv").exists()
 
 
-def test_demonstrations_alone_are_certified_too(tmp_path):
+def test_certify_skill_accepts_demonstrations_alone(tmp_path):
     found = certify_skill("NarrowPassage", {"guidance": "kmp"}, out=tmp_path)
     assert found["checker"] == "yes"
     assert found["constrained_steps"] == 0
@@ -40,22 +40,22 @@ def test_demonstrations_alone_are_certified_too(tmp_path):
         ("nowhere", {}, "no task"),
     ],
 )
-def test_what_follows_no_such_law_is_refused(tmp_path, of, environment, words):
+def test_certify_skill_refuses_other_guidance(tmp_path, of, environment, words):
     with pytest.raises(InputError, match=words):
         certify_skill(of, environment, out=tmp_path)
 
 
-def test_a_start_that_is_no_distance_is_refused(tmp_path):
+def test_certify_skill_refuses_a_negative_start_offset(tmp_path):
     with pytest.raises(InputError, match="not negative"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, start_within=-1.0)
 
 
-def test_an_attack_of_a_negative_number_of_steps_is_refused(tmp_path):
+def test_certify_skill_refuses_a_negative_attack(tmp_path):
     with pytest.raises(InputError, match="number of steps"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=-1)
 
 
-def test_a_task_needs_a_folder_to_write_to():
+def test_certify_skill_refuses_a_task_without_out():
     with pytest.raises(InputError, match="--out"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"})
 
@@ -64,8 +64,8 @@ def test_a_task_needs_a_folder_to_write_to():
     ("difficulty", "far"),
     [("standard", (755, 1950)), ("hard", (1352, 8387))],  # seeds of starts that would be farther than there are any
 )
-def test_without_actions_held_out_episodes_stay_in_the_bounds(tmp_path, difficulty, far):
-    """They begin beside the demonstrations, and sKGRL's history with them."""
+def test_held_out_episodes_stay_in_the_bounds(tmp_path, difficulty, far):
+    """Episodes begin next to the demonstrations, and so does the history of sKGRL."""
     environment = {"guidance": "skgrl", "difficulty": difficulty}
     found = certify_skill("NarrowPassage", environment, out=tmp_path)
     assert found["checker"] == "yes"
@@ -86,12 +86,12 @@ def test_without_actions_held_out_episodes_stay_in_the_bounds(tmp_path, difficul
 
 
 def declared_start(task, **environment):
-    """How far beside its start a certificate lets a task's robot begin."""
+    """Return the start offset of a certificate for a task."""
     options = check_environment(task, environment)
     return _declared_start(task, options, EnvConfig.resolve(task, options).make_task().reference().num_outputs)
 
 
-def test_a_start_is_within_what_the_task_declares_and_the_error_of_its_measurement():
+def test_start_is_within_the_declared_offset():
     assert not declared_start("BncConnector").any()
     np.testing.assert_allclose(declared_start("BncConnector", start_offset_max=0.002), np.full(6, 0.002))
     np.testing.assert_allclose(declared_start("BncConnector", pose_bias=0.001), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0])
@@ -102,7 +102,7 @@ def test_a_start_is_within_what_the_task_declares_and_the_error_of_its_measureme
 @pytest.mark.parametrize(
     "far", [{"pose_bias": 1e-3}, {"start_offset_max": 1e-3}, {"pose_bias": 5e-4, "start_offset_max": 1e-3}]
 )
-def test_a_history_begins_within_what_is_declared(far):
+def test_history_begins_within_the_declared_offset(far):
     env = make_env("BncConnector", guidance="skgrl", **far)
     within = declared_start("BncConnector", **far)
     declared = env.task.declaration
@@ -119,14 +119,14 @@ def test_a_history_begins_within_what_is_declared(far):
     assert (farthest[:2] > 0.5 * within[:2]).all()
 
 
-def test_a_start_that_fits_no_output_is_refused(monkeypatch, tmp_path):
+def test_declared_start_refuses_the_wrong_number_of_outputs(monkeypatch, tmp_path):
     monkeypatch.setattr(NarrowPassage, "start_within", lambda self: [0.1, 0.1, 0.1])
     with pytest.raises(InputError, match="start_within of NarrowPassage is a number, or 2 of them"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path)
 
 
-def test_via_points_move_the_motion_and_not_its_start(tmp_path):
-    """A reset goes by the demonstrations."""
+def test_via_points_move_the_motion_but_not_its_start(tmp_path):
+    """A reset starts at the demonstrations, not at via-points."""
     via = [0.0, 0.36, 0.1]
     certify_skill("NarrowPassage", {"guidance": "kgrl", "via_points": via}, out=tmp_path)
     with np.load(tmp_path / "primitive.npz") as primitive:

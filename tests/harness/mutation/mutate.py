@@ -39,7 +39,7 @@ PRIMITIVES = ["tests/models/primitives"]
 TEMPLATES = ["tests/models/templates"]
 TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
-    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp", "mixture")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "demonstrations")},
     "models/templates/constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
@@ -50,7 +50,7 @@ TARGETS = {
     ],
     "models/control/cartesian_impedance.py": [
         "tests/models/control/test_cartesian_impedance.py",
-        "tests/models/control/test_cartesian_impedance_law.py",
+        "tests/models/control/test_reachable_inertia.py",
     ],
     **{
         f"systems/{path.name}": [f"tests/systems/test_{path.name}"]

@@ -1,4 +1,4 @@
-"""A certificate: its bounds against what adversaries reach, and its checker against files that were tampered with."""
+"""Certified bounds hold against adversaries, and the checker rejects changed files."""
 
 import ast
 import hashlib
@@ -28,7 +28,7 @@ PHASE = np.linspace(0.0, 1.0, STEPS)
 
 
 def skill(history, bound=None, tied=0.0):
-    """Two outputs, the first explored: from 0 to 0.2 and from 0 to 1; the first may be constrained to ± bound."""
+    """Return a loop of two outputs, of which the first is explored and may be constrained to ±bound."""
     means = np.column_stack([0.2 * np.sin(np.pi * PHASE), PHASE])
     width = 0.05 + 0.1 * np.sin(np.pi * PHASE)
     covariances = np.zeros((STEPS, 2, 2))
@@ -52,14 +52,14 @@ CASES = {
 
 
 def certified(made):
-    """With budgets of half as much again as an adversary needs."""
+    """Certify a loop with budgets of 1.5 times what an adversary used."""
     seen = Adversary(made, np.ones(STEPS, bool)).attack(30 * STEPS)
     return certify(made, Budget(1.5 * seen.excess + 0.01, 1.5 * seen.residue))
 
 
 @cache
 def constrained():
-    """Through a history, which is the case that takes longest."""
+    """Return the constrained loop with a history, which takes longest, and its bounds."""
     made = skill(*CASES["sKGRL, constrained"], tied=0.5)
     return made, certified(made)
 
@@ -73,7 +73,7 @@ def case(request):
 
 
 def executed(made, actions, start):
-    """The commands (N, O) for actions (N,) of the first output."""
+    """Return the commands (N, O) for actions (N,) of the first output."""
     history = np.tile(start, (made.primitive.history, 1))
     commands = []
     for n, action in enumerate(actions):
@@ -85,13 +85,13 @@ def executed(made, actions, start):
 
 
 def adversaries(rng, number):
-    """White, constant, and corners that turn now and then."""
+    """Yield sequences of full deflections that change sign never, sometimes, often or at every step."""
     for i in range(number):
         turns = np.cumsum(rng.uniform(size=STEPS) < (0.0, 0.05, 0.3, 1.0)[i % 4]) % 2
         yield (2.0 * turns - 1.0) * rng.choice([-1.0, 1.0])
 
 
-def test_no_adversary_leaves_the_bounds_and_some_reach_them(case):
+def test_random_sequences_stay_in_the_bounds_and_reach_them(case):
     made, found = case
     rng, always = np.random.default_rng(0), found.always
     reached = {"position": 0.0, "speed": 0.0, "acceleration": 0.0}
@@ -111,8 +111,8 @@ def test_no_adversary_leaves_the_bounds_and_some_reach_them(case):
         assert reached["speed"] > 0.6
 
 
-def test_where_nothing_is_active_a_bound_is_reached_by_its_own_worst_actions():
-    """The zonotope's support is exact: the signs of the impulse responses reach it."""
+def test_free_bound_is_reached_by_its_worst_actions():
+    """The signs of the impulse responses reach the support of the zonotope."""
     made = skill(4)
     found = certify(made)
     n = STEPS - 1
@@ -123,15 +123,15 @@ def test_where_nothing_is_active_a_bound_is_reached_by_its_own_worst_actions():
     assert max(worst[n, 0], below[n, 0]) == pytest.approx(found.free.upper[n, 0], rel=1e-6)
 
 
-def test_what_corrections_can_reach_through_a_history_has_no_bound():
+def test_output_coupled_through_a_history_has_no_bound():
     tied, alone = certify(skill(4, 0.25, tied=0.5)).always, certify(skill(4, 0.25)).always
     assert np.isinf(tied.upper[-1, 1])
     assert np.isfinite(alone.upper).all()
     assert np.abs(tied.upper[:, 0]).max() <= 0.25 + 1e-9 or tied.upper[:, 0].max() < 0.3
 
 
-def test_an_adversary_leaves_no_bound_where_corrections_keep_their_budget():
-    """Constrained through a history: there are bounds on everything, near what other sequences reach."""
+def test_adversary_stays_in_the_bounds_within_the_budget():
+    """With a history and constraints, all bounds exist and are at most twice what an adversary reaches."""
     made, found = constrained()
     budget, bounds = found.budgeted.budget, found.budgeted.bounds
     seen = Adversary(made, np.ones(STEPS, bool), seed=1).attack(80 * STEPS)
@@ -146,14 +146,14 @@ def test_an_adversary_leaves_no_bound_where_corrections_keep_their_budget():
     assert np.isinf(found.always.upper[:, 1]).any()
 
 
-def test_nothing_is_spent_where_there_is_no_constraint():
+def test_budget_is_not_used_without_constraints():
     seen = Adversary(skill(4, None, tied=0.5), np.ones(STEPS, bool)).attack(10 * STEPS)
     assert seen.corrected == 0
     assert not seen.excess.any()
     assert not seen.residue.any()
 
 
-def test_an_attack_begins_in_the_corners_of_all_starts_and_between_them():
+def test_attack_samples_starts_in_corners_and_between():
     made = skill(4)
     adversary = Adversary(made, np.zeros(STEPS, bool))
     places = (np.array([adversary._sample_start() for _ in range(200)]) - made.start)[:, 0] / made.start_within[0]
@@ -162,7 +162,7 @@ def test_an_attack_begins_in_the_corners_of_all_starts_and_between_them():
     assert 50 < (np.abs(places) < 0.999).sum() < 150
 
 
-def test_an_attack_notices_a_start_that_was_not_certified():
+def test_attack_detects_a_start_that_was_not_certified():
     made = skill(4)
     kept = certify(replace(made, start_within=np.zeros(2))).free
     seen = Adversary(made, np.zeros(STEPS, bool)).attack(20 * STEPS)
@@ -199,12 +199,12 @@ def write(folder, contents):
     return folder
 
 
-def test_what_was_computed_is_accepted(case, tmp_path):
+def test_checker_accepts_computed_certificates(case, tmp_path):
     checker.check(write(tmp_path, files(*case)))
 
 
 def signed(contents, **changed):
-    """The files with claims changed, and signed again as if they were honest."""
+    """Return the files with changed claims and matching digests."""
     claims = json.loads(contents[CERTIFICATE])
     for name, content in contents.items():
         if name != CERTIFICATE:
@@ -220,7 +220,7 @@ def signed(contents, **changed):
 
 
 def altered(contents, name, **changed):
-    """One of the files with arrays changed."""
+    """Return the files with changed arrays in one of them."""
     with np.load(io.BytesIO(contents[name])) as arrays:
         values = {key: arrays[key].copy() for key in arrays.files}
     for key, change in changed.items():
@@ -231,7 +231,7 @@ def altered(contents, name, **changed):
 
 
 def at(index, factor=1.0, plus=0.0):
-    """A change of one number."""
+    """Return a function that changes one number."""
 
     def change(value):
         array = np.array(value, dtype=float)
@@ -242,7 +242,7 @@ def at(index, factor=1.0, plus=0.0):
 
 
 def faster(contents, factor, *left_out):
-    """Everything as if a step took `factor` times as long; sentences may be left out of what it assumes."""
+    """Return a consistent certificate with the period scaled by `factor`, without some of its assumptions."""
     claims = json.loads(contents[CERTIFICATE])
     claims["period"] *= factor
     for regime in ("free", "always"):
@@ -255,7 +255,7 @@ def faster(contents, factor, *left_out):
 
 
 def constrained_by_nothing(contents):
-    """A constraint that is no number, and claims as if there were none."""
+    """Return a certificate with a NaN constraint and the claims of an unconstrained loop."""
     none = altered(contents, "constraints.npz", c=lambda c: np.nan * c)
     none = altered(none, "witness.npz", active=np.zeros_like, multipliers=lambda alphas: alphas[:0])
     claims = json.loads(contents[CERTIFICATE])
@@ -321,7 +321,7 @@ def budgeted():
 
 
 @pytest.mark.parametrize("what", TAMPERED)
-def test_what_was_tampered_with_is_rejected(honest, tmp_path, what):
+def test_checker_rejects_a_changed_certificate(honest, tmp_path, what):
     with pytest.raises((checker.Rejected, ValueError)):
         checker.check(write(tmp_path, TAMPERED[what](honest)))
 
@@ -342,18 +342,18 @@ BUDGETED = {
 
 
 def claims_of(contents):
-    """The budgets of a certificate."""
+    """Return the budgets of a certificate."""
     claims = json.loads(contents[CERTIFICATE])["budgeted"]
     return {name: claims[name] for name in ("excess", "residue")}
 
 
 @pytest.mark.parametrize("what", BUDGETED)
-def test_what_was_tampered_with_in_the_third_regime_is_rejected(budgeted, tmp_path, what):
+def test_checker_rejects_a_changed_budgeted_regime(budgeted, tmp_path, what):
     with pytest.raises((checker.Rejected, ValueError)):
         checker.check(write(tmp_path, BUDGETED[what](budgeted)))
 
 
-def test_another_period_than_the_clocks_is_said_in_words(tmp_path):
+def test_certificate_states_a_period_unlike_the_clock(tmp_path):
     made = replace(skill(4, 0.25), period=1.5 * PERIOD)
     contents = files(made, certify(made))
     assert OTHER_CLOCK in json.loads(contents[CERTIFICATE])["assumes"]
@@ -363,7 +363,7 @@ def test_another_period_than_the_clocks_is_said_in_words(tmp_path):
 
 
 def told(folder, capsys, monkeypatch):
-    """Exit code and output of the checker as a program."""
+    """Return the exit code and the output of the checker as a program."""
     monkeypatch.setattr(sys, "argv", ["checker.py", str(folder)])
     try:
         runpy.run_path(checker.__file__, run_name="__main__")
@@ -386,21 +386,21 @@ NONE = {
 
 
 @pytest.mark.parametrize("what", NONE)
-def test_what_is_no_certificate_is_one_sentence_and_the_exit_code_says_so(honest, what, tmp_path, capsys, monkeypatch):
+def test_checker_reports_unreadable_files_with_exit_code_2(honest, what, tmp_path, capsys, monkeypatch):
     code, out = told(write(tmp_path, NONE[what](honest)), capsys, monkeypatch)
     assert code == 2
     assert out.startswith("no: the files make no sense")
     assert out.count("\n") == 1
 
 
-def test_yes_and_no_are_exit_codes(honest, tmp_path, capsys, monkeypatch):
+def test_checker_exits_with_0_or_1(honest, tmp_path, capsys, monkeypatch):
     assert told(write(tmp_path, honest), capsys, monkeypatch) == (0, "yes\n")
     code, out = told(write(tmp_path, TAMPERED["a speed"](honest)), capsys, monkeypatch)
     assert code == 1
     assert out.startswith("no: step 20: always speed of output 0 is ")
 
 
-def test_the_checker_is_short_and_knows_numpy_alone():
+def test_checker_is_short_and_imports_numpy_only():
     source = Path(checker.__file__).read_text()
     assert len(source.splitlines()) <= 250
     imported = set()

@@ -1,4 +1,4 @@
-"""Open lists say no in a sentence, whatever they are asked for."""
+"""Registries refuse unknown and duplicate names with a sentence."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,14 @@ from guiderail.models.common.registry import Registry
 
 
 @pytest.mark.parametrize("name", [{}, [], None, 3, ["sphere"]])
-def test_a_name_is_a_word(name):
+def test_name_must_be_a_string(name):
     shapes = Registry("shape")
     shapes.register("sphere", object())
     with pytest.raises(InputError, match=r"a shape is named by a word, not .*: choose one of sphere"):
         shapes.get(name)
 
 
-def test_an_unknown_name_gets_the_nearest_one():
+def test_unknown_name_is_refused_with_the_closest_name():
     shapes = Registry("shape")
     shapes.register("sphere", object())
     with pytest.raises(InputError, match="there is no shape 'spere': did you mean sphere"):
@@ -29,13 +29,13 @@ class _Kind:
 
 
 def _from(file):
-    """A function that a file of that path defines."""
+    """Return a function that is defined in the file of that path."""
     module = {"__file__": str(file)}
     exec("def build():\n    pass", module)
     return module["build"]
 
 
-def test_what_is_imported_again_is_the_same_and_of_another_file_it_is_not(tmp_path):
+def test_register_accepts_reimport_and_refuses_another_file(tmp_path):
     shapes = Registry("shape")
     shapes.register("sphere", _Kind(_from(tmp_path / "one.py")))
     again = _Kind(_from(tmp_path / "one.py"))

@@ -1,4 +1,4 @@
-"""YAML that a person wrote: what it says, and what happens when it says too much."""
+"""The YAML reader returns plain values and refuses documents beyond its limits."""
 
 import tracemalloc
 
@@ -34,13 +34,13 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("1e", "1e"),
     ],
 )
-def test_numbers_are_numbers_and_everything_else_is_text(text, value):
+def test_plain_scalars_follow_the_core_schema(text, value):
     read = parse_yaml(f"entry: {text}")["entry"]
     assert read == value
     assert type(read) is type(value)
 
 
-def test_an_alias_is_what_it_stands_for():
+def test_aliases_and_merges_are_resolved():
     assert parse_yaml("a: &x {b: 1, c: 2}\nd: {<<: *x, c: 3}\ne: *x") == {
         "a": {"b": 1, "c": 2},
         "d": {"b": 1, "c": 3},
@@ -81,7 +81,7 @@ def test_an_alias_is_what_it_stands_for():
         ("a: 'x", "end of stream"),
     ],
 )
-def test_says_in_one_line_what_is_wrong(text, said):
+def test_invalid_document_is_refused_in_one_line(text, said):
     tracemalloc.start()
     with pytest.raises(InputError) as refused:
         parse_yaml(text, "template.yaml")
@@ -94,12 +94,12 @@ def test_says_in_one_line_what_is_wrong(text, said):
     assert peak < 30e6
 
 
-def test_reads_a_file_with_a_byte_order_mark(tmp_path):
+def test_file_with_a_byte_order_mark_is_read(tmp_path):
     (tmp_path / "a.yaml").write_bytes(b"\xef\xbb\xbfname: \xcf\x88")
     assert load_yaml(tmp_path / "a.yaml") == {"name": "ψ"}
 
 
-def test_refuses_what_is_no_text_file(tmp_path):
+def test_file_that_is_no_text_is_refused(tmp_path):
     (tmp_path / "latin.yaml").write_bytes(b"name: \xe9")
     (tmp_path / "large.yaml").write_bytes(b"#" * 100_001)
     for name, said in [("latin", "UTF-8"), ("large", "larger"), ("missing", "there is no study"), ("x" * 300, "study")]:

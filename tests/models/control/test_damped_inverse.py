@@ -7,14 +7,14 @@ SCALE = np.array([LEVER] * 3 + [1.0] * 3)
 
 
 def jacobian(singular_values, num_joints, rng):
-    """Of the given singular values once rotations count at the lever, (6, n)."""
+    """Return a Jacobian (6, n) of the given singular values after scaling rotations by the lever."""
     U, _ = np.linalg.qr(rng.standard_normal((6, 6)))
     W, _ = np.linalg.qr(rng.standard_normal((num_joints, num_joints)))
     return (U * singular_values) @ W[:, :6].T / SCALE[:, None]
 
 
 @pytest.mark.parametrize("num_joints", [6, 7])
-def test_regular_it_is_the_plain_pseudoinverse(num_joints):
+def test_regular_posture_uses_the_pseudoinverse(num_joints):
     rng = np.random.default_rng(0)
     for _ in range(20):
         J = jacobian(rng.uniform(REGULAR, 1.0, 6), num_joints, rng)
@@ -26,8 +26,8 @@ def test_regular_it_is_the_plain_pseudoinverse(num_joints):
         np.testing.assert_allclose(still @ (v - preferred), 0.0, atol=1e-9)
 
 
-def test_near_a_singularity_joint_speeds_stay_bounded():
-    """However little is left of a direction: no unit of tool speed takes more than 1/σ₀."""
+def test_joint_velocities_stay_bounded_near_a_singularity():
+    """No unit of tool speed takes more than 1/σ₀ of joint speed, however singular the posture."""
     rng = np.random.default_rng(1)
     for left in (0.05, 0.02, 0.01, 1e-4, 1e-9, 0.0):
         J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, left]), 6, rng)
@@ -38,7 +38,7 @@ def test_near_a_singularity_joint_speeds_stay_bounded():
         assert is_regular == (left >= REGULAR)
 
 
-def test_is_continuous_where_damping_begins():
+def test_velocities_are_continuous_where_damping_begins():
     rng = np.random.default_rng(2)
     U, W = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
     V, preferred = rng.standard_normal((2, 6))
@@ -49,7 +49,7 @@ def test_is_continuous_where_damping_begins():
     np.testing.assert_allclose(*sides, rtol=1e-5)
 
 
-def test_a_lost_direction_is_left_to_what_is_preferred():
+def test_lost_direction_follows_the_preferred_velocities():
     rng = np.random.default_rng(3)
     J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, 0.0]), 6, rng)
     lost = np.linalg.svd(J)[2][-1]
@@ -57,7 +57,7 @@ def test_a_lost_direction_is_left_to_what_is_preferred():
     assert v @ lost == pytest.approx(0.7)
 
 
-def test_following_is_going_there():
+def test_is_following_requires_motion_along_the_velocity():
     J = np.eye(6)
     V = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
     assert is_following(J, V, V)

@@ -1,4 +1,4 @@
-"""Boxes and constraints at random, by geometry: never nearer than the margin, never through, and no farther off."""
+"""Geometric properties of KeepOut for random boxes and constraints."""
 
 import numpy as np
 import pytest
@@ -14,13 +14,13 @@ GAP = 1e-6
 
 
 def clearances(lower, upper, points):
-    """(n, B) distance of points outside of boxes, along the axis in which they are farther; negative inside."""
+    """Return distances (n, B) of points from boxes, along the largest axis; negative inside."""
     points = np.atleast_2d(points)[:, None]
     return np.maximum(lower - points, points - upper).max(axis=2)
 
 
 def scene(seed, dimensions=2, boxes=2, planes=0):
-    """Boxes far enough from each other that no face of one is in another, and a start outside of them all."""
+    """Draw disjoint boxes and a start outside all of them."""
     rng = np.random.default_rng(seed)
     while True:
         centre, half = rng.uniform(-1, 1, (boxes, dimensions)), rng.uniform(0.05, 0.3, (boxes, dimensions))
@@ -36,7 +36,7 @@ def scene(seed, dimensions=2, boxes=2, planes=0):
 
 
 @given(SEEDS, st.integers(1, 3), st.integers(1, 2))
-def test_no_point_of_the_way_is_nearer_than_the_margin(seed, dimensions, boxes):
+def test_path_keeps_the_margin(seed, dimensions, boxes):
     keep_out, lower, upper, start, desired = scene(seed, dimensions, boxes)
     assert keep_out.num_outputs == dimensions
     safe, blocked = keep_out.project(start, desired)
@@ -51,8 +51,8 @@ def test_no_point_of_the_way_is_nearer_than_the_margin(seed, dimensions, boxes):
 
 
 @given(SEEDS)
-def test_a_way_that_is_blocked_goes_as_far_as_it_can(seed):
-    """A target outside of the boxes beyond one of them: straight towards it, until the margin is all that is left."""
+def test_blocked_path_ends_at_the_margin(seed):
+    """The motion towards a target behind a box ends at the margin of the box."""
     keep_out, lower, upper, start, desired = scene(seed)
     if clearances(lower, upper, desired).min() < MARGIN + 1e-3:
         return
@@ -68,7 +68,7 @@ def test_a_way_that_is_blocked_goes_as_far_as_it_can(seed):
 
 
 @given(SEEDS)
-def test_a_target_in_a_box_goes_to_its_nearest_face(seed):
+def test_target_in_a_box_is_projected_to_its_nearest_face(seed):
     rng = np.random.default_rng(seed)
     lower, upper = np.zeros((1, 2)), np.array([[0.5, 0.7]])
     keep_out = KeepOut(lower, upper, LinearConstraints.none(2), MARGIN)
@@ -87,7 +87,7 @@ def test_a_target_in_a_box_goes_to_its_nearest_face(seed):
 
 
 @given(SEEDS, st.integers(1, 3))
-def test_constraints_are_kept_at_the_margin_by_the_nearest_point(seed, planes):
+def test_projection_to_constraints_is_the_nearest_point(seed, planes):
     rng = np.random.default_rng(seed)
     G = rng.standard_normal((planes, 2))
     c = -rng.uniform(0.2, 1, planes)
@@ -109,8 +109,8 @@ def test_constraints_are_kept_at_the_margin_by_the_nearest_point(seed, planes):
 
 
 @given(SEEDS)
-def test_someone_pushed_nearer_than_the_margin_comes_no_nearer(seed):
-    """From within the margin or within the box: never a smaller clearance than the start's, and free to leave."""
+def test_robot_within_the_margin_comes_no_closer(seed):
+    """From within the margin or a box, the clearance never decreases, and the robot may leave."""
     rng = np.random.default_rng(seed)
     lower, upper = np.array([[0.0, 0.0]]), np.array([[0.4, 0.6]])
     keep_out = KeepOut(lower, upper, LinearConstraints.none(2), MARGIN)
@@ -130,7 +130,7 @@ def test_someone_pushed_nearer_than_the_margin_comes_no_nearer(seed):
     assert not blocked
 
 
-def test_a_box_may_extend_to_infinity():
+def test_box_may_extend_to_infinity():
     wall = KeepOut([[0.3, -np.inf]], [[0.5, np.inf]], LinearConstraints.none(2), MARGIN)
     for y in (-100.0, 0.0, 1e6):
         safe, blocked = wall.project(np.array([0.0, y]), np.array([1.0, y]))
@@ -141,7 +141,7 @@ def test_a_box_may_extend_to_infinity():
         assert not blocked
 
 
-def test_along_a_face_and_on_the_spot_nothing_blocks():
+def test_motion_along_a_face_is_not_blocked():
     box = KeepOut([[0.0, 0.0]], [[1.0, 1.0]], LinearConstraints.none(2), MARGIN)
     beside = np.array([-0.5, 1.0 + MARGIN])
     for desired in (np.array([1.5, 1.0 + MARGIN]), beside):
@@ -153,7 +153,7 @@ def test_along_a_face_and_on_the_spot_nothing_blocks():
     assert low[0] == pytest.approx(-MARGIN, abs=1e-5)
 
 
-def test_the_first_of_two_walls_stops():
+def test_first_of_two_walls_stops_the_motion():
     walls = KeepOut([[0.5, -1.0], [0.2, -1.0]], [[0.6, 1.0], [0.3, 1.0]], LinearConstraints.none(2), 0.0)
     for start, end, wall in ((0.0, 1.0, 0.2), (1.0, 0.0, 0.6), (0.4, 1.0, 0.5), (0.4, 0.0, 0.3)):
         safe, blocked = walls.project(np.array([start, 0.0]), np.array([end, 0.0]))
@@ -161,7 +161,7 @@ def test_the_first_of_two_walls_stops():
         assert safe[0] == pytest.approx(wall, abs=1e-5)
 
 
-def test_refuses_what_does_not_fit():
+def test_constructor_refuses_invalid_arguments():
     none = LinearConstraints.none(2)
     stepwise = LinearConstraints(np.zeros((3, 1, 2)), -np.ones((3, 1)))
     for lower, upper, constraints in (

@@ -1,4 +1,4 @@
-"""Six letters, nothing set by hand: `python tests/models/primitives/letters.py` says how each is reproduced."""
+"""Fit primitives to six letters and print how each is reproduced: `python tests/models/primitives/letters.py`."""
 
 import sys
 from pathlib import Path
@@ -13,14 +13,14 @@ from oracles.handwriting import LETTERS, write
 
 if __name__ == "__main__":
     for letter in LETTERS:
-        shown = write(letter)
-        selection = fit(shown)
-        outputs = np.stack(shown.outputs)
+        demonstrations = write(letter)
+        selection = fit(demonstrations)
+        outputs = np.stack(demonstrations.outputs)
         motion = motion_without_actions(selection.primitive())
         near = np.abs(motion - outputs.mean(axis=0)) <= outputs.std(axis=0, ddof=1)
-        untold = share_within_spread(LcNsKmp(ReferenceTrajectory.from_demonstrations(shown)))
+        default = share_within_spread(LcNsKmp(ReferenceTrajectory.from_demonstrations(demonstrations)))
         print(
             f"{letter}: {selection.share:.1%} of steps within the reference's deviation, {near.all(axis=1).mean():.1%} "
-            f"within the recordings' own; untold {untold:.1%}. {selection.why}",
+            f"within the recordings' own; with the defaults {default:.1%}. {selection.why}",
             flush=True,
         )

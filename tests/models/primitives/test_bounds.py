@@ -1,4 +1,4 @@
-"""Bounds hold for all that was shown, and for little more."""
+"""Bounds contain the demonstrations, with a small margin."""
 
 import numpy as np
 import pytest
@@ -14,13 +14,13 @@ def shown():
 
 
 @pytest.mark.parametrize("phases", [1, 3, 7])
-def test_every_demonstration_keeps_them(phases):
+def test_bounds_contain_every_demonstration(phases):
     bounds = compute_bounds(shown(), phases, margin=0.0)
     for outputs in shown().outputs:
         assert bounds.contains(outputs).all()
 
 
-def test_a_demonstration_whose_samples_are_not_uniform_keeps_them_too():
+def test_bounds_contain_demonstrations_with_uneven_samples():
     t = np.array([0.0, 0.1, 0.13, 0.16, 1.0, 1.2, 1.7, 2.0])
     peak = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -2.0, 0.0])
     bounds = compute_bounds(Demonstrations(t, [peak[:, None], np.zeros((8, 1))]), 2, margin=0.0)
@@ -28,13 +28,13 @@ def test_a_demonstration_whose_samples_are_not_uniform_keeps_them_too():
     assert bounds.lower[1, 0] == -2.0
 
 
-def test_more_phases_are_tighter():
+def test_bounds_are_tighter_with_more_phases():
     room = [np.mean(b.upper - b.lower) for b in (compute_bounds(shown(), k) for k in (1, 2, 4, 8))]
     assert sorted(room, reverse=True) == room
     assert room[-1] < 0.4 * room[0]
 
 
-def test_the_margin_is_a_part_of_the_range_and_no_less_than_the_least():
+def test_margin_is_relative_to_the_range_with_a_minimum():
     tight = compute_bounds(shown(), margin=0.0)
     wide = compute_bounds(shown(), margin=0.25)
     size = tight.upper - tight.lower
@@ -43,17 +43,17 @@ def test_the_margin_is_a_part_of_the_range_and_no_less_than_the_least():
     np.testing.assert_allclose(compute_bounds(shown(), margin=0.0, min_margin=5.0).upper - tight.upper, 5.0)
 
 
-def test_a_free_output_has_none():
+def test_unbounded_output_has_infinite_bounds():
     bounds = compute_bounds(shown(), 2, bounded=[1])
     assert np.isinf(bounds.lower[:, 0]).all()
     assert np.isfinite(bounds.upper[:, 1]).all()
 
 
-def test_the_fastest_change_is_in_the_demonstrations_own_time():
+def test_max_rates_use_the_clock_of_each_demonstration():
     np.testing.assert_allclose(compute_bounds(shown()).max_rates[0], 1.1, rtol=1e-9)
 
 
 @pytest.mark.parametrize("arguments", [{"phases": 0}, {"phases": 99}, {"margin": -1.0}, {"bounded": [2]}])
-def test_nonsense_is_refused(arguments):
+def test_compute_bounds_refuses_invalid_arguments(arguments):
     with pytest.raises(InputError):
         compute_bounds(shown(), **arguments)

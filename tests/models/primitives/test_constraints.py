@@ -7,7 +7,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 
 
-def test_box_is_its_half_spaces():
+def test_box_equals_its_half_spaces():
     box = LinearConstraints.box([-1, -np.inf], [2, 3])
     assert box.num_constraints == 3
     assert box.violation(np.array([0.0, 0.0])) == pytest.approx(-1)
@@ -15,12 +15,12 @@ def test_box_is_its_half_spaces():
     assert box.violation(np.array([0.0, 3.25])) == pytest.approx(0.25)
 
 
-def test_no_constraint_is_never_violated():
+def test_none_is_never_violated():
     assert LinearConstraints.none(3).violation(np.full(3, 1e9)) == -np.inf
     assert LinearConstraints.box([-np.inf] * 2, [np.inf] * 2).num_constraints == 0
 
 
-def test_steps_past_the_end_keep_the_last():
+def test_window_repeats_the_last_step_past_the_end():
     box = LinearConstraints.box(np.zeros((3, 1)), np.array([[1.0], [2.0], [3.0]]))
     _, c = box.window(np.array([1, 2, 5]))
     np.testing.assert_array_equal(c, [[0, -2], [0, -3], [0, -3]])
@@ -42,24 +42,24 @@ def test_nearest_is_a_projection():
         ([[1e-3], [-1e-3]], [1e-3, 0.0]),
     ],
 )
-def test_refuses_contradictions(G, c):
+def test_constructor_refuses_contradictions(G, c):
     with pytest.raises(InputError, match="contradict"):
         LinearConstraints(G, c)
 
 
-def test_refuses_a_contradiction_at_one_step_and_says_which():
+def test_contradiction_at_one_step_names_the_step():
     lower, upper = np.zeros((4, 1)), np.ones((4, 1))
     upper[2] = -1
     with pytest.raises(InputError, match="at step 2"):
         LinearConstraints.box(lower, upper)
 
 
-def test_equal_bounds_are_no_contradiction():
+def test_box_accepts_equal_bounds():
     assert LinearConstraints.box([1.0], [1.0]).violation(np.array([1.0])) == 0
 
 
 @pytest.mark.parametrize(("G", "c"), [([[1.0]], [1.0, 2.0]), ([1.0], [1.0]), ([[np.nan]], [0.0]), ([[1.0]], [np.inf])])
-def test_refuses_shapes_and_numbers(G, c):
+def test_constructor_refuses_shapes_and_numbers(G, c):
     with pytest.raises(InputError):
         LinearConstraints(G, c)
 
@@ -68,7 +68,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def polytope(seed, steps=None):
-    """Half spaces around a point, of any length of row, and that point."""
+    """Draw half spaces around a point, with rows of any length, and return the point."""
     rng = np.random.default_rng(seed)
     outputs, rows = rng.integers(1, 5), rng.integers(1, 7)
     shape = (rows, outputs) if steps is None else (steps, rows, outputs)
@@ -79,7 +79,7 @@ def polytope(seed, steps=None):
 
 
 @given(SEEDS)
-def test_nearest_is_inside_and_no_allowed_point_is_nearer(seed):
+def test_nearest_is_allowed_and_no_allowed_point_is_nearer(seed):
     rng, G, c, inside = polytope(seed)
     constraints = LinearConstraints(G, c)
     wanted = inside + 3 * rng.standard_normal(len(inside))
@@ -96,7 +96,7 @@ def test_nearest_is_inside_and_no_allowed_point_is_nearer(seed):
 
 
 @given(SEEDS)
-def test_violation_is_the_worst_rows_of_the_step(seed):
+def test_violation_is_the_largest_of_the_rows_of_a_step(seed):
     rng, G, c, inside = polytope(seed, steps=4)
     constraints = LinearConstraints(G, c)
     assert (constraints.num_steps, constraints.num_constraints, constraints.num_outputs) == G.shape
@@ -117,8 +117,8 @@ def test_violation_is_the_worst_rows_of_the_step(seed):
 
 
 @given(SEEDS)
-def test_contradictions_are_refused_and_nothing_else_is(seed):
-    """Planes around a point are refused exactly where one more leaves nothing of it."""
+def test_constructor_refuses_exactly_the_contradictions(seed):
+    """Refuse planes around a point exactly if one more plane excludes every point."""
     rng, G, c, inside = polytope(seed)
     LinearConstraints(G, c)
     row = int(rng.integers(len(G)))
@@ -134,7 +134,7 @@ def test_contradictions_are_refused_and_nothing_else_is(seed):
                 LinearConstraints(*slab)
 
 
-def test_a_box_of_each_step_keeps_its_bounds_in_order():
+def test_box_keeps_the_order_of_bounds_per_step():
     lower = np.array([[0.0, -np.inf, 1.0], [0.1, -np.inf, 1.1]])
     upper = np.array([[2.0, 3.0, np.inf], [2.1, 3.1, np.inf]])
     box = LinearConstraints.box(lower, upper)
@@ -159,12 +159,12 @@ def test_a_box_of_each_step_keeps_its_bounds_in_order():
         ([1j], [2.0]),
     ],
 )
-def test_refuses_boxes_that_are_none(lower, upper):
+def test_box_refuses_invalid_bounds(lower, upper):
     with pytest.raises(InputError):
         LinearConstraints.box(lower, upper)
 
 
-def test_the_same_constraint_at_every_step_is_checked_once_and_any_other_too():
+def test_constructor_checks_every_distinct_step():
     G, c = np.ones((50, 1, 1)), np.zeros((50, 1))
     LinearConstraints(G, c)
     G, c = np.tile([[[1.0], [-1.0]]], (50, 1, 1)), np.tile([0.0, -1.0], (50, 1))
@@ -177,7 +177,7 @@ def test_the_same_constraint_at_every_step_is_checked_once_and_any_other_too():
         LinearConstraints(G, c)
 
 
-def test_the_nearest_of_the_first_step_unless_said():
+def test_nearest_uses_the_first_step_by_default():
     box = LinearConstraints.box([[0.0], [5.0]], [[1.0], [6.0]])
     np.testing.assert_allclose(box.nearest(np.array([9.0])), [1.0])
     np.testing.assert_allclose(box.nearest([9], 1), [6.0])
@@ -186,7 +186,7 @@ def test_the_nearest_of_the_first_step_unless_said():
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-12])
-def test_what_is_fixed_is_fixed_and_what_contradicts_is_refused(gap):
+def test_constructor_refuses_contradictions_of_fixed_outputs(gap):
     fixed = LinearConstraints.box([0.2, 0.0], [0.2 + gap, 1.0])
     nearest = fixed.nearest(np.array([5.0, 0.5]))
     assert fixed.violation(nearest) <= 1e-9
@@ -196,6 +196,6 @@ def test_what_is_fixed_is_fixed_and_what_contradicts_is_refused(gap):
             LinearConstraints.box([0.2 + gap, 0.0], [0.2, 1.0])
 
 
-def test_a_contradiction_of_general_rows_is_refused_where_it_is_small():
+def test_constructor_refuses_small_contradictions_of_rows():
     with pytest.raises(InputError, match="contradict each other"):
         LinearConstraints(np.array([[1.0, 1.0], [-1.0, -1.0]]), np.array([1.0, -1.0 + 5e-8]))

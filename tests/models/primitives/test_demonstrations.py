@@ -11,7 +11,7 @@ def wavy(lengths=(50, 80), outputs=2):
 
 
 @pytest.mark.parametrize("ending", ["npz", "csv"])
-def test_a_file_gives_back_exactly_what_was_saved(tmp_path, ending):
+def test_load_returns_exactly_what_was_saved(tmp_path, ending):
     demonstrations = wavy()
     demonstrations.save(tmp_path / f"d.{ending}")
     loaded = Demonstrations.load(tmp_path / f"d.{ending}")
@@ -20,7 +20,7 @@ def test_a_file_gives_back_exactly_what_was_saved(tmp_path, ending):
         np.testing.assert_array_equal(a, b)
 
 
-def test_plain_arrays_load_too(tmp_path):
+def test_load_reads_plain_arrays(tmp_path):
     t = np.linspace(0, 1, 10)
     np.savez(tmp_path / "d.npz", times=np.tile(t, (3, 1)), outputs=np.ones((3, 10, 2)))
     loaded = Demonstrations.load(tmp_path / "d.npz")
@@ -28,7 +28,7 @@ def test_plain_arrays_load_too(tmp_path):
     assert loaded.num_outputs == 2
 
 
-def test_resampling_puts_all_on_one_clock_and_keeps_their_shape():
+def test_resampled_demonstrations_share_a_clock_and_end_points():
     resampled = wavy((50, 200)).resampled(100)
     np.testing.assert_array_equal(resampled.times[0], resampled.times[1])
     assert np.ptp(np.diff(resampled.times[0])) < 1e-12
@@ -38,13 +38,13 @@ def test_resampling_puts_all_on_one_clock_and_keeps_their_shape():
         assert after.shape == (100, 2)
 
 
-def test_resampling_leaves_alone_what_is_on_one_clock():
+def test_resampled_returns_self_when_the_clock_is_uniform():
     t = np.linspace(0, 1, 20)
     d = Demonstrations(t, np.random.default_rng(0).standard_normal((3, 20, 1)))
     assert d.resampled() is d
 
 
-def test_a_sample_logged_twice_counts_once():
+def test_constructor_drops_repeated_samples():
     d = Demonstrations([[0.0, 0.1, 0.1, 0.2]], [[[1.0], [2.0], [2.0], [3.0]]])
     np.testing.assert_array_equal(d.times[0], [0, 0.1, 0.2])
 
@@ -73,18 +73,18 @@ def test_a_sample_logged_twice_counts_once():
         ([[0.0, 1.0]] * 2, [[[1.0], [2.0]]], "2 time vectors"),
     ],
 )
-def test_refuses(times, outputs, names):
+def test_constructor_refuses_invalid_demonstrations(times, outputs, names):
     with pytest.raises(InputError, match=names):
         Demonstrations(times, outputs)
 
 
 @pytest.mark.parametrize("names", [["a", "b"], ["a\n"], [" x"], [1], ["x" * 201], ["\ud800"]])
-def test_refuses_names(names):
+def test_constructor_refuses_invalid_names(names):
     with pytest.raises(InputError, match="name"):
         Demonstrations([[0.0, 1.0]], [[[1.0], [2.0]]], names)
 
 
-def test_refuses_damaged_and_dangerous_files(tmp_path):
+def test_load_refuses_damaged_and_dangerous_files(tmp_path):
     with pytest.raises(InputError, match="no demonstration file"):
         Demonstrations.load(tmp_path / "missing.npz")
     good = tmp_path / "good.npz"

@@ -1,4 +1,4 @@
-"""Kernels as explicit features, against the matrices that they stand for, in more digits than they have."""
+"""Explicit features of kernels, compared with their matrices in higher precision."""
 
 import mpmath
 import numpy as np
@@ -13,7 +13,7 @@ KERNELS = [SquaredExponential(0.5), SquaredExponential(0.1), Matern52(0.4)]
 
 
 def conditioned(kernel, past, future, noise):
-    """K_fp (K_pp + ρI)⁻¹ and K_ff − K_fp (K_pp + ρI)⁻¹ K_pf with fifty digits behind the kernel's nineteen."""
+    """Compute K_fp (K_pp + ρI)⁻¹ and K_ff − K_fp (K_pp + ρI)⁻¹ K_pf with fifty digits."""
     K = kernel(*(np.r_[past, future].astype(np.longdouble),) * 2)
     P = len(past)
     with mpmath.workdps(50):
@@ -26,7 +26,7 @@ def conditioned(kernel, past, future, noise):
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=repr)
 @pytest.mark.parametrize("noise", [12e-4, 12e-10])
-def test_features_are_the_kernel_given_the_history(kernel, noise):
+def test_features_equal_the_kernel_given_the_history(kernel, noise):
     past, future = 0.02 * np.arange(-6, 0), 0.02 * np.arange(9)
     features = window_features(kernel, past, future, noise)
     W, left = conditioned(kernel, past, future, noise)
@@ -36,14 +36,14 @@ def test_features_are_the_kernel_given_the_history(kernel, noise):
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=repr)
-def test_without_a_history_they_are_the_kernel(kernel):
+def test_features_equal_the_kernel_without_a_history(kernel):
     future = np.linspace(0, 3, 40)
     features = window_features(kernel, future[:0], future, 0.0)
     assert features.history_map.shape == (40, 0)
     np.testing.assert_allclose(features.features @ features.features.T, kernel(future, future), rtol=0, atol=1e-14)
 
 
-def test_there_are_no_more_of_them_than_the_kernel_has_directions():
+def test_number_of_features_is_the_rank_of_the_kernel():
     smooth = window_features(SquaredExponential(np.sqrt(5)), np.zeros(0), np.linspace(0, 1, 60), 0.0)
     rough = window_features(SquaredExponential(np.sqrt(5e-6)), np.zeros(0), np.linspace(0, 1, 60), 0.0)
     assert smooth.features.shape[1] <= 12
@@ -51,7 +51,7 @@ def test_there_are_no_more_of_them_than_the_kernel_has_directions():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3))
-def test_a_basis_represents_what_it_was_given_and_says_how_much_of_anything_else(seed, dimensions):
+def test_basis_represents_its_inputs_and_returns_the_residual(seed, dimensions):
     rng = np.random.default_rng(seed)
     kernel = SquaredExponential(np.sqrt(0.5 / rng.uniform(0.1, 5)))
     inputs, elsewhere = rng.uniform(-1, 1, (15, dimensions)), rng.uniform(-3, 3, (7, dimensions))
@@ -80,7 +80,7 @@ def test_a_basis_represents_what_it_was_given_and_says_how_much_of_anything_else
     np.testing.assert_allclose(H[:15, :before], F, rtol=0, atol=1e-9)
 
 
-def test_points_far_apart_each_need_a_feature_and_the_same_point_twice_needs_one():
+def test_basis_adds_a_feature_for_each_distinct_point():
     kernel = SquaredExponential(np.sqrt(0.5))
     assert KernelBasis(kernel, np.array([[0.0], [100.0], [200.0]])).size == 3
     assert KernelBasis(kernel, np.array([[1.0], [1.0], [1.0]])).size == 1

@@ -1,4 +1,4 @@
-"""Letters with sharp corners and loops, and outputs that differ together: reproduced with nothing set by hand."""
+"""Fits of letters with sharp corners and loops, and of correlated outputs, without manual settings."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from oracles.handwriting import LETTERS, correlated, write
 
 
 def share_of_what_was_shown(demonstrations, motion):
-    """The share of steps at which every output is within one standard deviation of the recordings' own mean."""
+    """Compute the share of steps with all outputs within one standard deviation of the demonstrations' mean."""
     outputs = np.stack(demonstrations.outputs)
     return float((np.abs(motion - outputs.mean(axis=0)) <= outputs.std(axis=0, ddof=1)).all(axis=1).mean())
 
@@ -22,14 +22,14 @@ PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 # `letters.py` beside this file writes down what was chosen for longer ones, and why.
 @pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
-def test_a_letter_stays_within_what_was_shown(letter, page):
+def test_fitted_letter_stays_within_the_demonstrations(letter, page):
     selection = fit(write(letter, count=4, steps=60, **page))
     assert selection.is_within_spread
     assert selection.share == share_within_spread(selection.primitive()) >= MIN_SHARE
     assert f"{selection.components} components have the least information criterion" in selection.why
 
 
-def test_the_letter_with_most_corners_stays_within_the_recordings_own_deviation():
+def test_fitted_letter_with_corners_stays_within_the_deviation():
     shown = write("B", count=5, steps=100)
     assert share_of_what_was_shown(shown, motion_without_actions(fit(shown).primitive())) >= MIN_SHARE
 
@@ -44,8 +44,8 @@ def selection(together):
     return fit(together)
 
 
-def test_outputs_that_differ_together_are_reproduced_together(together, selection):
-    """At a correlation of 0.98 one standard deviation across is a seventh of one along."""
+def test_fit_reproduces_correlated_outputs(together, selection):
+    """At a correlation of 0.98, the standard deviation across is a seventh of that along."""
     outputs = np.stack(together.outputs)
     apart = outputs - outputs.mean(axis=0)
     assert np.corrcoef(apart.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
@@ -53,7 +53,7 @@ def test_outputs_that_differ_together_are_reproduced_together(together, selectio
     assert share_of_what_was_shown(together, motion_without_actions(selection.primitive())) >= MIN_SHARE
 
 
-def test_what_was_chosen_is_among_what_was_tried_and_nothing_smoother_is_as_good(selection):
+def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
     chosen = next(
         c for c in selection.candidates if (c.length_scale, c.lambda_) == (selection.length_scale, selection.lambda_)
     )
@@ -69,8 +69,8 @@ def test_what_was_chosen_is_among_what_was_tried_and_nothing_smoother_is_as_good
         assert str(number) in selection.why
 
 
-def test_a_unit_of_length_changes_nothing_but_the_unit(together, selection):
-    """A hundred times the numbers: a hundred times the motion, and λ in the inverse square of the unit."""
+def test_fit_is_invariant_to_the_unit_of_length(together, selection):
+    """Outputs scaled by 100 scale the motion by 100 and λ by the inverse square."""
     larger = fit(Demonstrations(together.times, [100 * y for y in together.outputs]))
     assert larger.components == selection.components
     assert larger.length_scale == selection.length_scale
@@ -80,14 +80,14 @@ def test_a_unit_of_length_changes_nothing_but_the_unit(together, selection):
     )
 
 
-def test_a_unit_of_time_changes_the_kernel_alone(together, selection):
+def test_unit_of_time_scales_only_the_length_scale(together, selection):
     slower = fit(Demonstrations([10 * t for t in together.times], together.outputs))
     assert slower.components == selection.components
     assert slower.length_scale == pytest.approx(10 * selection.length_scale, rel=1e-9)
     assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
 
 
-def test_other_arguments_of_the_primitive_are_passed_on(selection):
+def test_selection_passes_arguments_on_to_the_primitive(selection):
     primitive = selection.primitive(history=3, history_variance=1e-5, lambda_=7.0)
     assert (primitive.history, primitive.lambda_, primitive.beta) == (3, 7.0, selection.beta)
     assert primitive.reference is selection.reference
@@ -95,14 +95,14 @@ def test_other_arguments_of_the_primitive_are_passed_on(selection):
 
 
 def hook(steps=60, deviation=0.05):
-    """A reference with a corner in the middle."""
+    """Return a reference with a corner in the middle."""
     t = np.linspace(0, 2, steps)
     means = np.column_stack([np.abs(t - 1), t])
     return ReferenceTrajectory(t, means, np.tile(deviation**2 * np.eye(2), (steps, 1, 1)))
 
 
-def test_a_primitive_that_leaves_the_spread_says_so():
-    """The share falls where the kernel cuts the corner, and where λ pulls everything to zero."""
+def test_share_is_low_when_a_primitive_leaves_the_spread():
+    """The share falls if the kernel cuts the corner, or if λ pulls the motion to zero."""
     good = LcNsKmp(hook(), SquaredExponential(0.1), 0.05, 0.05)
     assert share_within_spread(good) == 1.0
     too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(22.4), 6.0, 6.0)
@@ -115,8 +115,8 @@ def test_a_primitive_that_leaves_the_spread_says_so():
         assert estimate == pytest.approx(share_within_spread(primitive), abs=0.1)
 
 
-def test_the_share_counts_correlations():
-    """A tenth of a deviation across two outputs that agree to 0.99 is far outside; along them it is not."""
+def test_share_considers_correlations():
+    """A tenth of a deviation is far outside across two outputs with a correlation of 0.99, and inside along them."""
     t = np.linspace(0, 1, 20)
     covariance = 0.01 * np.array([[1.0, 0.99], [0.99, 1.0]])
 
@@ -132,7 +132,7 @@ def test_the_share_counts_correlations():
         assert share_within_spread(primitive) == share
 
 
-def test_with_a_history_the_motion_is_what_its_own_commands_lead_to():
+def test_motion_with_a_history_follows_its_own_commands():
     reference = hook()
     primitive = LcNsKmp(reference, history=2, history_variance=1e-4)
     past = np.tile(reference.means[0], (2, 1))
@@ -141,8 +141,8 @@ def test_with_a_history_the_motion_is_what_its_own_commands_lead_to():
         past = np.vstack([past[1:], output])
 
 
-def test_the_criterion_stops_where_more_components_are_no_better():
-    """A straight line needs one or two components; nobody has to try sixty."""
+def test_information_criteria_stop_when_not_improving():
+    """A straight line needs one or two components; the search stops long before sixty."""
     t = np.linspace(0, 1, 100)
     rng = np.random.default_rng(0)
     outputs = np.stack([t[:, None] + 0.05 * rng.standard_normal((100, 1)) for _ in range(4)])
@@ -151,7 +151,7 @@ def test_the_criterion_stops_where_more_components_are_no_better():
     assert not {8, 16} & set(found)
 
 
-def test_refuses_too_few_demonstrations():
+def test_fit_refuses_too_few_demonstrations():
     t = np.linspace(0, 1, 50)
     with pytest.raises(InputError, match="at least three"):
         fit(Demonstrations(t, [np.sin(t)[:, None], np.cos(t)[:, None]]))
@@ -160,6 +160,6 @@ def test_refuses_too_few_demonstrations():
 
 
 @pytest.mark.parametrize("components", [0, 41, 1000])
-def test_refuses_components_that_there_is_nothing_for(components, together):
+def test_fit_refuses_too_many_components(components, together):
     with pytest.raises(InputError, match="components must be between 1 and half the number of steps, 40"):
         fit(together, components=components)

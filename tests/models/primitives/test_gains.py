@@ -16,7 +16,7 @@ def primitive(request):
 
 
 def rollout(primitive, actions):
-    """The closed loop as a robot would run it, step by step."""
+    """Run the closed loop step by step, as on a robot."""
     past = np.tile(primitive.reference.means[0], (primitive.history, 1))
     out = []
     for n, action in enumerate(actions):
@@ -30,7 +30,7 @@ def deviation_rms(primitive, actions):
     return np.sqrt((moved**2).mean(axis=0)) / np.sqrt((primitive.reference.standard_deviations**2).mean(axis=0))
 
 
-def test_constant_actions_end_up_where_authority_says(primitive):
+def test_constant_actions_reach_the_authority(primitive):
     gains = authority_gains(primitive, action_scale=1.5)
     np.testing.assert_allclose(authority(primitive, gains), np.sqrt(3) * 1.5)
     for o in range(2):
@@ -39,7 +39,7 @@ def test_constant_actions_end_up_where_authority_says(primitive):
 
 
 @pytest.mark.parametrize("action_repeat", [1, 5])
-def test_white_actions_stir_up_what_rms_says(primitive, action_repeat):
+def test_white_actions_reach_the_exploration_rms(primitive, action_repeat):
     gains = rms_gains(primitive, action_scale=1.0, action_repeat=action_repeat)
     np.testing.assert_allclose(exploration_rms(primitive, gains, action_repeat), 1.0)
     rng = np.random.default_rng(0)
@@ -52,7 +52,7 @@ def test_white_actions_stir_up_what_rms_says(primitive, action_repeat):
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(samples), axis=0)), 1.0, rtol=0.15)
 
 
-def test_only_named_outputs_are_explored(primitive):
+def test_gains_are_zero_for_unexplored_outputs(primitive):
     for gains in (authority_gains(primitive, outputs=[1]), rms_gains(primitive, outputs=[1])):
         assert gains[0] == 0
         assert gains[1] > 0
@@ -60,7 +60,7 @@ def test_only_named_outputs_are_explored(primitive):
     np.testing.assert_array_equal(masked, authority_gains(primitive, outputs=[1]))
 
 
-def test_refuses(primitive):
+def test_gains_refuse_invalid_arguments(primitive):
     with pytest.raises(InputError, match="action_scale"):
         authority_gains(primitive, action_scale=0)
     with pytest.raises(InputError, match="action_dims"):
@@ -72,7 +72,7 @@ def test_refuses(primitive):
         authority_gains(deaf)
 
 
-def test_gains_are_held_for_one_step_unless_said_and_may_be_a_list(primitive):
+def test_exploration_rms_accepts_lists_and_defaults_to_one_step(primitive):
     gains = [0.5, 2.0]
     np.testing.assert_array_equal(exploration_rms(primitive, gains), exploration_rms(primitive, np.array(gains), 1))
     np.testing.assert_array_equal(authority(primitive, tuple(gains)), authority(primitive, np.array(gains)))

@@ -1,4 +1,4 @@
-"""Files of demonstrations, from everywhere: a result, or one sentence, in a bounded time and memory."""
+"""Readers of demonstration files return a result or raise an error in bounded time and memory."""
 
 import io
 import os
@@ -19,7 +19,7 @@ Y = np.column_stack([np.sin(T), T**2])
 
 
 def npy(description, shape, data=b"", version=b"\x01\x00", fortran_order=False):
-    """An array as NumPy writes it, with whatever header."""
+    """Return an array in NumPy's format, with any header."""
     header = f"{{'descr': {description!r}, 'fortran_order': {fortran_order}, 'shape': {shape}, }}".encode() + b"\n"
     size = struct.pack("<H" if version == b"\x01\x00" else "<L", len(header))
     return b"\x93NUMPY" + version + size + header + data
@@ -33,7 +33,7 @@ def archive(path, compression=zipfile.ZIP_DEFLATED, **members):
 
 
 def refused(path):
-    """What is said about a file, with the memory that reading it may take."""
+    """Return the message that refuses a file, and check the memory that reading it takes."""
     tracemalloc.start()
     with pytest.raises(InputError) as said:
         Demonstrations.load(path)
@@ -82,11 +82,11 @@ GOOD = {"times": npy("<f8", (4,), T.tobytes()), "outputs": npy("<f8", (1, 4, 2),
         ({"names": npy("<U1", (3,), "abc".encode("utf-32-le"))}, "3 names for 2 outputs"),
     ],
 )
-def test_refuses_arrays_that_are_none(tmp_path, changed, said):
+def test_npz_reader_refuses_invalid_arrays(tmp_path, changed, said):
     assert said in refused(archive(tmp_path / "d.npz", **{**GOOD, **changed}))
 
 
-def test_the_archive_that_the_refusals_start_from_is_sound(tmp_path):
+def test_npz_reader_accepts_the_valid_archive(tmp_path):
     loaded = Demonstrations.load(archive(tmp_path / "d.npz", **GOOD))
     np.testing.assert_array_equal(loaded.outputs[0], Y)
 
@@ -107,27 +107,27 @@ def test_the_archive_that_the_refusals_start_from_is_sound(tmp_path):
         (np.full(1001, 2), "more than 1000"),
     ],
 )
-def test_refuses_lengths_that_are_none(tmp_path, lengths, said):
+def test_npz_reader_refuses_invalid_lengths(tmp_path, lengths, said):
     path = tmp_path / "d.npz"
     np.savez(path, lengths=np.asarray(lengths), times=np.r_[T[:2], T[:2]], outputs=Y)
     assert said in refused(path)
 
 
-def test_zeros_are_not_unpacked_to_be_refused(tmp_path):
+def test_npz_reader_refuses_large_arrays_without_unpacking(tmp_path):
     path = tmp_path / "d.npz"
     np.savez_compressed(path, times=np.arange(2000.0), outputs=np.zeros((1, 2000, 2000)))
     assert path.stat().st_size < 100_000
     assert "more than 2000000" in refused(path)
 
 
-def test_an_archive_may_have_other_arrays_too_but_not_thousands(tmp_path):
+def test_npz_reader_accepts_other_arrays_but_not_thousands(tmp_path):
     path = archive(tmp_path / "d.npz", **GOOD, force=npy("|O", (), b"x"))
     assert Demonstrations.load(path).num_outputs == 2
     path = archive(tmp_path / "e.npz", **GOOD, **{f"a{i}": b"" for i in range(3000)})
     assert "too many arrays" in refused(path)
 
 
-def test_many_demonstrations_are_refused_before_they_are_cut(tmp_path):
+def test_npz_reader_refuses_many_demonstrations_before_splitting(tmp_path):
     path = tmp_path / "d.npz"
     np.savez(path, times=T, outputs=np.zeros((200_000, 4, 1)))
     assert "200000 demonstrations" in refused(path)
@@ -138,7 +138,7 @@ def test_many_demonstrations_are_refused_before_they_are_cut(tmp_path):
     assert "far more samples than the others" in refused(path)
 
 
-def test_refuses_archives_that_numpy_does_not_write(tmp_path):
+def test_npz_reader_refuses_archives_not_written_by_numpy(tmp_path):
     renamed = tmp_path / "renamed.npz"
     buffer = io.BytesIO()
     np.save(buffer, Y)
@@ -173,8 +173,8 @@ def test_refuses_archives_that_numpy_does_not_write(tmp_path):
     assert "damaged" in refused(tmp_path / "text.npz")
 
 
-def test_a_bit_that_flipped_is_noticed_wherever_it_is(tmp_path):
-    """One bit at every byte of an archive: what still loads is what was saved."""
+def test_npz_reader_detects_a_flipped_bit_anywhere(tmp_path):
+    """Flip one bit in every byte of an archive: if it still loads, the content is unchanged."""
     good = archive(tmp_path / "good.npz", **GOOD).read_bytes()
     path = tmp_path / "d.npz"
     loaded = 0
@@ -191,7 +191,7 @@ def test_a_bit_that_flipped_is_noticed_wherever_it_is(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["<f4", ">f8", "<f2", "<i4", "|u1", "|b1", ">i8"])
-def test_every_kind_of_number_is_read_as_it_is(tmp_path, kind):
+def test_npz_reader_reads_every_numeric_type(tmp_path, kind):
     values = np.array([[[0, 1], [1, 0], [1, 1]]]).astype(kind)
     path = tmp_path / "d.npz"
     np.savez(path, times=np.arange(3, dtype=np.int64), outputs=np.asfortranarray(values))
@@ -200,7 +200,7 @@ def test_every_kind_of_number_is_read_as_it_is(tmp_path, kind):
     np.testing.assert_array_equal(loaded.outputs[0], [[0, 1], [1, 0], [1, 1]])
 
 
-def test_one_demonstration_as_other_programs_write_it(tmp_path):
+def test_csv_reader_accepts_the_clock_names_of_other_programs(tmp_path):
     path = tmp_path / "d.csv"
     for first in ("t", "time", "Time [s]", " timestamp (Sec)", "t/s", "t [ s ]"):
         path.write_text(f"{first},x,y [m],z\n0,1,2,3\n0.5,4,5,6\n1e0, 7,8,-9.5e-1\n\n", encoding="utf-8-sig")
@@ -211,7 +211,7 @@ def test_one_demonstration_as_other_programs_write_it(tmp_path):
 
 
 @pytest.mark.parametrize("clock", ["t [ms]", "time (us)", "Timestamp/ns", "t [min]", "t []", "t (UTC)"])
-def test_time_in_another_unit_than_seconds_is_refused(clock, tmp_path):
+def test_csv_reader_refuses_time_in_another_unit(clock, tmp_path):
     (tmp_path / "d.csv").write_text(f"{clock},x\n0,1\n1,2\n")
     said = refused(tmp_path / "d.csv")
     assert "time is in seconds" in said
@@ -219,7 +219,7 @@ def test_time_in_another_unit_than_seconds_is_refused(clock, tmp_path):
     assert "guiderail dataset import" in said
 
 
-def test_a_folder_is_as_many_demonstrations_as_it_has_files(tmp_path):
+def test_folder_is_read_in_the_numeric_order_of_its_files(tmp_path):
     for m in range(12):
         (tmp_path / f"demo_{m}.csv").write_text(f"t,x\n0,{m}\n1,{m + 1}\n2,{m}\n")
     (tmp_path / "notes.txt").write_text("not read")
@@ -233,7 +233,7 @@ def test_a_folder_is_as_many_demonstrations_as_it_has_files(tmp_path):
     assert "demonstration file" in refused(tmp_path)
 
 
-def test_refuses_folders_that_hold_none_or_too_many(tmp_path):
+def test_folder_with_no_or_too_many_files_is_refused(tmp_path):
     assert "no .csv file" in refused(tmp_path)
     for m in range(1001):
         (tmp_path / f"{m}.csv").touch()
@@ -271,18 +271,18 @@ def test_refuses_folders_that_hold_none_or_too_many(tmp_path):
         ("t,x\n" + "\n" * 400_001, "more than 400000 lines"),
     ],
 )
-def test_refuses_tables_that_are_none(tmp_path, text, said):
+def test_csv_reader_refuses_invalid_tables(tmp_path, text, said):
     path = tmp_path / "d.csv"
     path.write_text(text, encoding="utf-8")
     assert said in refused(path)
 
 
-def test_refuses_bytes_that_are_no_text(tmp_path):
+def test_csv_reader_refuses_invalid_utf8(tmp_path):
     (tmp_path / "d.csv").write_bytes(b"t,x\n0,\xff\n")
     assert "no table" in refused(tmp_path / "d.csv")
 
 
-def test_waits_for_no_pipe_and_reads_no_device(tmp_path):
+def test_read_refuses_pipes_and_devices(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     assert "no demonstration file" in refused(tmp_path / "pipe.csv")
     os.symlink("/dev/zero", tmp_path / "zero.npz")
@@ -293,13 +293,13 @@ def test_waits_for_no_pipe_and_reads_no_device(tmp_path):
         Demonstrations.load("a\0b.csv")
 
 
-def test_a_demonstrations_rows_may_be_anywhere(tmp_path):
+def test_csv_reader_groups_rows_by_demonstration(tmp_path):
     (tmp_path / "d.csv").write_text("demonstration,time,x\n7,0,1\n-3,0,5\n7,1,2\n-3,1,6\n7,2,3\n")
     loaded = Demonstrations.load(tmp_path / "d.csv")
     assert [y.ravel().tolist() for y in loaded.outputs] == [[5, 6], [1, 2, 3]]
 
 
-def test_who_reads_a_file_does_not_wait_for_the_learners_of_mixtures():
+def test_import_of_primitives_does_not_import_scikit_learn():
     code = (
         "import sys, guiderail.models.primitives; sys.exit('sklearn' in sys.modules or 'scipy.optimize' in sys.modules)"
     )

@@ -8,11 +8,11 @@ A, B = np.array([[0.0, 0.0], [0.3, -0.4]]), np.array([[0.0, 0.5], [1.0, 2.0], [0
 DISTANCE = np.array([[np.linalg.norm(a - b) for b in B] for a in A])
 
 
-def test_the_squared_exponential_is_its_closed_form():
+def test_squared_exponential_matches_its_closed_form():
     np.testing.assert_allclose(SquaredExponential(0.4)(A, B), np.exp(-(DISTANCE**2) / (2 * 0.4**2)), rtol=1e-14)
 
 
-def test_matern_is_its_closed_form():
+def test_matern52_matches_its_closed_form():
     s = np.sqrt(5) * DISTANCE / 0.7
     np.testing.assert_allclose(Matern52(0.7)(A, B), (1 + s + s**2 / 3) * np.exp(-s), rtol=1e-14)
     assert Matern52()(A, A).diagonal().tolist() == [1.0, 1.0]
@@ -21,6 +21,6 @@ def test_matern_is_its_closed_form():
 
 @pytest.mark.parametrize("kernel", [SquaredExponential, Matern52])
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
-def test_refuses_what_is_no_scale(kernel, scale):
+def test_kernel_refuses_an_invalid_length_scale(kernel, scale):
     with pytest.raises(InputError, match="positive"):
         kernel(scale)

@@ -15,7 +15,7 @@ def data(n=300, outputs=6, seed=0):
 
 
 def textbook(kernel, t, means, covariances, queries, lambda_, covariance_lambda):
-    """Equations 2.17 and 2.18 as they stand."""
+    """Compute equations 2.17 and 2.18 directly."""
     outputs = means.shape[1]
     eye = np.eye(outputs)
     K = np.kron(kernel(t, t), eye)
@@ -30,7 +30,7 @@ def textbook(kernel, t, means, covariances, queries, lambda_, covariance_lambda)
 
 
 @pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.7)])
-def test_equations_2_17_and_2_18(kernel):
+def test_mean_and_covariance_match_equations_2_17_and_2_18(kernel):
     t, means, covariances = data(80, 3)
     queries = np.linspace(-0.3, 8.3, 17)
     mean, covariance = textbook(kernel, t, means, covariances, queries, 1.5, 20.0)
@@ -39,8 +39,8 @@ def test_equations_2_17_and_2_18(kernel):
     np.testing.assert_allclose(primitive.covariance(queries), covariance, rtol=1e-6, atol=1e-7)
 
 
-def test_via_points_are_as_if_they_had_always_been_there():
-    """Added, moved and removed, inside the reference and beyond it: each time what a fresh primitive says."""
+def test_via_points_equal_points_of_the_reference():
+    """Added, moved and removed via-points give the result of a new primitive with the same points."""
     kernel = SquaredExponential(0.5)
     t, means, covariances = data(60, 2)
     queries = np.linspace(-0.5, 9.5, 23)
@@ -68,8 +68,8 @@ def test_via_points_are_as_if_they_had_always_been_there():
     np.testing.assert_allclose(primitive.mean(queries), expected([])[0], atol=1e-7)
 
 
-def test_driven_by_a_state():
-    """Two inputs, three outputs: no clock anywhere."""
+def test_kmp_accepts_a_state_as_input():
+    """A primitive of two inputs and three outputs needs no clock."""
     rng = np.random.default_rng(0)
     x = rng.uniform(-1, 1, (120, 2))
     y = np.column_stack([x[:, 0] * x[:, 1], x.sum(axis=1), np.cos(x[:, 0])])
@@ -90,7 +90,7 @@ def test_driven_by_a_state():
         ((0.0, [0.0, 0.0], np.eye(3)), "shape"),
     ],
 )
-def test_refuses_via_points(via, names):
+def test_add_via_point_refuses_invalid_points(via, names):
     primitive = Kmp(*data(20, 2))
     before = primitive.mean([1.0])
     with pytest.raises(InputError, match=names):
@@ -98,7 +98,7 @@ def test_refuses_via_points(via, names):
     np.testing.assert_array_equal(primitive.mean([1.0]), before)
 
 
-def test_refuses_names_and_arguments():
+def test_kmp_refuses_unknown_via_points_and_invalid_arguments():
     primitive = Kmp(*data(20, 2))
     with pytest.raises(InputError, match="no via-point 7"):
         primitive.remove_via_point(7)
@@ -112,7 +112,7 @@ def test_refuses_names_and_arguments():
             Kmp(*broken, covariances)
 
 
-def test_a_via_point_is_finite_in_each_of_its_inputs():
+def test_via_point_input_must_be_finite():
     x = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     primitive = Kmp(x, x, np.tile(np.eye(2), (20, 1, 1)))
     for place in ([np.nan, 0.0], [0.0, np.inf]):
@@ -120,7 +120,7 @@ def test_a_via_point_is_finite_in_each_of_its_inputs():
             primitive.add_via_point(place, [0.0, 0.0], np.eye(2))
 
 
-def test_lists_make_a_primitive_too():
+def test_kmp_accepts_lists():
     t, means, covariances = data(20, 2)
     expected = Kmp(t, means, covariances).mean([1.0])
     np.testing.assert_array_equal(Kmp(t.tolist(), means.tolist(), covariances.tolist()).mean([1.0]), expected)

@@ -1,4 +1,4 @@
-"""The primitive against problem 4.5 itself, and against what its callers may do to it."""
+"""LcNsKmp solves problem 4.5 and refuses invalid arguments."""
 
 import tracemalloc
 from functools import cache
@@ -29,14 +29,14 @@ def scale_of(problem):
 
 
 def relative_error(problem, prediction, dense) -> float:
-    """Largest difference of the window to the textbook's at the same multipliers, in scales of the outputs."""
+    """Return the largest difference from the dense window at the same multipliers, in scales of the outputs."""
     G, _ = problem.constraints()
     expected = dense.corrected(G, prediction.multipliers)
     return float((np.abs(prediction.trajectory - expected) / scale_of(problem)).max())
 
 
 def kkt_residual(problem, prediction) -> float:
-    """Largest violation, negative multiplier, or product of a multiplier (in shares of the largest) and its slack."""
+    """Return the largest violation, negative multiplier, or product of a relative multiplier and its slack."""
     G, c = problem.constraints()
     if not c.size:
         return 0.0
@@ -47,7 +47,7 @@ def kkt_residual(problem, prediction) -> float:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_solves_problem_4_5(seed):
+def test_predict_solves_problem_4_5(seed):
     problem = random_problem(seed)
     prediction = problem.solve()
     assert relative_error(problem, prediction, problem.dense()) < 1e-8
@@ -56,7 +56,7 @@ def test_solves_problem_4_5(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_stays_accurate_where_a_dense_cholesky_does_not(seed):
+def test_predict_is_accurate_where_a_dense_cholesky_is_not(seed):
     problem = random_problem(seed, history_variance=1e-8, history_noise=1e-3)
     prediction = problem.solve()
     dense = problem.dense()
@@ -70,8 +70,8 @@ def test_stays_accurate_where_a_dense_cholesky_does_not(seed):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_agrees_with_a_generic_qp_solver_over_kernel_weights(seed):
-    """Problem 4.5 as it stands, over weights that the kernel represents, by an interior-point method.
+def test_predict_agrees_with_a_qp_over_kernel_weights(seed):
+    """Solve problem 4.5 directly, over weights of the kernel's features, by an interior-point method.
 
     With a short length scale the kernel matrix is regular, so that a solver in double precision is good to 1e-8 too.
     """
@@ -116,7 +116,7 @@ def test_agrees_with_a_generic_qp_solver_over_kernel_weights(seed):
 
 @cache
 def ring_loading() -> ReferenceTrajectory:
-    """Four kinesthetic demonstrations of a robot arm that loads a bearing ring."""
+    """Return four kinesthetic demonstrations of a robot arm that loads a bearing ring."""
     with np.load(REAL_DATA) as file:
         demonstrations = pose_demonstrations(
             list(file["time"]), list(file["position"]), list(file["quaternion_wxyz"]), orientation="rotation_vector"
@@ -125,7 +125,7 @@ def ring_loading() -> ReferenceTrajectory:
 
 
 def real_problem(history, seed) -> Problem:
-    """Loading a bearing ring; ±1 cm around the mean as constraint."""
+    """Demonstrations of loading a bearing ring, with constraints ±1 cm around the mean."""
     reference = ring_loading()
     inside = reference.means.mean(axis=0)
     rng = np.random.default_rng(seed)
@@ -147,7 +147,7 @@ def real_problem(history, seed) -> Problem:
 @pytest.mark.skipif(not REAL_DATA.exists(), reason="the recordings are not part of the repository")
 @pytest.mark.parametrize("history", [0, 10])
 @pytest.mark.parametrize("seed", range(4))
-def test_solves_problem_4_5_on_real_demonstrations(history, seed):
+def test_predict_solves_problem_4_5_on_real_demonstrations(history, seed):
     problem = real_problem(history, seed)
     prediction = problem.solve()
     assert relative_error(problem, prediction, problem.dense()) < 1e-8
@@ -178,8 +178,8 @@ def arguments_of(p: LcNsKmp) -> dict:
     return {name: getattr(p, name) for name in names}
 
 
-def test_family_with_parts_switched_off():
-    """KMP (2.17), NS-KMP (4.4) and LC-KMP (4.2) are the same prediction without the parts they don't have."""
+def test_special_cases_are_the_other_members_of_the_family():
+    """KMP (2.17), NS-KMP (4.4) and LC-KMP (4.2) are special cases of the same prediction."""
     problem = random_problem(3)
     p, n = problem.primitive, problem.step
     arguments = {**arguments_of(p), "history": 0, "constraints": None, "lambda_": p.lambda_ + p.beta, "beta": 0.0}
@@ -205,7 +205,7 @@ def test_family_with_parts_switched_off():
 
 
 def small(**changes) -> dict:
-    """A plain primitive: two outputs, twenty steps, x ≤ 0.5."""
+    """Return a simple primitive: two outputs, twenty steps, x ≤ 0.5."""
     t = np.linspace(0, 1, 20)
     means = np.column_stack([t, np.sin(t)])
     covariances = np.tile(0.01 * np.eye(2), (20, 1, 1))
@@ -218,7 +218,7 @@ def small(**changes) -> dict:
     }
 
 
-def test_constraints_hold_from_the_next_step_on_even_where_the_history_violates_them():
+def test_constraints_hold_after_a_history_that_violates_them():
     p = LcNsKmp(**small(history=3))
     pushed_out = np.tile([0.8, 0.2], (3, 1))
     prediction = p.predict(8, np.zeros(2), pushed_out)
@@ -230,8 +230,8 @@ def test_constraints_hold_from_the_next_step_on_even_where_the_history_violates_
 @pytest.mark.parametrize("history", [0, 1, 10])
 @pytest.mark.parametrize("period", [0.02, 0.001])
 @pytest.mark.parametrize("history_variance", [1e-4, 1e-10])
-def test_bound_holds_under_hostile_actions(history, period, history_variance):
-    """Closed loop, actions far beyond any sensible gain, in one direction, alternating, and random."""
+def test_bounds_hold_under_extreme_actions(history, period, history_variance):
+    """Actions far beyond any sensible gain in the closed loop: constant, alternating and random."""
     t = period * np.arange(60)
     covariances = np.tile(np.diag([1e-6, 1e-2]), (60, 1, 1))
     reference = ReferenceTrajectory(t, np.column_stack([t, np.sin(t)]), covariances)
@@ -257,8 +257,8 @@ def test_bound_holds_under_hostile_actions(history, period, history_variance):
 )
 @pytest.mark.parametrize("period", [0.02, 0.001])
 @pytest.mark.parametrize("history", [0, 1, 10])
-def test_bound_holds_where_problems_are_badly_scaled(variances, period, history):
-    """Covariances from 1e-12 to 1, ρ = 1e-10, a millisecond's clock."""
+def test_bounds_hold_in_badly_scaled_problems(variances, period, history):
+    """Covariances from 1e-12 to 1, ρ = 1e-10, steps of a millisecond."""
     t = period * np.arange(60)
     means = np.column_stack([t, np.sin(40 * t)])
     if variances == "demonstrations that coincide":
@@ -282,7 +282,7 @@ def test_bound_holds_where_problems_are_badly_scaled(variances, period, history)
         past = np.vstack([past[1:], output]) if history else None
 
 
-def test_constraints_that_change_with_the_step_bind_where_they_apply():
+def test_constraints_of_each_step_apply_at_that_step():
     t = np.linspace(0, 1, 20)
     upper = np.where(t[:, None] < 0.5, np.inf, 0.3) * np.ones(2)
     upper[t < 0.5] = 10.0
@@ -292,21 +292,21 @@ def test_constraints_that_change_with_the_step_bind_where_they_apply():
     assert p.constraints.violation(np.array([0.4, 0.0]), 2) < 0 < p.constraints.violation(np.array([0.4, 0.0]), 15)
 
 
-def test_holds_the_last_mean_at_the_end():
+def test_predict_holds_the_last_mean_at_the_end():
     p = LcNsKmp(**small(constraints=None))
     np.testing.assert_array_equal(p.predict(19).output, p.predict(10_000).output)
     np.testing.assert_allclose(p.predict(19).output, p.reference.means[-1], atol=0.06)
 
 
-def test_passes_through_its_history():
-    """With ρ → 0 the window continues the history: the first point is nearer to it than the mean is."""
+def test_predict_passes_through_its_history():
+    """For ρ → 0 the window continues the history: its first point is closer to it than the mean."""
     p = LcNsKmp(**small(history=5, history_variance=1e-8, constraints=None))
     beside = p.reference.means[5:10] + np.array([0.05, 0])
     output = p.predict(10, np.zeros(2), beside).output
     assert abs(output[0] - (p.reference.means[10, 0] + 0.05)) < 0.005
 
 
-def test_a_history_that_rounding_hides_is_refused_before_anything_is_predicted():
+def test_constructor_refuses_a_history_hidden_by_rounding():
     t = 0.01 * np.arange(100)
     reference = ReferenceTrajectory(t, t[:, None], np.full((100, 1, 1), 1e-4))
     with pytest.raises(InputError, match="raise history_variance, or shorten the history"):
@@ -321,8 +321,8 @@ def test_a_history_that_rounding_hides_is_refused_before_anything_is_predicted()
         LinearConstraints(np.array([[0, 1.0], [0, 1.0], [0, 2.0], [0, -1.0]]), np.array([0.05, 0.05, 0.1, -0.05])),
     ],
 )
-def test_an_output_that_may_not_move_leaves_the_others_their_way(history, constraints):
-    """Bounds without room between them, once and said several times."""
+def test_fixed_output_does_not_affect_the_others(history, constraints):
+    """Equal lower and upper bounds, once and repeated."""
     t = np.linspace(0, 2, 200)
     reference = ReferenceTrajectory(t, np.column_stack([np.sin(t), 0.1 * t]), np.tile(1e-4 * np.eye(2), (200, 1, 1)))
     p = LcNsKmp(reference, history=history, constraints=constraints)
@@ -334,14 +334,14 @@ def test_an_output_that_may_not_move_leaves_the_others_their_way(history, constr
     assert output[0] == pytest.approx(reference.means[-1, 0], abs=0.02)
 
 
-def test_a_trajectory_does_not_follow_the_callers_array():
+def test_trajectory_does_not_alias_the_callers_array():
     p, action = LcNsKmp(**small()), np.array([0.1, 0.1])
     prediction, expected = p.predict(5, action), p.predict(5, action.copy()).trajectory.copy()
     action[:] = 1e3
     np.testing.assert_array_equal(prediction.trajectory, expected)
 
 
-def test_any_kernel_and_an_uneven_clock():
+def test_predict_accepts_any_kernel_and_an_uneven_clock():
     t = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.1, 30))
     reference = ReferenceTrajectory(t, np.column_stack([np.sin(t)]), np.full((30, 1, 1), 1e-4))
     p = LcNsKmp(reference, kernel=Matern52(0.3), horizon=10)
@@ -349,8 +349,8 @@ def test_any_kernel_and_an_uneven_clock():
     np.testing.assert_allclose(outputs, np.sin(t), atol=0.05)
 
 
-def test_driven_by_inputs_of_its_own():
-    """The direct path says what the clock's says, and takes inputs of any dimension."""
+def test_predict_at_accepts_other_inputs():
+    """`predict_at` agrees with `predict` on the clock, and accepts inputs of any dimension."""
     p = LcNsKmp(**small(history=2))
     steps, past = np.arange(8, 17), p.reference.means[6:8]
     args = p.reference.means[steps], p.reference.covariances[steps], np.ones(2) * 5, past
@@ -369,7 +369,7 @@ def test_driven_by_inputs_of_its_own():
         p.predict_at(states[steps] * np.nan, *args, states[6:8])
 
 
-def test_memory_stays_within_its_limit():
+def test_cache_stays_within_its_limit():
     p = LcNsKmp(**small(cache_bytes=20_000))
     for n in list(range(20)) * 3:
         p.predict(n)
@@ -380,7 +380,7 @@ def test_memory_stays_within_its_limit():
     np.testing.assert_array_equal(p.predict(7).output, expected)
 
 
-def test_a_long_running_controller_allocates_nothing_that_stays():
+def test_predict_does_not_leak_memory():
     p = LcNsKmp(**small(history=3))
     past = p.reference.means[:3]
 
@@ -413,7 +413,7 @@ def test_a_long_running_controller_allocates_nothing_that_stays():
         ({"history": -1}, "numbers of steps"),
     ],
 )
-def test_refuses_at_construction(changes, names):
+def test_constructor_refuses_invalid_arguments(changes, names):
     with pytest.raises(InputError, match=names):
         LcNsKmp(**small(**changes))
 
@@ -432,6 +432,6 @@ def test_refuses_at_construction(changes, names):
         (0, np.zeros(2), np.full((3, 2), np.nan), "finite"),
     ],
 )
-def test_refuses_at_prediction(step, action, history, names):
+def test_predict_refuses_invalid_arguments(step, action, history, names):
     with pytest.raises(InputError, match=names):
         LcNsKmp(**small(history=3)).predict(step, action, history)

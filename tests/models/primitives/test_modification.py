@@ -1,4 +1,4 @@
-"""Null-space actions at several points, and the whole motion: equations 4.17 and 4.18 against their printed form."""
+"""Modified windows and trajectories match the printed equations 4.17 and 4.18."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def dense(problem, step, horizon, at, actions):
-    """The textbook's window from `step` on, its actions at the steps `at`."""
+    """Return the dense window from `step` on, with actions at the steps `at`."""
     p = problem.primitive
     P, dt = p.history, p.reference.times[1] - p.reference.times[0]
     held = np.minimum(np.arange(step, step + horizon + 1), p.num_steps - 1)
@@ -37,13 +37,13 @@ def dense(problem, step, horizon, at, actions):
 
 
 def spread(rng, first, horizon, most=4):
-    """A few different steps of a window, in any order, far enough from each other for a kernel of a second's width."""
+    """Draw different steps of a window, in any order, with distances suited to a kernel of a second's width."""
     places = np.arange(first, first + horizon + 1, 12)
     return rng.permutation(places)[: rng.integers(1, most + 1)]
 
 
 def check(problem, found, expected, constraints):
-    """As the textbook at the same multipliers; inside, complementary, and none negative."""
+    """The window equals the dense one at the same multipliers and satisfies the KKT conditions."""
     scale = np.abs(problem.primitive.reference.means).max(axis=0)
     G, c = constraints
     assert found.multipliers.shape == c.shape
@@ -58,7 +58,7 @@ def check(problem, found, expected, constraints):
 
 
 @given(SEEDS)
-def test_a_window_under_several_actions_is_equation_4_18(seed):
+def test_modified_window_matches_equation_4_18(seed):
     problem = random_problem(seed, box=bool(seed % 2))
     p, rng = problem.primitive, np.random.default_rng(seed)
     at = spread(rng, problem.step, p.horizon)
@@ -69,7 +69,7 @@ def test_a_window_under_several_actions_is_equation_4_18(seed):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_whole_motion_is_one_problem_over_all_steps(seed):
+def test_modified_trajectory_is_one_problem_over_all_steps(seed):
     problem = random_problem(seed, box=bool(seed % 2))
     p, rng = problem.primitive, np.random.default_rng(seed)
     problem.history = np.tile(p.reference.means[0], (p.history, 1)) if p.history else None
@@ -83,7 +83,7 @@ def test_the_whole_motion_is_one_problem_over_all_steps(seed):
 
 
 @given(SEEDS)
-def test_one_action_at_the_executed_point_is_what_predict_says(seed):
+def test_modified_window_with_one_action_equals_predict(seed):
     problem = random_problem(seed)
     scale = np.abs(problem.primitive.reference.means).max(axis=0)
     one = problem.primitive.modified_window(problem.step, [problem.step], problem.action, problem.history)
@@ -103,7 +103,7 @@ def plain(steps=40, deviation=0.1, **changes):
     return LcNsKmp(reference, **{"horizon": 15, **changes})
 
 
-def test_actions_add_up_where_nothing_binds():
+def test_actions_add_up_without_active_constraints():
     p = plain(history=3, history_variance=1e-4)
     past = p.reference.means[7:10]
     a, b = np.array([30.0, -5.0]), np.array([-10.0, 20.0])
@@ -115,8 +115,8 @@ def test_actions_add_up_where_nothing_binds():
     assert np.abs(first).max() > 1e-3
 
 
-def test_actions_at_every_point_are_taken_as_they_are():
-    """K̲ is then K itself, and cancels: β Σ A ξ̂, however rough the actions are."""
+def test_actions_at_every_point_are_not_interpolated():
+    """K̲ equals K and cancels: the result is β Σ A ξ̂, however rough the actions are."""
     p = plain(kernel=SquaredExponential(0.4))
     rng = np.random.default_rng(0)
     order = rng.permutation(40)
@@ -128,8 +128,8 @@ def test_actions_at_every_point_are_taken_as_they_are():
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
-def test_where_demonstrations_say_nothing_the_motion_goes_through_the_actions():
-    """The wider the demonstrations, the more of β/ħ of the way."""
+def test_motion_follows_actions_where_covariance_is_large():
+    """The displacement approaches β/ħ of the action as the covariance grows."""
     p = plain(deviation=1e4, lambda_=0.06, beta=5.94)
     at, actions = [5, 18, 33], np.array([[1.0, 2.0], [-1.0, 0.5], [0.0, -2.0]])
     found = p.modified_trajectory(at, actions).trajectory[at]
@@ -141,8 +141,8 @@ def test_where_demonstrations_say_nothing_the_motion_goes_through_the_actions():
 
 @settings(max_examples=settings().max_examples // 2)  # each takes a tenth of a second
 @given(SEEDS)
-def test_the_whole_motion_keeps_the_constraints_everywhere(seed):
-    """Whatever is asked for, anywhere: bounds that differ from step to step, and actions beyond any reason."""
+def test_modified_trajectory_satisfies_all_constraints(seed):
+    """Bounds that differ from step to step hold under extreme actions at any points."""
     rng = np.random.default_rng(seed)
     t = 0.05 * np.arange(40)
     means = np.column_stack([np.sin(t), t])
@@ -154,7 +154,7 @@ def test_the_whole_motion_keeps_the_constraints_everywhere(seed):
     assert (np.abs(found.trajectory - means) <= width + 1e-9).all()
 
 
-def test_a_trajectory_outside_is_refused_whoever_solved_for_it():
+def test_trajectory_outside_the_constraints_is_refused():
     SOLVERS["lazy"] = lambda rows, lower, upper: (np.zeros(rows.shape[1]), np.zeros(len(rows)))
     try:
         p = plain(constraints=LinearConstraints.box([-np.inf, -np.inf], [0.5, np.inf]), solver="lazy")
@@ -167,7 +167,7 @@ def test_a_trajectory_outside_is_refused_whoever_solved_for_it():
     p.predict(0)  # its own window is below the bound at the executed point
 
 
-def test_past_the_end_the_window_is_the_last_ones():
+def test_window_past_the_end_is_the_last_one():
     p = plain()
     for step in (39, 45):
         found = p.modified_window(step, [39, 50], np.ones((2, 2)))
@@ -193,12 +193,12 @@ def test_past_the_end_the_window_is_the_last_ones():
         (np.arange(10, 25), np.ones((15, 2)), "cannot separate them"),
     ],
 )
-def test_refuses(at, actions, said):
+def test_modified_window_refuses_invalid_actions(at, actions, said):
     with pytest.raises(InputError, match=said):
         plain().modified_window(10, at, actions)
 
 
-def test_refuses_a_history_that_does_not_fit_and_steps_before_the_first():
+def test_modified_window_refuses_invalid_history_and_step():
     with pytest.raises(InputError, match="history"):
         plain(history=2).modified_trajectory([0], [[1.0, 1.0]])
     with pytest.raises(InputError, match="no history"):

@@ -7,7 +7,7 @@ from guiderail.models.primitives import pose_demonstrations, pose_outputs, pose_
 
 
 def turning(total, n=60, axis=(0.0, 0.0, 1.0), flips=True):
-    """A turn about an axis, with quaternions whose sign flips as a driver's may."""
+    """Return a rotation about an axis, with quaternions of alternating sign."""
     rotations = Rotation.from_rotvec(np.outer(np.linspace(0, total, n), axis))
     quaternions = rotations.as_quat(scalar_first=True)
     if flips:
@@ -17,7 +17,7 @@ def turning(total, n=60, axis=(0.0, 0.0, 1.0), flips=True):
 
 @pytest.mark.parametrize("orientation", ["euler_zyx", "rotation_vector"])
 @pytest.mark.parametrize("total", [np.pi / 2, 1.2 * np.pi, 3.5 * np.pi])
-def test_no_jumps_and_the_same_rotation(orientation, total):
+def test_outputs_are_continuous_and_keep_the_rotation(orientation, total):
     positions, quaternions = turning(total)
     outputs = pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], orientation)
     assert np.abs(np.diff(outputs[:, 3:], axis=0)).max() < 2 * total / 59
@@ -25,8 +25,8 @@ def test_no_jumps_and_the_same_rotation(orientation, total):
     assert difference.magnitude().max() < 1e-9
 
 
-def test_target_frame():
-    """The target's own pose is zero; a point one unit ahead of the target is ahead in its frame."""
+def test_outputs_are_relative_to_the_target_frame():
+    """The target's pose is zero; a point one unit ahead of the target is ahead in its frame."""
     R_WT = Rotation.from_euler("z", 90, degrees=True)
     q = R_WT.as_quat(scalar_first=True)
     p_WT = np.array([1.0, 2.0, 3.0])
@@ -35,7 +35,7 @@ def test_target_frame():
 
 
 def test_demonstrations_share_a_branch():
-    """Two recordings of one motion near a half turn, one of which starts just beyond it."""
+    """Two recordings of one motion near a half turn, one of which starts beyond it."""
     n = 40
     position = np.zeros((n, 3))
     first = Rotation.from_rotvec(np.outer(np.linspace(3.10, 2.0, n), [0, 0, 1])).as_quat(scalar_first=True)
@@ -47,8 +47,8 @@ def test_demonstrations_share_a_branch():
         assert abs(d.outputs[0][0, column] - d.outputs[1][0, column]) < 0.1
 
 
-def test_a_branch_is_the_nearest_full_turn():
-    """A motion that starts where angles of more than a half turn say so: no less, and no half turn of them."""
+def test_branch_is_the_nearest_full_turn():
+    """Start a motion at angles of more than a half turn, and keep their branch."""
     position, quaternions = turning(0.4)
     for turns in (-2, -1, 0, 1, 3):
         near = np.array([2 * np.pi * turns + 2.0, 0.0, 0.0])
@@ -56,8 +56,8 @@ def test_a_branch_is_the_nearest_full_turn():
         np.testing.assert_allclose(outputs[0, 3:], [2 * np.pi * turns, 0, 0], atol=1e-12)
 
 
-def test_the_first_demonstration_decides_the_branch_of_all():
-    """Each starts a sixth of a turn further than the one before: the fifth is more than half a turn from the first."""
+def test_first_demonstration_determines_the_branch():
+    """Each demonstration starts a sixth of a turn further: the fifth is more than half a turn from the first."""
     n, starts = 5, np.deg2rad([170.0, 110.0, 50.0])
     quaternions = [
         Rotation.from_rotvec(np.outer(np.linspace(start, start - 0.1, n), [0, 0, 1])).as_quat(scalar_first=True)
@@ -67,20 +67,20 @@ def test_the_first_demonstration_decides_the_branch_of_all():
     assert [round(np.rad2deg(y[0, 3])) for y in d.outputs] == [170, 110, 50, 345]
 
 
-def test_lists_are_poses_too():
+def test_pose_outputs_accept_lists():
     positions, quaternions = turning(1.0)
     from_arrays = pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0])
     from_lists = pose_outputs(positions.tolist(), quaternions.tolist(), [0, 0, 0], [1, 0, 0, 0])
     np.testing.assert_array_equal(from_lists, from_arrays)
 
 
-def test_last_pose_is_the_target_unless_given():
+def test_target_is_the_last_pose_by_default():
     positions, quaternions = turning(1.0)
     d = pose_demonstrations([np.arange(60)], [positions], [quaternions])
     np.testing.assert_allclose(d.outputs[0][-1], 0, atol=1e-12)
 
 
-def test_refuses():
+def test_pose_outputs_refuse_invalid_poses():
     positions, quaternions = turning(1.0)
     with pytest.raises(InputError, match="singular"):
         pose_outputs(*turning(np.pi / 2, axis=(0, 1, 0)), np.zeros(3), [1, 0, 0, 0])

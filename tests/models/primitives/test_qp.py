@@ -1,4 +1,4 @@
-"""The quadratic program by its own conditions, whoever solves it; and what is said where nothing solves it."""
+"""Every solver meets the KKT conditions of the quadratic program or raises an error."""
 
 import sys
 
@@ -18,7 +18,7 @@ DISTANCE = {"daqp": 1e-10, "piqp": 1e-8, "osqp": 1e-6}
 
 @st.composite
 def problems(draw):
-    """Rows of unit length with bounds on either side or both, some of them as narrow as a point, and a scale."""
+    """Draw rows of unit length with one-sided, two-sided and equal bounds, and a scale."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     size, rows = draw(st.integers(1, 8)), draw(st.integers(1, 8))
     A = rng.standard_normal((rows, size))
@@ -38,7 +38,7 @@ def problems(draw):
 
 @pytest.mark.parametrize("name", SOLVERS)
 @given(problem=problems())
-def test_the_solution_is_inside_and_pushed_by_active_bounds_alone(name, problem):
+def test_solution_satisfies_the_kkt_conditions(name, problem):
     A, lower, upper = problem
     size = max(lower.max(), -upper.min())
     v, multipliers = solve_least_norm(A, lower, upper, SOLVERS[name])
@@ -54,7 +54,7 @@ def test_the_solution_is_inside_and_pushed_by_active_bounds_alone(name, problem)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_a_single_bound_is_met_by_the_shortest_way(name):
+def test_single_bound_is_met_by_the_shortest_correction(name):
     row = np.array([[0.6, 0.8]])
     for lower, upper, expected in ((2.0, np.inf, 2.0), (-np.inf, -3.0, -3.0), (2.0, 2.5, 2.0), (-9.0, -3.0, -3.0)):
         v, multipliers = solve_least_norm(row, np.array([lower]), np.array([upper]), SOLVERS[name])
@@ -64,7 +64,7 @@ def test_a_single_bound_is_met_by_the_shortest_way(name):
 
 @pytest.mark.parametrize("name", SOLVERS)
 @given(seed=st.integers(0, 2**32 - 1), gap=st.sampled_from([1e-3, 0.1, 10.0]))
-def test_what_has_no_solution_is_never_given_one(name, seed, gap):
+def test_infeasible_problem_raises_unsolvable_error(name, seed, gap):
     rng = np.random.default_rng(seed)
     row = rng.standard_normal(4)
     row /= np.linalg.norm(row)
@@ -79,13 +79,13 @@ def test_what_has_no_solution_is_never_given_one(name, seed, gap):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_a_solver_says_nothing_of_its_own(name, capfd):
+def test_solvers_print_nothing(name, capfd):
     solve_least_norm(np.eye(3), np.ones(3), np.full(3, 2.0), SOLVERS[name])
     assert capfd.readouterr() == ("", "")
 
 
 def test_daqp_solves_problems_of_many_bounds_at_once():
-    """A thousand nearly parallel directions: degenerate, and what long horizons are made of."""
+    """A thousand nearly parallel directions are degenerate, as those of long horizons."""
     angles = np.linspace(0, 1e-4, 1000)
     A = np.column_stack([np.cos(angles), np.sin(angles)])
     v, _ = solve_least_norm(A, np.ones(1000), np.full(1000, np.inf))
@@ -93,7 +93,7 @@ def test_daqp_solves_problems_of_many_bounds_at_once():
     assert np.linalg.norm(v) <= 1 + 1e-8
 
 
-def test_refuses_solvers_that_are_not_there(monkeypatch):
+def test_find_solver_refuses_missing_solvers(monkeypatch):
     with pytest.raises(InputError, match="choose one of daqp, piqp, osqp"):
         find_solver("magic")
     monkeypatch.setitem(sys.modules, "piqp", None)

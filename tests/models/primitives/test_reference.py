@@ -7,7 +7,7 @@ from guiderail.models.primitives.reference import Mixture, fit_mixture, regress
 
 
 def hourglass(num=9, n=120, seed=0):
-    """Demonstrations that are wide, narrow in the middle, and wide again."""
+    """Return demonstrations that are narrow in the middle."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 2, n)
     width = 0.1 * np.abs(t - 1) + 0.005
@@ -15,7 +15,7 @@ def hourglass(num=9, n=120, seed=0):
 
 
 @pytest.mark.parametrize("components", [8, None])
-def test_regression_recovers_mean_and_width(components):
+def test_regression_recovers_mean_and_deviation(components):
     d = hourglass(60)
     reference = ReferenceTrajectory.from_demonstrations(d, components)
     outputs = np.stack(d.outputs)
@@ -25,8 +25,8 @@ def test_regression_recovers_mean_and_width(components):
     assert wide == pytest.approx(outputs[:, 10, 0].std(), rel=0.3)
 
 
-def test_regression_gives_the_moments_of_the_mixture_at_an_instant():
-    """They are added up from the joint density, which is what conditioning means."""
+def test_regression_returns_the_moments_of_the_mixture():
+    """Compare with the moments of the joint density at a fixed time."""
     weights, means = np.array([0.3, 0.7]), np.array([[-0.5, 1.0], [0.8, -0.4]])
     covariances = np.array([[[0.4, 0.3], [0.3, 0.5]], [[0.2, -0.1], [-0.1, 0.3]]])
     center, scale = np.array([2.0, 0.1]), np.array([0.5, 3.0])
@@ -42,13 +42,13 @@ def test_regression_gives_the_moments_of_the_mixture_at_an_instant():
         assert covariance[0, 0] == pytest.approx(density @ (y - mean[0]) ** 2, rel=1e-9)
 
 
-def test_same_seed_same_reference():
+def test_reference_is_deterministic_for_a_seed():
     a, b = (ReferenceTrajectory.from_demonstrations(hourglass(), 6, seed=3) for _ in range(2))
     np.testing.assert_array_equal(a.covariances, b.covariances)
 
 
-def test_demonstrations_that_coincide_and_one_alone():
-    """EM's own regularization keeps them regular; a floor is what a person would set."""
+def test_reference_of_equal_or_single_demonstrations_needs_floor():
+    """EM's regularization keeps the covariance regular; a floor sets its scale."""
     t = np.linspace(0, 1, 50)
     same = Demonstrations(t, [np.column_stack([np.sin(t), np.zeros(50)])] * 3)
     assert (ReferenceTrajectory.from_demonstrations(same, 5).standard_deviations > 0).all()
@@ -57,7 +57,7 @@ def test_demonstrations_that_coincide_and_one_alone():
     assert ReferenceTrajectory.from_demonstrations(hourglass(1), 5).num_outputs == 2
 
 
-def test_clock_goes_on_beyond_its_ends():
+def test_inputs_are_extrapolated_beyond_the_ends():
     reference = ReferenceTrajectory([0, 1, 3], np.zeros((3, 1)), np.ones((3, 1, 1)))
     np.testing.assert_array_equal(reference.inputs(np.arange(-2, 5)), [-2, -1, 0, 1, 3, 5, 7])
     assert not reference.uniform
@@ -78,20 +78,20 @@ def test_clock_goes_on_beyond_its_ends():
         ([0.0, 1.0], [[0.0, 0.0]] * 2, [[[1.0, 0.5], [0.0, 1.0]]] * 2, "symmetric"),
     ],
 )
-def test_refuses(times, means, covariances, names):
+def test_constructor_refuses_invalid_references(times, means, covariances, names):
     with pytest.raises(InputError, match=names):
         ReferenceTrajectory(times, means, covariances)
 
 
-def test_refuses_senseless_mixtures():
+def test_from_demonstrations_refuses_invalid_mixtures():
     with pytest.raises(InputError, match="components"):
         ReferenceTrajectory.from_demonstrations(hourglass(), 0)
     with pytest.raises(InputError, match="floor"):
         ReferenceTrajectory.from_demonstrations(hourglass(), 5, floor=-1)
 
 
-def test_far_from_every_component_the_likeliest_goes_on():
-    """At an instant at which every density is zero to a computer, the mean goes on along a line of its component."""
+def test_regression_extrapolates_the_most_likely_component():
+    """If every density underflows, the mean continues along the line of one component."""
     times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
     mixture = fit_mixture(times, outputs, components=20, seed=0)
     far = np.array([-300.0, 300.0, 400.0])
@@ -101,23 +101,23 @@ def test_far_from_every_component_the_likeliest_goes_on():
     assert means[2, 0] - means[1, 0] == pytest.approx((means[2, 0] - means[0, 0]) / 7, rel=0.2)
 
 
-def test_half_as_many_components_as_steps_and_no_more():
+def test_components_are_limited_to_half_the_steps():
     times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
     assert len(fit_mixture(times, outputs, components=6, seed=0).weights) == 6
     with pytest.raises(InputError, match="components"):
         fit_mixture(times, outputs, components=7, seed=0)
 
 
-def test_of_two_numbers_of_components_the_better_is_taken():
-    """Four steps allow one or two: two levels that nothing lies between are two."""
+def test_fit_mixture_selects_the_better_number_of_components():
+    """Four steps allow one or two components; two separate levels need two."""
     rng = np.random.default_rng(0)
     outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
     assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2
 
 
 @pytest.mark.parametrize("height", [0.3, 0.5, 1.0, 0.1])
-def test_an_output_that_never_moves_has_the_same_spread_wherever_it_is(height):
-    """Whether the mean of many equal numbers is that number is a matter of rounding."""
+def test_constant_output_has_a_spread_independent_of_its_value(height):
+    """The mean of many equal numbers may differ from them by rounding."""
     rng = np.random.default_rng(0)
     t = np.linspace(0, 1, 50)
     outputs = [np.column_stack([np.sin(t + 0.05 * rng.normal()), np.full(50, height)]) for _ in range(3)]

@@ -1,4 +1,4 @@
-"""What a command is checked against before it is sent: the bound itself, and nothing that a solver says."""
+"""Commands are checked against the constraints, independently of the solver's status."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def primitive(constraints, steps=30, deviation=0.1, **changes):
-    """Two outputs near zero, and constraints that the actions of a test meet."""
+    """Return a primitive of two outputs near zero, with constraints that become active."""
     t = 0.02 * np.arange(steps)
     reference = ReferenceTrajectory(t, np.zeros((steps, 2)), np.tile(deviation**2 * np.eye(2), (steps, 1, 1)))
     return LcNsKmp(reference, **{"horizon": 8, "constraints": constraints, **changes})
@@ -31,8 +31,8 @@ UNIT_BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
 
 
 @given(st.floats(0, 1) | st.sampled_from([0.5, 1 - 1e-6, 1 - 1e-8, 1 - 5e-9]), SEEDS)
-def test_a_command_outside_is_refused_whoever_solved_for_it(share, seed):
-    """A solver that goes only part of the way: what it says is not what counts."""
+def test_command_outside_the_constraints_is_refused(share, seed):
+    """A solver that returns a part of the correction is detected."""
 
     def sloppy(rows, lower, upper):
         v, multipliers = SOLVERS["daqp"](rows, lower, upper)
@@ -60,7 +60,7 @@ def test_a_command_outside_is_refused_whoever_solved_for_it(share, seed):
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_a_command_that_is_no_number_is_refused(wrong):
+def test_command_with_nan_is_refused(wrong):
     SOLVERS["wrong"] = lambda rows, lower, upper: (np.full(rows.shape[1], wrong), np.zeros(len(rows)))
     try:
         p = primitive(UNIT_BOX, solver="wrong")
@@ -71,8 +71,8 @@ def test_a_command_that_is_no_number_is_refused(wrong):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_a_window_that_contradicts_itself_gives_no_command(solver):
-    """Above a plane at one step and below it at the next, which one kernel can't bend to."""
+def test_infeasible_window_raises_unsolvable_error(solver):
+    """Constraints that demand a jump between two steps are infeasible for a smooth kernel."""
     lower, upper = np.full((30, 2), -1e3), np.full((30, 2), 1e3)
     lower[11], upper[12] = 500.0, -500.0
     p = primitive(LinearConstraints.box(lower, upper), kernel=SquaredExponential(np.sqrt(5e4)), solver=solver)
@@ -83,8 +83,8 @@ def test_a_window_that_contradicts_itself_gives_no_command(solver):
 
 
 @given(SEEDS)
-def test_windows_between_planes_solve_problem_4_5(seed):
-    """As the textbook has it, multipliers of both sides included; feasible, complementary, and none negative."""
+def test_windows_between_parallel_planes_solve_problem_4_5(seed):
+    """The window equals the dense one, multipliers of both sides included, and satisfies the KKT conditions."""
     problem = random_problem(seed, box=True)
     scale = np.abs(problem.primitive.reference.means).max(axis=0)
     prediction = problem.solve()
@@ -101,7 +101,7 @@ def test_windows_between_planes_solve_problem_4_5(seed):
     np.testing.assert_allclose(prediction.output, prediction.trajectory[0], rtol=0, atol=1e-12)
 
 
-def test_each_side_of_a_box_has_its_own_multiplier():
+def test_box_sides_have_separate_multipliers():
     for side in (0, 1):
         for sign, row in ((1.0, 2 * side + 1), (-1.0, 2 * side)):
             action = np.zeros(2)
@@ -112,8 +112,8 @@ def test_each_side_of_a_box_has_its_own_multiplier():
             assert prediction.multipliers[0, np.arange(4) != row].max() == 0
 
 
-def test_constraints_that_repeat_or_oppose_each_other_are_all_kept():
-    """Rows that are each other's negative, some of them three times, some not at every step."""
+def test_repeated_and_opposite_constraints_are_satisfied():
+    """Opposite rows, some repeated three times, some opposite at a part of the steps only."""
     G = np.array([[1.0, 0], [-1, 0], [-1, 0], [1, 0], [0, 1], [0, -1], [0.0, 0.0]])
     c = np.array([-0.4, -0.7, -0.3, -0.9, -0.5, -0.2, -1.0])
     for varying in (False, True):
@@ -129,8 +129,8 @@ def test_constraints_that_repeat_or_oppose_each_other_are_all_kept():
 
 
 @given(SEEDS)
-def test_what_a_bound_is_tightened_by_a_command_moves_by(seed):
-    """Twice the units of everything, and twice the command: nothing in the law has a unit of its own."""
+def test_command_moves_with_a_tightened_bound(seed):
+    """Scaling all units by two scales the command by two: the law has no unit of its own."""
     rng = np.random.default_rng(seed)
     t = 0.02 * np.arange(30)
     means = np.cumsum(0.01 * rng.standard_normal((30, 2)), axis=0)
@@ -155,7 +155,7 @@ def test_what_a_bound_is_tightened_by_a_command_moves_by(seed):
     np.testing.assert_allclose(output(1000.0), 1000 * output(1.0), rtol=1e-6, atol=1e-6)
 
 
-def test_a_bound_may_be_as_tight_as_a_point():
+def test_bounds_may_leave_a_single_point():
     p = primitive(LinearConstraints.box([0.25, -1.0], [0.25, 1.0]), horizon=0)
     for action in (np.zeros(2), np.array([1e4, 1e4])):
         prediction = p.predict(4, action)
@@ -163,8 +163,8 @@ def test_a_bound_may_be_as_tight_as_a_point():
         assert prediction.constrained
 
 
-def test_a_window_stops_at_the_end_and_the_clock_goes_on():
-    """Steps past the end are the last one again, for constraints and means alike."""
+def test_window_at_the_end_extrapolates_the_clock():
+    """Steps past the end repeat the last one, for constraints and means."""
     steps = 30
     lower, upper = np.full((steps, 2), -1.0), np.full((steps, 2), 1.0)
     upper[-1] = -0.5
@@ -178,8 +178,8 @@ def test_a_window_stops_at_the_end_and_the_clock_goes_on():
     assert p.predict(0, np.array([1e4, 0.0])).output[0] == pytest.approx(1.0, abs=1e-9)
 
 
-def test_every_window_has_features_of_its_own_where_the_clock_is_uneven():
-    """With an uneven clock, or a kernel that is not stationary, no window is like the one before."""
+def test_features_differ_per_window_on_an_uneven_clock():
+    """With an uneven clock or a nonstationary kernel, every window has its own features."""
     t = np.cumsum(np.linspace(0.01, 0.1, 30))
     means = np.column_stack([np.sin(t), np.cos(t)])
     reference = ReferenceTrajectory(t, means, np.tile(1e-4 * np.eye(2), (30, 1, 1)))
@@ -193,7 +193,7 @@ def test_every_window_has_features_of_its_own_where_the_clock_is_uneven():
 
 
 class Moving(SquaredExponential):
-    """A kernel that depends on where it is."""
+    """Nonstationary kernel."""
 
     stationary = False
 
@@ -201,7 +201,7 @@ class Moving(SquaredExponential):
         return super().__call__(a, b) * np.multiply.outer(1 + a, 1 + b)
 
 
-def test_a_kernel_that_is_not_stationary_is_evaluated_where_it_is():
+def test_features_differ_per_window_for_nonstationary_kernels():
     t = 0.02 * np.arange(30)
     means = np.column_stack([np.sin(t), np.cos(t)])
     reference = ReferenceTrajectory(t, means, np.tile(1e-2 * np.eye(2), (30, 1, 1)))
@@ -212,8 +212,8 @@ def test_a_kernel_that_is_not_stationary_is_evaluated_where_it_is():
 
 
 @pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.5)])
-def test_the_history_is_where_the_clock_was(kernel):
-    """A history of three, at the three steps before: as the same points named one by one."""
+def test_history_inputs_are_on_the_clock(kernel):
+    """A history of three equals the same points given to `predict_at`."""
     t = 0.1 * np.arange(12)
     means = np.column_stack([np.sin(t), np.cos(t)])
     covariances = np.tile(1e-2 * np.eye(2), (12, 1, 1))
@@ -228,7 +228,7 @@ def test_the_history_is_where_the_clock_was(kernel):
     np.testing.assert_allclose(early, at, rtol=0, atol=1e-12)
 
 
-def test_predict_at_refuses_what_does_not_fit():
+def test_predict_at_refuses_invalid_arguments():
     p = primitive(UNIT_BOX)
     t, means, covariances = np.linspace(0, 1, 4), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1))
     p.predict_at(t, means, covariances)
@@ -248,7 +248,7 @@ def test_predict_at_refuses_what_does_not_fit():
         stepwise.predict_at(t, means, covariances)
 
 
-def test_linear_response_is_the_prediction_where_nothing_binds():
+def test_linear_response_equals_the_unconstrained_prediction():
     p = primitive(LinearConstraints.box([-1e3, -1e3], [1e3, 1e3]), history=3, history_variance=1e-4)
     rng = np.random.default_rng(0)
     past, action = 0.1 * rng.standard_normal((3, 2)), rng.standard_normal(2)
@@ -259,7 +259,7 @@ def test_linear_response_is_the_prediction_where_nothing_binds():
         np.testing.assert_allclose(p.predict(step, action, past).output, expected, rtol=0, atol=1e-13)
 
 
-def test_what_is_kept_is_counted_and_forgotten_oldest_first():
+def test_cache_counts_bytes_and_drops_the_oldest():
     one = primitive(None)
     one.predict(0)
     size = one.cached_bytes

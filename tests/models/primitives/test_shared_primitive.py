@@ -21,7 +21,7 @@ def box(half=0.9):
     return LinearConstraints.box([-half, -half], [half, half])
 
 
-def test_the_same_numbers_are_one_primitive_while_somebody_uses_it():
+def test_equal_arguments_share_a_primitive_in_use():
     first = get_shared_primitive(reference(), box(), KERNEL, history=2, lambda_=6)
     assert get_shared_primitive(reference(), box(), KERNEL, lambda_=6.0, history=2) is first
 
@@ -36,11 +36,11 @@ def test_the_same_numbers_are_one_primitive_while_somebody_uses_it():
         lambda: get_shared_primitive(reference(), box(), KERNEL, history=2, solver="osqp"),
     ],
 )
-def test_any_other_number_makes_another(other):
+def test_different_arguments_make_another_primitive(other):
     assert other() is not get_shared_primitive(reference(), box(), KERNEL, history=2)
 
 
-def test_it_answers_as_one_that_nobody_else_uses():
+def test_shared_primitive_predicts_as_its_own():
     shared = get_shared_primitive(reference(), box(), KERNEL, history=2)
     past, action = np.array([[0.0, 0.0], [0.01, 0.01]]), np.array([3.0, -2.0])
     shared.predict(7, -action, past)  # what was asked before does not matter
@@ -48,7 +48,7 @@ def test_it_answers_as_one_that_nobody_else_uses():
     np.testing.assert_array_equal(shared.predict(5, action, past).output, own.predict(5, action, past).output)
 
 
-def test_what_nobody_uses_is_not_kept():
+def test_unused_primitive_is_released():
     from guiderail.models.primitives.lc_ns_kmp import _SHARED
 
     get_shared_primitive(reference(1.7), box(), KERNEL)
@@ -56,6 +56,6 @@ def test_what_nobody_uses_is_not_kept():
     assert not [primitive for primitive in _SHARED.values() if primitive.reference.means[-1, 1] == 1.7]
 
 
-def test_what_a_primitive_refuses_is_refused():
+def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="lambda_"):
         get_shared_primitive(reference(), box(), KERNEL, lambda_=-1.0)
