@@ -42,6 +42,7 @@ GREEN, DARK, RED = (0, 150, 60), (28, 31, 36), (179, 38, 30)
 SCALE = 2  # supersampling of lines, which Pillow does not smooth
 LEARNING_EPISODES = 32  # as in `make demo`
 SCRATCH = tempfile.TemporaryDirectory()
+ON_ARM = {"guidance": "kgrl", "difficulty": "hard", "station": "arm"}
 
 
 @dataclass
@@ -188,6 +189,15 @@ def _learned(env: Any) -> PolicyFn:
         return Policy.load(out)
 
 
+def _learned_on_arm(env: Any) -> PolicyFn:
+    """Train KGRL on the hard connector with an arm, which takes some minutes."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        given = ON_ARM | {"reward": "aligned"}
+        start_or_resume("BncConnector", out, environment=given, settings={"symmetry": "near"}, episodes=60, seed=0)
+        return Policy.load(out)
+
+
 def _right(env: Any) -> PolicyFn:
     return BaselinePolicy(lambda rng, size: lambda observation: np.array([1.0, 0.0]), env)
 
@@ -219,7 +229,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "passage_methods": (
         lambda: [
             Panel(
-                "KGRL, white actions",
+                "KGRL, random actions",
                 "NarrowPassage",
                 {"guidance": "kgrl", "action_repeat": 10},
                 _random(1),
@@ -247,7 +257,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "passage_learned": (
         lambda: [
             Panel(
-                "before: demonstration alone", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, describe=_obstacle
+                "before learning", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, describe=_obstacle
             ),
             Panel(
                 f"after {LEARNING_EPISODES} episodes, sKGRL",
@@ -260,11 +270,19 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
         PASSAGE,
         None,
     ),
+    "connector_learned": (
+        lambda: [
+            Panel("before learning", "BncConnector", ON_ARM, zero_policy),
+            Panel("after 60 episodes, KGRL", "BncConnector", ON_ARM, _learned_on_arm),
+        ],
+        SQUARE,
+        8,
+    ),
     "connector": (
         lambda: [
-            Panel("the demonstration alone", "BncConnector", {"guidance": "kgrl"}, zero_policy),
+            Panel("demonstration", "BncConnector", {"guidance": "kgrl"}, zero_policy),
             Panel(
-                "KGRL, a rule by hand", "BncConnector", {"guidance": "kgrl"}, make_baseline("BncConnector", "scripted")
+                "scripted, through KGRL", "BncConnector", {"guidance": "kgrl"}, make_baseline("BncConnector", "scripted")
             ),
         ],
         SQUARE,
@@ -281,9 +299,9 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
                 describe=_within,
             )
             for title, guidance in (
-                ("a rule by hand, through KGRL", {"guidance": "kgrl"}),
-                ("sKGRL, adaptive history", {"guidance": "skgrl", "adaptive_history": True}),
-                ("residual, the same reach", {"guidance": "residual", "action_scale": 1.85}),
+                ("scripted, through KGRL", {"guidance": "kgrl"}),
+                ("scripted, through sKGRL", {"guidance": "skgrl", "adaptive_history": True}),
+                ("scripted, residual RL", {"guidance": "residual", "action_scale": 1.85}),
             )
         ],
         SQUARE,
@@ -291,11 +309,11 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "parts": (
         lambda: [
-            Panel("a bayonet: demonstration", partial(_created_task, "bayonet"), _with_offset(0.0), zero_policy),
+            Panel("bayonet", partial(_created_task, "bayonet"), _with_offset(0.0), zero_policy),
             Panel(
-                "the same, socket 1.5 mm beside", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy
+                "the same, 1.5 mm off", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy
             ),
-            Panel("a snap-fit: demonstration", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
+            Panel("snap-fit", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
         ],
         SQUARE,
         8,
@@ -303,7 +321,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "clamp": (
         lambda: [
             Panel("straight down", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "straight_descent")),
-            Panel("a rule that searches", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
+            Panel("scripted search", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
         ],
         SQUARE,
         3,
@@ -311,7 +329,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "pouring": (
         lambda: [
             Panel("random inputs", "Pouring", {"time_limit": 6.0}, _random(1)),
-            Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
+            Panel("scripted inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
         ],
         SQUARE,
         6,
