@@ -42,6 +42,7 @@ GREEN, DARK, RED = (0, 150, 60), (28, 31, 36), (179, 38, 30)
 SCALE = 2  # supersampling of lines, which Pillow does not smooth
 LEARNING_EPISODES = 32  # as in `make demo`
 SCRATCH = tempfile.TemporaryDirectory()
+ENDINGS = {"collision": "stopped by the force limit"}  # in pictures; other terminations are shown by name
 ON_ARM = {"guidance": "kgrl", "difficulty": "hard", "station": "arm"}
 
 
@@ -64,7 +65,7 @@ class Panel:
 
     def ending(self) -> str:
         """Return a short description of the ending."""
-        words = str(self.row["termination"]).replace("_", " ")
+        words = ENDINGS.get(self.row["termination"], str(self.row["termination"])).replace("_", " ")
         force = f", {self.row['peak_force']:.0f} N at most" if self.row["peak_force"] > 0 else ""
         return self.describe(self.row) if self.describe else f"{words}{force}"
 
