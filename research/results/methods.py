@@ -17,8 +17,8 @@ COLUMNS = (
     "max. commanded violation", "peak force held out (in training) [N]",
 )  # fmt: skip
 README_COLUMNS = (
-    "task (hard)", "guided [%]", "residual RL [%]", "scripted / random [%]", "training episodes",
-    "over-force, guided / residual",
+    "task", "guided, success [%]", "residual RL, success [%]", "scripted / random, success [%]",
+    "training episodes per seed (seeds)", "training episodes ended by force or collision, guided / residual [%]",
 )  # fmt: skip
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
@@ -84,7 +84,7 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("KGRL", "sKGRL, adaptive history"),
         ),
         Section(
-            "Connector, hard, trained with a finer contact model in Drake, evaluated in MuJoCo",
+            "Connector, hard, trained in Drake, evaluated in MuJoCo",
             [
                 Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
                 Row("KGRL, randomized contact", "connector_hard_fine", "kgrl_randomized", "MuJoCo"),
@@ -105,7 +105,7 @@ SECTIONS: dict[str, list[Section]] = {
             ],
         ),
         Section(
-            "Connector, a hidden offset per run",
+            "Connector, one unobserved offset per training run",
             [
                 Row("KGRL", "connector", "kgrl"),
                 Row("sKGRL", "connector", "skgrl"),
@@ -115,7 +115,7 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("KGRL", "sKGRL"),
         ),
         Section(
-            "Connector, a hidden offset per episode",
+            "Connector, another unobserved offset in every episode",
             [
                 Row("KGRL", "connector_disc", "kgrl"),
                 Row("sKGRL", "connector_disc", "skgrl"),
@@ -231,8 +231,9 @@ def readme_table(tables: Path) -> str:
                 "; ".join(f"{name.split(',')[0]} {_success(seeds)}" for name, seeds in guided),
                 _percent(residual),
                 f"{_percent(scripted)} / {_percent(random)}",
-                ", ".join(dict.fromkeys(f"{n:g}" for _, seeds in guided for n in seeds["training_episodes"])),
-                f"{_stopped(pd.concat([seeds for _, seeds in guided]))} / {_stopped(residual)}",
+                ", ".join(dict.fromkeys(f"{n:g}" for _, seeds in guided for n in seeds["training_episodes"]))
+                + f" ({len(guided[0][1])})",
+                f"{', '.join(_stopped(seeds) for _, seeds in guided)} / {_stopped(residual)}",
             )
         )
     return _markdown(README_COLUMNS, rows)
@@ -330,10 +331,11 @@ def _forces(parts: Sequence[pd.DataFrame]) -> str:
 
 
 def _success(seeds: pd.DataFrame) -> str:
-    """Return the mean success [%], with the range over seeds where they differ."""
+    """Return the mean success [%] with the range over several seeds; a single seed is marked."""
     rates = 100 * seeds["success_rate" if _is_evaluated(seeds) else "training_success_rate"].astype(float)
     span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
-    return f"{rates.mean():.0f}{span}"
+    is_single = len(seeds) == 1 and _is_trained(seeds)
+    return f"{rates.mean():.0f}{' (one seed)' if is_single else span}"
 
 
 def _percent(seeds: pd.DataFrame) -> str:
@@ -341,8 +343,8 @@ def _percent(seeds: pd.DataFrame) -> str:
 
 
 def _stopped(seeds: pd.DataFrame) -> str:
-    """Return how many training episodes of all seeds ended in a collision; a dash where that is unknown."""
+    """Return the share of training episodes of all seeds that ended in a collision [%]; a dash where it is unknown."""
     column = "training_ended_in_collision"
     if column not in seeds or seeds[column].isna().any():
         return "–"
-    return f"{seeds[column].sum():.0f} of {seeds['training_episodes'].sum():.0f}"
+    return f"{100 * seeds[column].sum() / seeds['training_episodes'].sum():.0f}"
