@@ -20,6 +20,8 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 if TYPE_CHECKING:
     import mujoco
 
+MAX_JOINT_SPEED = 1e3  # a faster joint is a failed simulation [m/s], [rad/s]
+
 
 def mujoco_engine() -> ModuleType:
     """Import and return the module `mujoco`.
@@ -229,6 +231,10 @@ class MujocoGantry(LeafSystem):
         following = np.concatenate([self._engine_state(), filtered])
         if not np.isfinite(following).all():
             raise DivergedError("the simulation failed in MuJoCo: its state is not finite")
+        if np.abs(data.qvel).max() > MAX_JOINT_SPEED:
+            raise DivergedError(
+                f"the simulation failed in MuJoCo: a joint is faster than {MAX_JOINT_SPEED:g} m/s or rad/s"
+            )
         discrete_state.set_value(self._state, following)
 
     def _check_warnings(self) -> None:

@@ -2,15 +2,17 @@
 
 import re
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 from pydrake.gym import DrakeGymEnv
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, PortDataType
+from pydrake.systems.framework import Context, Diagram, PortDataType
 
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
@@ -51,6 +53,10 @@ _SIMULATION_FAILURE = re.compile(
     r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE
 )
 
+# A state beyond these limits is a failed simulation: largest coordinate of a position [m], and largest joint speed
+# [m/s] or [rad/s], three times that of a ball that falls for the longest episode.
+MAX_POSITION, MAX_JOINT_SPEED = 10.0, 1e3
+
 
 class GuidedEnv(DrakeGymEnv):
     """Gymnasium environment that runs a `TaskDiagram`.
@@ -65,9 +71,12 @@ class GuidedEnv(DrakeGymEnv):
     the step [N]), `fallback` (True if guidance fell back to a safe command), every reward term by name (summed over the
     step), and `control_steps` since the reset. The `info` of a reset also has the values that the task sampled.
 
-    An episode that reaches the task's number of control steps is truncated with `termination` "time_limit". If the
-    simulation fails (a solver that does not converge, NaN), the episode is truncated with the last valid observation,
-    and `info["simulation_failure"]` is Drake's message; every other error is a bug and propagates.
+    An episode that reaches the task's number of control steps is truncated with `termination` "time_limit".
+
+    The simulation fails if Drake reports a solver that does not converge or NaN, while it advances the diagram or
+    evaluates a port, or if a pose or a joint speed is implausible. The failed control step is dropped, the episode is
+    truncated with the last valid observation, and `info["simulation_failure"]` is the message. After a reset that failed,
+    the first step truncates the episode. A failure before the first valid observation and every other error propagate.
 
     Attributes:
         task: The `TaskDiagram`.
@@ -137,13 +146,15 @@ class GuidedEnv(DrakeGymEnv):
         self._recorded = [(name, diagram.GetOutputPort(name)) for name in recorded]
         self._force_port = diagram.GetOutputPort("contact_force")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
+        self._plants = list(_plants(diagram))
         self._pose_port = diagram.GetOutputPort("pose")
         sizes = {name: port.size() for name, port in self._recorded}
         self.trace = EpisodeTrace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
         self.drawn: dict[str, Any] = {}
         self._control_steps = 0
         self._running = False
-        self._observation: np.ndarray | None = None
+        self._observation: np.ndarray | None = None  # the last valid one
+        self._failure: str | None = None  # message of the failed simulation
         self._violations = (-np.inf, -np.inf)
         self._closed = False
         self._release = weakref.finalize(self, release or _do_nothing)
@@ -183,22 +194,51 @@ class GuidedEnv(DrakeGymEnv):
         context = self.simulator.get_mutable_context()
         context.SetTimeStateAndParametersFrom(self._pristine)
         self._action_value.GetMutableData().set_value(self._neutral)
-        self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
-        self.simulator.Initialize()
+        self.drawn, self._failure = {}, None
+        with self._record_failure():
+            self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
+            self.simulator.Initialize()
         return self._begin_episode()
 
-    def _begin_episode(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the result of a reset; the simulator is initialized."""
+    def _begin_episode(self) -> tuple[np.ndarray | None, dict[str, Any]]:
+        """Return the result of a reset; the simulator is initialized, unless it failed."""
         context = self.simulator.get_context()
         self._control_steps = 0
         self.trace.clear()
         self._running = True
-        self._observation = self._observe(context)
-        now = {name: port.Eval(context) for name, port in self._recorded}
-        self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
+        self._violations = -np.inf, -np.inf
+        if self._failure is None:
+            with self._record_failure():
+                self._check_plausible(context, self._pose_port.Eval(context))
+                observation = self._observe(context)
+                now = {name: port.Eval(context) for name, port in self._recorded}
+                self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
+                self._observation = observation
         info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
-        info.update(self.drawn)
-        return self._observation, info
+        return self._observation, info | self.drawn
+
+    @contextmanager
+    def _record_failure(self) -> Iterator[None]:
+        """Store the message of a failed simulation in `_failure`; every other error propagates."""
+        try:
+            yield
+        except PolicyError:
+            raise  # a policy inside the diagram failed, not the simulation
+        except (RuntimeError, SystemExit) as error:
+            if self._observation is None or not _SIMULATION_FAILURE.search(str(error)):
+                raise
+            self._failure = str(error)
+
+    def _check_plausible(self, context: Context, pose: np.ndarray) -> None:
+        """Raise a `RuntimeError` if the measured pose (O,) or a joint speed cannot be that of a sound simulation."""
+        if not np.isfinite(pose).all():
+            raise RuntimeError("the measured pose is not finite")
+        if np.abs(pose[:3]).max() > MAX_POSITION:
+            raise RuntimeError(f"the simulation failed: the robot is at {pose[:3]} m")
+        for plant in self._plants:
+            speed = np.abs(plant.GetVelocities(plant.GetMyContextFromRoot(context))).max()
+            if not speed <= MAX_JOINT_SPEED:
+                raise RuntimeError(f"the simulation failed: a joint moves at {speed:g} m/s or rad/s")
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply `action` for `action_repeat` control steps, or until the episode ends.
@@ -210,59 +250,49 @@ class GuidedEnv(DrakeGymEnv):
         action = self._check_action(action)
         if not self._running:
             raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() first")
-        simulator = self.simulator
-        context = simulator.get_context()
+        context = self.simulator.get_context()
         self._action_value.GetMutableData().set_value(action)
 
         total = peak_force = 0.0
         commanded_violation = measured_violation = -np.inf
         terms = dict.fromkeys(self.task.reward_terms, 0.0)
-        termination = 0
-        fallback, failure = False, None
-        first_step = self._control_steps
-        for _ in range(self.action_repeat):
-            try:
+        termination, fallback = 0, False
+        first_step, last_step = self._control_steps, min(self._control_steps + self.action_repeat, self.task.num_steps)
+        while self._failure is None and not termination and self._control_steps < last_step:
+            with self._record_failure():
                 self._advance()
                 pose = self._pose_port.Eval(context)
-                if not np.isfinite(pose).all():
-                    failure = "the measured pose is not finite"
-            except PolicyError:
-                raise  # a policy inside the diagram failed, not the simulation
-            except (RuntimeError, SystemExit) as error:
-                if not _SIMULATION_FAILURE.search(str(error)):
-                    raise
-                failure = str(error)
-            if failure is not None:
-                break
+                self._check_plausible(context, pose)
+                reward = float(self._reward_port.Eval(context)[0])
+                force = float(self._force_port.Eval(context)[0])
+                now = {name: port.Eval(context) for name, port in self._recorded}
+                gained = [(name, float(port.Eval(context)[0])) for name, port in self._term_ports]
+                desired_pose = self._desired_pose_port.Eval(context)
+                reason = int(self._termination_port.Eval(context)[0])
+                if reason or self._control_steps + 1 == last_step:
+                    self._observation = self._observe(context)
+            if self._failure is not None:
+                break  # without this control step
             self._control_steps += 1
-            reward = float(self._reward_port.Eval(context)[0])
-            force = float(self._force_port.Eval(context)[0])
             total += reward
             peak_force = max(peak_force, force)
-            now = {name: port.Eval(context) for name, port in self._recorded}
             commanded_violation = max(commanded_violation, float(now["commanded_violation"][0]))
             measured_violation = max(measured_violation, float(now["measured_violation"][0]))
             fallback = fallback or bool(now["fallback"][0])
-            for name, port in self._term_ports:
-                terms[name] += float(port.Eval(context)[0])
-            self.trace.append(self._desired_pose_port.Eval(context), pose, force, reward, now)
-            termination = int(self._termination_port.Eval(context)[0])
-            if termination or self._control_steps == self.task.num_steps:
-                break
+            for name, value in gained:
+                terms[name] += value
+            self.trace.append(desired_pose, pose, force, reward, now)
+            termination = reason
 
         terminated = termination != 0
-        truncated = not terminated and (failure is not None or self._control_steps >= self.task.num_steps)
-        if truncated and failure is None:
+        truncated = not terminated and (self._failure is not None or self._control_steps >= self.task.num_steps)
+        if truncated and self._failure is None:
             termination = _TIME_LIMIT
         if self._control_steps == first_step:
             # The simulation failed before the first control step ended.
             commanded_violation, measured_violation = self._violations
         self._violations = commanded_violation, measured_violation
         info = self._info(termination, commanded_violation, measured_violation, peak_force, fallback, terms)
-        if failure is not None:
-            info["simulation_failure"] = failure
-        else:
-            self._observation = self._observe(context)
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 
@@ -329,6 +359,7 @@ class GuidedEnv(DrakeGymEnv):
         fallback: float,
         terms: Any,
     ) -> dict[str, Any]:
+        failure = {} if self._failure is None else {"simulation_failure": self._failure}
         return {
             "is_success": TERMINATIONS[termination] == "success",
             "termination": TERMINATIONS[termination],
@@ -338,7 +369,17 @@ class GuidedEnv(DrakeGymEnv):
             "fallback": fallback,
             "control_steps": self._control_steps,
             **terms,
+            **failure,
         }
+
+
+def _plants(diagram: Diagram) -> Iterator[MultibodyPlant]:
+    """Yield the plants in a diagram that have joints."""
+    for system in diagram.GetSystems():
+        if isinstance(system, Diagram):
+            yield from _plants(system)
+        elif isinstance(system, MultibodyPlant) and system.num_velocities():
+            yield system
 
 
 def _do_nothing() -> None:

@@ -171,7 +171,7 @@ class RobotEnv(GuidedEnv):
         simulator = Simulator(self.task.diagram)
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
         self._switch_station(simulator, self._task_station)
-        self.fault, self.drawn = Fault.NONE, drawn
+        self.fault, self.drawn, self._failure = Fault.NONE, drawn, None
         return self._begin_episode()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

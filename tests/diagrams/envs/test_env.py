@@ -7,6 +7,7 @@ from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from guiderail.diagrams.envs.env import INFO_KEYS, GuidedEnv
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.task_diagram import TaskDiagram, round_period
 from guiderail.models.common.errors import InputError
 
@@ -14,6 +15,7 @@ TICK = round_period(0.02)
 SUBSTEPS = 5
 PERIOD = SUBSTEPS * TICK
 SOLVER_FAILURE = "The SAP solver failed to converge at simulation time = 0.1."
+HESSIAN_FAILURE = "The Hessian of the momentum cost along the search direction is NaN."
 
 
 class Toy(LeafSystem):
@@ -25,6 +27,7 @@ class Toy(LeafSystem):
     def __init__(self):
         super().__init__()
         self.error: Exception | None = None
+        self.failing, self.fails_from = "", 0.0  # port, or "initialize", that fails from a time on [s]
         self.action = self.DeclareVectorInputPort("action", 1)
         self.state = self.DeclareDiscreteState(4)
         self.DeclareInitializationDiscreteUpdateEvent(self.initialize)
@@ -32,12 +35,11 @@ class Toy(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(TICK, 0.0, self.tick)
 
         def port(name, size, value):
-            self.DeclareVectorOutputPort(
-                name,
-                size,
-                lambda context, output: output.SetFromVector(np.atleast_1d(value(self.x(context)))),
-                prerequisites_of_calc={self.xd_ticket()},
-            )
+            def calc(context, output):
+                self.fail(name, context)
+                output.SetFromVector(np.atleast_1d(value(self.x(context))))
+
+            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={self.xd_ticket()})
 
         port("observation", 4, lambda x: x)
         port("reward", 1, lambda x: 2 * x[0] + 1)
@@ -54,7 +56,12 @@ class Toy(LeafSystem):
     def x(self, context):
         return context.get_discrete_state(self.state).value()
 
+    def fail(self, name, context):
+        if name == self.failing and context.get_time() >= self.fails_from - 1e-9:
+            raise RuntimeError(HESSIAN_FAILURE)
+
     def initialize(self, context, state):
+        self.fail("initialize", context)
         x = self.x(context).copy()
         x[1] = x[0]
         state.set_value(x)
@@ -81,6 +88,7 @@ def make(num_steps=20, **arguments):
         builder.ExportOutput(toy.get_output_port(i), toy.get_output_port(i).get_name())
 
     def randomize(context, rng, options):
+        toy.fail("randomize", context)
         start = options.get("start", rng.uniform(-0.5, -0.4))
         toy.GetMyMutableContextFromRoot(context).get_mutable_discrete_state(toy.state).SetAtIndex(0, start)
         return {"start": start}
@@ -244,6 +252,95 @@ def test_simulation_failure_truncates_with_the_last_observation(error):
     env.toy.error = None
     env.reset(options={"start": 0.0})
     assert env.step([1.0])[0][0] == np.float32(0.1)
+
+
+PORTS = [port.get_name() for port in map(Toy().get_output_port, range(Toy().num_output_ports()))]
+READ_AT_RESET = {"observation", "pose", "commanded_violation", "measured_violation", "fallback"}
+
+
+@pytest.mark.parametrize("port", PORTS)
+def test_failure_of_a_port_truncates_without_its_step(port):
+    env = make(action_repeat=3)
+    before, info = env.reset(options={"start": 0.0})
+    env.toy.failing, env.toy.fails_from = port, (3 if port == "observation" else 2) * PERIOD
+    after, reward, terminated, truncated, info = env.step([1.0])
+    steps = 2 if port == "observation" else 1  # the observation is read after the last control step only
+    assert (terminated, truncated, info["termination"]) == (False, True, "")
+    assert info["simulation_failure"] == HESSIAN_FAILURE
+    assert info["control_steps"] == len(env.trace) == steps
+    assert reward == pytest.approx([1.2, 2.6][steps - 1])
+    np.testing.assert_array_equal(after, before)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step([1.0])
+    env.toy.failing = ""
+    env.reset(options={"start": 0.0})
+    assert env.step([1.0])[0][0] == np.float32(0.3)
+
+
+@pytest.mark.parametrize("port", PORTS)
+def test_failure_of_a_port_outranks_a_termination(port):
+    env = make()
+    env.reset(options={"start": 0.9})
+    env.toy.failing, env.toy.fails_from = port, PERIOD
+    _, reward, terminated, truncated, info = env.step([1.0])
+    assert (reward, terminated, truncated, info["is_success"]) == (0.0, False, True, False)
+    assert info["simulation_failure"] == HESSIAN_FAILURE
+
+
+@pytest.mark.parametrize("place", [*PORTS, "randomize", "initialize"])
+def test_failure_of_a_reset_truncates_at_the_first_step(place):
+    env = make()
+    env.reset(options={"start": 0.0})
+    before, *_ = env.step([1.0])
+    env.toy.failing = place
+    observation, info = env.reset(options={"start": 0.5})
+    if place in {*READ_AT_RESET, "randomize", "initialize"}:
+        assert info["simulation_failure"] == HESSIAN_FAILURE
+        np.testing.assert_array_equal(observation, before)
+        env.toy.failing = ""
+    after, reward, terminated, truncated, info = env.step([1.0])
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info["simulation_failure"] == HESSIAN_FAILURE
+    assert info["control_steps"] == len(env.trace) == 0
+    np.testing.assert_array_equal(after, observation)
+    env.toy.failing = ""
+    assert "simulation_failure" not in env.reset(options={"start": 0.0})[1]
+    assert env.step([1.0])[0][0] == np.float32(0.1)
+
+
+@pytest.mark.parametrize("place", [*READ_AT_RESET, "randomize", "initialize"])
+def test_failure_before_the_first_observation_is_raised(place):
+    env = make()
+    env.toy.failing = place
+    with pytest.raises(RuntimeError, match="Hessian"):
+        env.reset()
+
+
+@pytest.mark.parametrize("position", [10.5, -10.5, 1e300, np.nan, np.inf])
+def test_implausible_position_is_a_failed_simulation(position):
+    env = make(action_repeat=2)
+    env.reset(options={"start": 0.0})
+    context = env.toy.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
+    context.get_mutable_discrete_state(env.toy.state).SetAtIndex(0, position)
+    _, reward, terminated, truncated, info = env.step([0.0])
+    assert (reward, terminated, truncated, info["control_steps"]) == (0.0, False, True, 0)
+    assert "the robot is at" in info["simulation_failure"] or "not finite" in info["simulation_failure"]
+
+
+def test_implausible_joint_speed_is_a_failed_simulation():
+    env = make_env("NarrowPassage")
+    env.reset(seed=0)
+    (plant,) = env._plants
+    context = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
+    plant.SetVelocities(context, np.full(plant.num_velocities(), 1e7))
+    *_, truncated, info = env.step(np.zeros(2))
+    assert truncated
+    assert info["simulation_failure"]
+    env.reset()
+    assert "simulation_failure" not in env.step(np.zeros(2))[-1]
+    plant.SetVelocities(context, np.array([0.0, -1001.0]))
+    with pytest.raises(RuntimeError, match="a joint moves at 1001"):
+        env._check_plausible(env.simulator.get_context(), np.zeros(2))
 
 
 @pytest.mark.parametrize("options", ["x", "", 3, [], [("start", 0.0)]])
