@@ -34,9 +34,6 @@ NOT_CHECKED = (
     "docs/changelog.md",
     "tests/models/",
     "tests/test_prose.py",
-    "tests/tools/",
-    "tools/datasets/",
-    "tools/parts/",
 )
 
 

@@ -1,4 +1,4 @@
-"""What others recorded comes in and goes out with its numbers; what a file doesn't say is asked for."""
+"""Tests of import and export: numbers are kept, and missing units and signals are asked for."""
 
 import json
 

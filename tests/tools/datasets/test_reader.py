@@ -75,7 +75,7 @@ def test_load_demonstrations_refuses_invalid_tables(tmp_path, text, words):
     with pytest.raises(InputError, match=words):
         load_demonstrations(tmp_path / "wrong.csv")
     with pytest.raises(InputError, match=words):
-        Demonstrations.load(tmp_path / "wrong.csv")  # whoever learns from it is told the same
+        Demonstrations.load(tmp_path / "wrong.csv")  # the same message as in training
 
 
 def test_folder_without_files_or_of_mixed_outputs_is_refused(tmp_path):

@@ -31,12 +31,12 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The simplest of the six; `learn_parts.py` beside it creates the tasks of all of them and learns them all of them."""
+    """Task folder of the simplest of the six parts of `learn_parts.py`."""
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
     call("create-task", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
     yield where / "peg"
-    # What was registered here is nobody else's.
+    # Other tests must not see the registered task.
     for name in [name for name in TASKS.names() if name.startswith("parts/")]:
         del TASKS._entries[name]
         gymnasium.registry.pop(environment_id(name), None)

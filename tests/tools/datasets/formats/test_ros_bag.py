@@ -1,4 +1,4 @@
-"""What a message says by names is read by its names; what no motion can be made of is refused in a sentence."""
+"""Tests of ROS 2 bags: joints are read by name, and messages without a motion are refused."""
 
 import numpy as np
 import pytest
