@@ -149,11 +149,8 @@ def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.nda
         rows, lower, upper = primitive.free_constraints(n)
         rank = next((len(one.correction) for one in predictions if one.correction is not None), 0)
         corrections = np.array([np.zeros(rank) if one.correction is None else one.correction for one in predictions])
-        free, outputs, sizes = (
-            actions @ rows.T,
-            np.array([one.output for one in predictions]),
-            primitive.output_sizes(n),
-        )
+        free, sizes = actions @ rows.T, primitive.output_sizes(n)
+        outputs = np.array([one.output for one in predictions])
         ranges = []
         for cell in cells:
             norms = [

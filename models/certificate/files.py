@@ -76,10 +76,12 @@ def certificate_files(
         "start_within": loop.start_within,
     }
     witness = {"active": certified.can_be_active, "multipliers": certified.multipliers}
+    if certified.budgeted is not None:
+        witness |= {f"lagrange_{key}": getattr(certified.budgeted, key) for key in ("steps", "outputs", "multipliers")}
     files = {
         PRIMITIVE: _npz(arrays),
         CONSTRAINTS: _npz({"G": constraints.G, "c": constraints.c}),
-        WITNESS: _npz(witness | _lagrange_multipliers(certified)),
+        WITNESS: _npz(witness),
     }
     claims: dict[str, Any] = {
         "format": FORMAT,
@@ -109,17 +111,6 @@ def certificate_files(
             claims[regime]["rest_force"] = float(np.linalg.norm(at_rest[:3]))
     claims["digest"] = digest(claims)
     return {**files, CERTIFICATE: json.dumps(claims).encode()}
-
-
-def _lagrange_multipliers(certified: CertifiedBounds) -> dict[str, np.ndarray]:
-    budgeted = certified.budgeted
-    if budgeted is None:
-        return {}
-    return {
-        "lagrange_steps": budgeted.steps,
-        "lagrange_outputs": budgeted.outputs,
-        "lagrange_multipliers": budgeted.multipliers,
-    }
 
 
 def digest(claims: Mapping[str, Any]) -> str:

@@ -49,7 +49,11 @@ class LinearConstraints:
         Raises:
             InputError: If a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.
         """
-        lower, upper = _broadcast(as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound"))
+        lower, upper = as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound")
+        try:
+            lower, upper = np.broadcast_arrays(lower, upper)
+        except ValueError as error:
+            raise InputError(f"box bounds must have the same shape, not {lower.shape} and {upper.shape}") from error
         if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
             raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
         if (lower > upper).any():
@@ -95,9 +99,8 @@ class LinearConstraints:
         """Return G (n, F, O) and c (n, F) at steps (n,); a step past the end has the constraints of the last one."""
         steps = np.asarray(steps)
         if self.G.ndim == 2:
-            return np.broadcast_to(self.G, (len(steps), *self.G.shape)), np.broadcast_to(
-                self.c, (len(steps), *self.c.shape)
-            )
+            G, c = (np.broadcast_to(values, (len(steps), *values.shape)) for values in (self.G, self.c))
+            return G, c
         steps = np.minimum(steps, self.G.shape[0] - 1)
         return self.G[steps], self.c[steps]
 
@@ -161,11 +164,3 @@ class LinearConstraints:
                     f"the constraints{where} contradict each other: no output satisfies all {self.num_constraints} of "
                     "them; loosen c or remove a row of G"
                 )
-
-
-def _broadcast(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        lower, upper = np.broadcast_arrays(lower, upper)
-    except ValueError as error:
-        raise InputError(f"box bounds must have the same shape, not {lower.shape} and {upper.shape}") from error
-    return lower, upper

@@ -94,10 +94,10 @@ SOLVERS: dict[str, Solver] = {"daqp": _daqp, "piqp": _piqp, "osqp": _osqp}
 
 
 def find_solver(name: str) -> Solver:
-    """The solver of that name.
+    """Return a solver by its name.
 
     Raises:
-        InputError: if there is none.
+        InputError: If there is none.
     """
     if name not in SOLVERS:
         raise InputError(f"there is no solver '{name}': choose one of {', '.join(SOLVERS)}")

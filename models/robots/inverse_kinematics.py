@@ -10,16 +10,12 @@ from pydrake.solvers import Solve
 from guiderail.models.common.errors import InputError
 
 STARTS = 10  # start postures of a search: the given one and random ones around it
+TOLERANCE = 1e-9  # tolerance of the pose, translation [m] and rotation [rad] together
 AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 
 
 def solve_inverse_kinematics(
-    plant: MultibodyPlant,
-    reference: Frame,
-    tool_center: Frame,
-    X: RigidTransform,
-    posture: np.ndarray,
-    tolerance: float = 1e-9,
+    plant: MultibodyPlant, reference: Frame, tool_center: Frame, X: RigidTransform, posture: np.ndarray
 ) -> np.ndarray:
     """Return the joint positions (n,) nearest to `posture` that put the tool center at X in the reference frame.
 
@@ -33,12 +29,11 @@ def solve_inverse_kinematics(
         tool_center: Frame to place at X.
         X: Pose of the tool center in the reference frame.
         posture: Joint positions (n,) [rad].
-        tolerance: Tolerance of the pose, translation [m] and rotation [rad] together.
 
     Raises:
         InputError: If the pose is out of reach, or reached only beyond the joint limits.
     """
-    problem = _Problem(plant, reference, tool_center, X, np.asarray(posture, dtype=float), tolerance)
+    problem = _Problem(plant, reference, tool_center, X, np.asarray(posture, dtype=float))
     solution = problem.search(within_limits=True)
     if solution is not None:
         return solution
@@ -52,16 +47,10 @@ class _Problem:
     """Inverse kinematics of one pose."""
 
     def __init__(
-        self,
-        plant: MultibodyPlant,
-        reference: Frame,
-        tool_center: Frame,
-        X: RigidTransform,
-        posture: np.ndarray,
-        tolerance: float,
+        self, plant: MultibodyPlant, reference: Frame, tool_center: Frame, X: RigidTransform, posture: np.ndarray
     ):
         self._plant, self._reference, self._tool_center = plant, reference, tool_center
-        self._X, self._posture, self._tolerance = X, posture, tolerance
+        self._X, self._posture = X, posture
         self._context = plant.CreateDefaultContext()
 
     def search(self, within_limits: bool) -> np.ndarray | None:
@@ -125,7 +114,7 @@ class _Problem:
             if not np.linalg.norm(moved_error) < np.linalg.norm(error):
                 break
             q, error = moved, moved_error
-        return q if np.linalg.norm(error) < self._tolerance else None
+        return q if np.linalg.norm(error) < TOLERANCE else None
 
     def _error_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the error from the pose at `q` to X, (6,) rotation first, and the Jacobian (6, n)."""

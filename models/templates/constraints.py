@@ -18,12 +18,12 @@ from typing_extensions import override
 from guiderail.models.templates.geometry import (
     WORLD,
     Frames,
-    angle_between,
     bearing,
     chord_angle,
     interpolate,
     largest,
     matrix_deg,
+    pose_distance,
     pose_in,
     with_position_in,
 )
@@ -41,8 +41,7 @@ class ActiveConstraint(ABC):
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
         """Return the distance of X_WE from its projection, the larger of [m] and [rad]; 0 if X_WE is allowed."""
-        X_WP = self.project(X_WE, frames)
-        return max(math.dist(X_WP.translation(), X_WE.translation()), angle_between(X_WP.rotation(), X_WE.rotation()))
+        return pose_distance(self.project(X_WE, frames), X_WE)
 
     @property
     def frame_names(self) -> tuple[str, ...]:

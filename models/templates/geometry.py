@@ -91,6 +91,11 @@ def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
     return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
 
 
+def pose_distance(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
+    """Return the distance of two poses, the larger of [m] and [rad]."""
+    return max(math.dist(X_WA.translation(), X_WB.translation()), angle_between(X_WA.rotation(), X_WB.rotation()))
+
+
 def largest(violations: Iterable[float]) -> float:
     """Return the largest violation, at least 0; NaN if any is NaN, which `max` would hide."""
     worst = 0.0

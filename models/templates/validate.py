@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from guiderail.models.templates.geometry import Frames, angle_between
+from guiderail.models.templates.geometry import Frames, pose_distance
 from guiderail.models.templates.template import SharedControlTemplate
 
 SAMPLES = 200  # poses of the end effector
@@ -97,7 +97,7 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
         for X, frames in scenes:
             X_WP = template.project(number, X, frames)
             outside += [c.violation(X_WP, frames) > TOLERANCE for c in state.active_constraints]
-            again = max(again, _difference(template.project(number, X_WP, frames), X_WP))
+            again = max(again, pose_distance(template.project(number, X_WP, frames), X_WP))
         for i in np.flatnonzero(outside).tolist():
             kind = type(state.active_constraints[i]).__name__
             if outside[i] == len(scenes):
@@ -110,14 +110,6 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
             yield Finding(True, f"{state.name}: active constraint {i + 1} ({kind}) {why}")
         if again > TOLERANCE and not outside.any():
             yield Finding(True, f"{state.name}: the constraints in their order are not idempotent ({again:.2g})")
-
-
-def _difference(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
-    """Return the distance of two poses, the larger of [m] and [rad]."""
-    return max(
-        float(np.linalg.norm(X_WA.translation() - X_WB.translation())),
-        angle_between(X_WA.rotation(), X_WB.rotation()),
-    )
 
 
 def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:

@@ -103,10 +103,11 @@ class SlotColumns:
     num_entry: int  # columns 0 … num_entry are the entry, which is open towards the mouth
 
 
-def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 14, num_end: int = 3) -> SlotColumns:
+def slot_columns(dimensions: BncDimensions) -> SlotColumns:
     """Return the walls that a mill of the slot's half width leaves along the lug's path."""
     d = dimensions
     radius, half_width = d.slot_radius, d.slot_half_width
+    num_entry, num_ramp, num_end = 6, 14, 3  # columns of each part
     knots = np.array(
         [
             [0.0, 0.0],
@@ -184,20 +185,20 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
     return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
 
 
-def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES, equal_area: bool = False) -> TriangleMesh:
+def bore_mesh(dimensions: BncDimensions, equal_area: bool = False) -> TriangleMesh:
     """Return the collision mesh of the barrel: the mouth's face, its chamfer and the bore.
 
     The bore is a polygon around the true circle, or with `equal_area` a polygon of the same area.
     """
     d = dimensions
-    corner = equal_area_radius(1.0, num_sides) if equal_area else 1.0 / float(np.cos(np.pi / num_sides))
+    corner = equal_area_radius(1.0, BORE_SIDES) if equal_area else 1.0 / float(np.cos(np.pi / BORE_SIDES))
     profile = [
         (d.ring_radius, 0.0),
         ((d.bore_radius + d.mouth_chamfer) * corner, 0.0),
         (d.bore_radius * corner, d.mouth_chamfer),
         (d.bore_radius * corner, d.ring_length),
     ]
-    return lathe(profile, num_sides)
+    return lathe(profile, BORE_SIDES)
 
 
 def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:

@@ -22,7 +22,6 @@ from guiderail.models.objects.triangle_mesh import equal_area_radius
 
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
-
 FRICTION = 0.2  # metal on metal
 # Without a margin the plug penetrates by its motion in a step of 10 ms, and the next step ejects it. With one, fast
 # sliding is decelerated by more than friction, depending on the step (`python -m research.benchmarks engines`).
@@ -53,19 +52,13 @@ def jack_sdf(
     """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
-    place, barrel = at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height)
-    collision_barrel = (
-        cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height) if equal_area else barrel
-    )
-    pad = (
-        at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2),
-        cylinder(d.pad_radius, d.pad_thickness),
-    )
+    place = at(z=d.barrel_height / 2)
+    radius = equal_area_radius(d.barrel_radius, barrel_sides(d)) if equal_area else d.barrel_radius
+    pad = (at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), cylinder(d.pad_radius, d.pad_thickness))
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", place, collision_barrel, barrel_material) + visual(
-        "barrel_visual", place, barrel, NICKEL
-    )
+    contents = collision("barrel", place, cylinder(radius, d.barrel_height), barrel_material)
+    contents += visual("barrel_visual", place, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
         lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
@@ -76,10 +69,7 @@ def jack_sdf(
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     """Return the plug's model: link `plug` is frame P, with geometry `bore`, `slots` and `seat`."""
     d, ring = dimensions, replace(RING, friction=friction)
-    seat = (
-        at(z=d.seat_height + d.seat_thickness / 2),
-        box(d.seat_width, d.seat_width, d.seat_thickness),
-    )
+    seat = (at(z=d.seat_height + d.seat_thickness / 2), box(d.seat_width, d.seat_width, d.seat_thickness))
     shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
     contents = collision("bore", at(), mesh("bnc_bore.obj"), ring)
     contents += collision("slots", at(), mesh("bnc_slots.obj"), ring)

@@ -17,18 +17,13 @@ PAD_STIFFNESS = 1.5e5  # [N/m]
 def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
     """Return the collision geometry of the jack in its frame J."""
     d = dimensions
-    barrel = Surface(
-        "barrel", "bore", Cylinder(d.barrel_radius, d.barrel_height), friction, (0.0, 0.0, d.barrel_height / 2)
-    )
-    pad_centre = d.barrel_height + d.pad_height - d.pad_thickness / 2
+    shape = Cylinder(d.barrel_radius, d.barrel_height)
+    barrel = Surface("barrel", "bore", shape, friction, (0.0, 0.0, d.barrel_height / 2))
+    shape, centre = Cylinder(d.pad_radius, d.pad_thickness), d.barrel_height + d.pad_height - d.pad_thickness / 2
     spring = Spring((0.0, 0.0, 1.0), PAD_STIFFNESS)
-    pad = Surface(
-        "pad", "pad", Cylinder(d.pad_radius, d.pad_thickness), PAD.friction, (0.0, 0.0, pad_centre), spring=spring
-    )
-    centre, shape = (
-        0.5 * (d.lug_tip_radius + d.lug_root_radius),
-        Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius),
-    )
+    pad = Surface("pad", "pad", shape, PAD.friction, (0.0, 0.0, centre), spring=spring)
+    centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
+    shape = Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius)
     lugs = [
         Surface(f"lug_{number}", "slots", shape, friction, (side * centre, 0.0, d.lug_height), pitch=np.pi / 2)
         for number, side in enumerate((1.0, -1.0))
