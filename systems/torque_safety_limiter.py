@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault, damping_torque
+from guiderail.models.control.joint_status import Fault, damping_torque
 from guiderail.systems.support.declarations import (
     check_period,
     declare_cache,
@@ -248,7 +248,7 @@ class TorqueSafetyLimiter(LeafSystem):
             )
         fault = self._present_fault.Eval(context)
         if fault:
-            raise InputError(f"the arm can't go on yet: {FAULT_DESCRIPTIONS[fault]}")
+            raise InputError(f"the arm can't go on yet: {fault.description}")
         context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:

@@ -1,7 +1,5 @@
 """Conversion to arrays of numbers, and the cross product of two vectors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses as six coordinates [x y z Rz Ry Rx], in which the thesis records and commands."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 

@@ -1,7 +1,5 @@
 """Plugin registry: entries by name, from this package, from entry points, or registered at runtime."""
 
-from __future__ import annotations
-
 import ast
 import difflib
 import re
@@ -24,6 +22,13 @@ class Registry(Generic[Entry]):
     Listing the names imports nothing; getting an entry imports its module. An entry is added by `register`, as a
     decorator or a call: in a module of `package`, which is found without being imported; in an installed package with
     an entry point of the group `entry_points`; or in any other file that is imported.
+
+    Args:
+        noun: Kind of the entries for messages, such as "task".
+        package: Import name of the package, or of each package, whose modules register entries.
+        decorator: Name of the function whose calls, with a name as first argument, register entries; the modules'
+            source is searched for it. Without it, all modules are imported at the first use.
+        entry_points: Group of entry points of further entries.
     """
 
     def __init__(
@@ -34,15 +39,6 @@ class Registry(Generic[Entry]):
         decorator: str | None = None,
         entry_points: str | None = None,
     ):
-        """Create an empty registry.
-
-        Args:
-            noun: Kind of the entries for messages, such as "task".
-            package: Import name of the package, or of each package, whose modules register entries.
-            decorator: Name of the function whose calls, with a name as first argument, register entries; the modules'
-                source is searched for it. Without it, all modules are imported at the first use.
-            entry_points: Group of entry points of further entries.
-        """
         self.noun = noun
         self._packages = (package,) if isinstance(package, str) else tuple(package)
         self._decorator, self._group = decorator, entry_points

@@ -3,8 +3,6 @@
 Vectors of six are [translational, rotational], and all quantities are expressed in one frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

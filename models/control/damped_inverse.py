@@ -1,13 +1,10 @@
 """Damped inverse kinematics: joint velocities for a tool velocity, bounded near singular postures."""
 
-from __future__ import annotations
-
 import numpy as np
 
 LEVER = 0.25  # distance from the tool center that converts rotational to translational velocities [m]
-REGULAR = (
-    0.03  # smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more
-)
+# Smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more.
+REGULAR = 0.03
 STILL = 1e-3  # desired tool speed up to which any motion is accepted [m/s]
 _SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])
 

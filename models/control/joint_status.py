@@ -1,7 +1,5 @@
 """Joint status of a robot arm: messages, plausibility checks, fault codes and damping torques."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -37,49 +35,38 @@ def damping_torque(
 
 
 class Fault(IntEnum):
-    """Reason for stopping the arm, in order of precedence."""
+    """Reason for stopping the arm, in order of precedence.
 
-    NONE = 0
-    NO_STATUS = 1
-    STALE = 2
-    OUT_OF_ORDER = 3
-    FUTURE = 4
-    MALFORMED = 5
-    WRONG_SIZE = 6
-    NOT_FINITE = 7
-    POSITION_JUMP = 8
-    VELOCITY_JUMP = 9
-    VELOCITY_LIMIT = 10
-    WORKSPACE_LIMIT = 11
-    FORCE_LIMIT = 12
-    EXTERNAL_TORQUE_LIMIT = 13
-    TORQUE_NOT_FINITE = 14
-    USER_STOP = 15
-    DEADLINE_MISSED = 16
-    MONITOR_STOP = 17
+    Attributes:
+        description: Description for messages.
+    """
 
+    description: str
 
-FAULT_DESCRIPTIONS = {
-    Fault.NONE: "no fault",
-    Fault.NO_STATUS: "no status message received, or too few",
-    Fault.STALE: "the newest status message is too old",
-    Fault.OUT_OF_ORDER: "a status message is older than its predecessor: the robot's clock was set back",
-    Fault.FUTURE: "a status message is in the future: the robot's clock has jumped",
-    Fault.MALFORMED: "a status message cannot be decoded",
-    Fault.WRONG_SIZE: "a status message has the wrong number of joints",
-    Fault.NOT_FINITE: "a status message contains NaN or infinity",
-    Fault.POSITION_JUMP: "a joint position changed faster than the joint can move",
-    Fault.VELOCITY_JUMP: "a joint velocity changed faster than the joint can accelerate",
-    Fault.VELOCITY_LIMIT: "a joint exceeds its velocity limit",
-    Fault.WORKSPACE_LIMIT: "the tool or its commanded pose is outside the workspace",
-    Fault.FORCE_LIMIT: "the force on the tool exceeds its limit",
-    Fault.EXTERNAL_TORQUE_LIMIT: "an external joint torque exceeds its limit",
-    Fault.TORQUE_NOT_FINITE: "a commanded torque is NaN or infinite",
-    Fault.USER_STOP: "stop requested by the user",
-    Fault.DEADLINE_MISSED: "the controller missed its deadline and sent no command in time",
-    Fault.MONITOR_STOP: "the safety monitor stopped the arm, or its heartbeat timed out",
-}
-"""Description of each fault, for messages."""
+    def __new__(cls, code: int, description: str = "") -> "Fault":
+        """Return a member with a code and a description."""
+        fault = int.__new__(cls, code)
+        fault._value_, fault.description = code, description
+        return fault
+
+    NONE = 0, "no fault"
+    NO_STATUS = 1, "no status message received, or too few"
+    STALE = 2, "the newest status message is too old"
+    OUT_OF_ORDER = 3, "a status message is older than its predecessor: the robot's clock was set back"
+    FUTURE = 4, "a status message is in the future: the robot's clock has jumped"
+    MALFORMED = 5, "a status message cannot be decoded"
+    WRONG_SIZE = 6, "a status message has the wrong number of joints"
+    NOT_FINITE = 7, "a status message contains NaN or infinity"
+    POSITION_JUMP = 8, "a joint position changed faster than the joint can move"
+    VELOCITY_JUMP = 9, "a joint velocity changed faster than the joint can accelerate"
+    VELOCITY_LIMIT = 10, "a joint exceeds its velocity limit"
+    WORKSPACE_LIMIT = 11, "the tool or its commanded pose is outside the workspace"
+    FORCE_LIMIT = 12, "the force on the tool exceeds its limit"
+    EXTERNAL_TORQUE_LIMIT = 13, "an external joint torque exceeds its limit"
+    TORQUE_NOT_FINITE = 14, "a commanded torque is NaN or infinite"
+    USER_STOP = 15, "stop requested by the user"
+    DEADLINE_MISSED = 16, "the controller missed its deadline and sent no command in time"
+    MONITOR_STOP = 17, "the safety monitor stopped the arm, or its heartbeat timed out"
 
 
 @dataclass(frozen=True)
@@ -98,7 +85,7 @@ class JointStatus:
     velocities: np.ndarray
     external_torque: np.ndarray
 
-    def __deepcopy__(self, memo: object) -> JointStatus:
+    def __deepcopy__(self, memo: object) -> "JointStatus":
         """Return the same immutable object, because Drake copies abstract values often."""
         return self
 
@@ -124,7 +111,7 @@ class Heartbeat:
     sequence: int
     is_stopping: bool
 
-    def __deepcopy__(self, memo: object) -> Heartbeat:
+    def __deepcopy__(self, memo: object) -> "Heartbeat":
         """Return the same immutable object."""
         return self
 
@@ -169,7 +156,7 @@ class StatusLimits:
             raise InputError("a robot's settling time and its clock's drift must be finite and not negative")
 
     @classmethod
-    def at_rate(cls, velocity: Sequence[float], period: float) -> StatusLimits:
+    def at_rate(cls, velocity: Sequence[float], period: float) -> "StatusLimits":
         """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`."""
         timeout = MAX_MISSED_MESSAGES * period
         return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout)

@@ -13,6 +13,15 @@ class KeepOut:
     A commanded position is projected to the nearest allowed one. The motion towards it stops before it would enter a
     box, so that a large step cannot jump through a wall.
 
+    Args:
+        lower: Lower corners of the boxes (B, O).
+        upper: Upper corners of the boxes (B, O); a box may extend to infinity.
+        constraints: G y ≥ c on positions (O,), the same at every step.
+        margin: Distance from boxes and constraints, not negative.
+
+    Raises:
+        ValueError: If shapes do not match, a box is empty, or the margin is negative.
+
     Attributes:
         margin: Distance from boxes and constraints [unit of a position].
     """
@@ -20,17 +29,6 @@ class KeepOut:
     _GAP = 1e-6  # distance from a box at which a motion stops, so that rounding cannot put it inside
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, constraints: LinearConstraints, margin: float):
-        """Check the arguments.
-
-        Args:
-            lower: Lower corners of the boxes (B, O).
-            upper: Upper corners of the boxes (B, O); a box may extend to infinity.
-            constraints: G y ≥ c on positions (O,), the same at every step.
-            margin: Distance from boxes and constraints, not negative.
-
-        Raises:
-            ValueError: If shapes do not match, a box is empty, or the margin is negative.
-        """
         self._lower = np.atleast_2d(np.asarray(lower, dtype=float))
         self._upper = np.atleast_2d(np.asarray(upper, dtype=float))
         if self._lower.shape != self._upper.shape or not (self._lower < self._upper).all():

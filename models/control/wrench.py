@@ -1,7 +1,5 @@
 """External wrench on a tool from the wrist's reaction and the tool's motion, and its center of pressure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from guiderail.models.common.arrays import cross

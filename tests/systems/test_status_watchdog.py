@@ -6,7 +6,7 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, MALFORMED_STATUS, Fault, JointStatus, StatusLimits
+from guiderail.models.control.joint_status import MALFORMED_STATUS, Fault, JointStatus, StatusLimits
 from guiderail.systems.status_watchdog import StatusWatchdog
 
 PERIOD = 1.0 / 256.0
@@ -157,7 +157,7 @@ def test_initialization_resets_the_state():
 
 
 def test_every_fault_has_a_description():
-    assert set(FAULT_DESCRIPTIONS) == set(Fault)
+    assert all(fault.description for fault in Fault)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault
+from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
@@ -161,9 +161,9 @@ class SkillExecutor:
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
         steps = len(self.trace)
         if arm_state in (ArmState.DAMPING, ArmState.OFF):
-            return Outcome(Fault(fault), FAULT_DESCRIPTIONS[Fault(fault)], steps)
+            return Outcome(Fault(fault), Fault(fault).description, steps)
         if self._is_stop_requested():
-            return Outcome(Fault.USER_STOP, FAULT_DESCRIPTIONS[Fault.USER_STOP], steps)
+            return Outcome(Fault.USER_STOP, Fault.USER_STOP.description, steps)
         if force > limit:
             return Outcome(Fault.FORCE_LIMIT, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", steps)
         return None
@@ -180,7 +180,7 @@ class SkillExecutor:
                 return outcome
             if elapsed > BLEND_TIMEOUT:
                 fault = Fault(int(station.get_fault_output_port().Eval(context)[0]))
-                return Outcome(fault, f"could not take over: {FAULT_DESCRIPTIONS[fault]}", 0)
+                return Outcome(fault, f"could not take over: {fault.description}", 0)
         for command in slow_approach(pose, self._start, self._skill.control_period):
             desired_pose.FixValue(context, command)
             if (outcome := self._step()) is not None:

@@ -18,7 +18,7 @@ from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
-from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault
+from guiderail.models.control.joint_status import Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.connection import Log
 from guiderail.tools.hardware.operator import OperatorKeys
@@ -40,7 +40,7 @@ class RobotStoppedError(Exception):
     """
 
     def __init__(self, fault: Fault):
-        super().__init__(FAULT_DESCRIPTIONS[fault])
+        super().__init__(fault.description)
         self.fault = fault
 
 
@@ -314,7 +314,7 @@ class RobotEnv(GuidedEnv):
             self._command(pose)
             elapsed += self.task.control_period
             if elapsed > RESUME_TIMEOUT:
-                raise InputError(f"the arm can't be taken over: {FAULT_DESCRIPTIONS[self._active_fault]}")
+                raise InputError(f"the arm can't be taken over: {self._active_fault.description}")
 
     def _retry_until_ok(self, motion: Callable[[], Any]) -> None:
         """Retry `motion` until it completes without a stop."""
@@ -335,7 +335,7 @@ class RobotEnv(GuidedEnv):
         """If the arm is at rest after a stop, have the operator confirm, and resume."""
         if self._arm_state != ArmState.OFF:
             return
-        self._confirm_resume(FAULT_DESCRIPTIONS[self._active_fault])
+        self._confirm_resume(self._active_fault.description)
         # No status was received while the operator was asked. Those of an arm that was moved in the meantime are
         # accepted after the settling time only.
         self._clock.begin()
