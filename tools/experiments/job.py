@@ -1,4 +1,4 @@
-"""Job of a study: one method with one seed, trained and evaluated in a folder of its own.
+"""Job of a study: one method with one seed, trained and evaluated in a folder of its own by a worker that keeps a log.
 
 A job depends on nothing but its folder: interrupted, it resumes there, and finished, it only reads its tables.
 """
@@ -8,8 +8,13 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable
+import os
+import socket
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -26,18 +31,20 @@ from guiderail.tools.environments import (
     import_modules,
     make_environment,
     task_content,
-)
+)  # fmt: skip
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.evaluate import evaluate_run
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollout
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Study
+from guiderail.tools.experiments.engines.engine import Outcome
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.learning.train import configure, with_defaults
 
 BEST_CONSTANT = "best_constant"
+BEGIN = " begins on "  # marks each attempt of a worker in the log of a job
 SELECTION_EPISODES = 10  # training episodes of each constant action, of which the best one is evaluated
 
 TRAINING = (
@@ -110,8 +117,10 @@ class Job:
     def folder(self) -> RunFolder:
         """Folder of the run and of its evaluated episodes."""
         config = self.config(self.after_episodes[-1])
-        values = {"method": self.method, "seed": self.seed, "episodes": config.episodes}
-        return RunFolder(self.out / self.study.folder.format(**values, algorithm=config.learner.algorithm))
+        name = self.study.folder.format(
+            method=self.method, seed=self.seed, episodes=config.episodes, algorithm=config.learner.algorithm
+        )
+        return RunFolder(self.out / name)
 
     @property
     def log(self) -> Path:
@@ -314,3 +323,55 @@ def _best_constant(job: Job) -> np.ndarray:
         return pd.DataFrame(rows).sort_values(["success_rate", "mean_return"], ascending=False, kind="stable")
 
     return load_or_compute(file, compare).iloc[0].filter(like="action_").to_numpy(float)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Work on a job, with a log: always ends in an outcome, and refuses a worker whose results would differ.
+
+    Attributes:
+        work: Returns the rows of a job.
+        versions: Package versions that the worker must have: other versions give other bits.
+    """
+
+    work: Callable[[Job], list[dict[str, Any]]]
+    versions: Mapping[str, str]
+
+    def __call__(self, job: Job) -> Outcome:
+        """Return the rows of a job, or one sentence on its failure."""
+        host = socket.gethostname()
+        if not job.log.parent.is_dir():
+            return Outcome(failure=f"{host} has no {job.log.parent}: --out must be a folder that all workers share")
+        installed = installed_versions()
+        for name, version in self.versions.items():
+            if installed.get(name) != version:
+                return Outcome(
+                    failure=f"{host} has {name} {installed.get(name)} instead of {version}: install the same versions "
+                    "everywhere, because results depend on them"
+                )
+        _append(job, f"{BEGIN}{host}, process {os.getpid()}\n")
+        try:
+            rows = self.work(job)
+        except InputError as error:
+            _append(job, f" failed: {error}\n")
+            return Outcome(failure=str(error))
+        except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
+            _append(job, f" failed:\n{traceback.format_exc()}")
+            message = " ".join(str(error).split())[:200]
+            return Outcome(failure=f"{type(error).__name__}: {message} (the traceback is in {job.log})")
+        _append(job, " is done\n")
+        return Outcome(tuple(rows))
+
+
+def count_attempts(log: Path, start: int = 0) -> int:
+    """Return how many workers started a job, counted from byte `start` of its log; 0 while it waits."""
+    try:
+        return log.read_bytes()[start:].count(BEGIN.encode())
+    except FileNotFoundError:
+        return 0
+
+
+def _append(job: Job, text: str) -> None:
+    """Append a line with a time to the log; if the disk is full, the job continues without it."""
+    with suppress(OSError), job.log.open("a", encoding="utf-8") as file:
+        file.write(f"{datetime.now(UTC):%Y-%m-%d %H:%M:%S}{text}")

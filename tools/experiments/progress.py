@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from guiderail.tools.experiments.engines.engine import Outcome
-from guiderail.tools.experiments.worker import count_attempts
+from guiderail.tools.experiments.job import count_attempts
 
 MAX_SHOWN = 20  # jobs in the table; the others are counted
 TERMINAL_PERIOD, LOG_PERIOD = 1.0, 60.0  # time between two updates [s]

@@ -1,4 +1,4 @@
-"""Studies: train and evaluate methods over seeds, and write a table with one row each.
+"""Studies: train and evaluate methods over seeds, write a table with one row each, and draw the sweeps.
 
 Each seed has rows of its own, so that failures of single seeds are not averaged away. A study that was interrupted
 resumes with the same call, and studies that share runs use them again. An engine runs the jobs; the rows are the same
@@ -7,32 +7,34 @@ from each engine.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.environments import import_modules
-from guiderail.tools.experiments.declaration import Ratio, Study
+from guiderail.tools.evaluation.metrics import wilson_of_each
+from guiderail.tools.experiments.declaration import Ratio, Study, Sweep
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
-from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, check_job, is_done, run_job
+from guiderail.tools.experiments.job import EVALUATED, TRAINING, Attempt, Job, check_job, is_done, run_job
 from guiderail.tools.experiments.progress import StudyProgress
-from guiderail.tools.experiments.sweep import breaking_points, draw_sweeps
-from guiderail.tools.experiments.worker import Attempt
-from guiderail.tools.learning.run_folder import RunConfig, installed_versions
+from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import write_table
+from guiderail.tools.visualization.style import legend, new_figure, save_figure
 
 ALL_METHODS = "all methods"
+LINE_STYLES = ("-", "--", "-.", ":")  # in turn, because curves of methods that always or never succeed coincide
+BREAKING_SUCCESS = 0.9  # success rate below which a method counts as broken
+NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
 
-
-class DescribeDifferences(Protocol):
-    """Function that describes how a run's configuration differs from a reference, such as a publication."""
-
-    def __call__(self, config: RunConfig, *, learns: bool = True) -> list[str]:
-        """Return sentences; with `learns` False, none on the learner."""
+# Sentences on how a configuration differs from a reference; with `learns=False`, none on the learner.
+DescribeDifferences: TypeAlias = Callable[..., list[str]]
 
 
 def run_study(study: Study, out: Path, engine: Engine | None = None, console: Console | None = None) -> pd.DataFrame:
@@ -174,18 +176,16 @@ def _run_jobs(jobs: list[Job], engine: Engine, console: Console | None) -> dict[
             progress.end(index, job, outcomes[index])
         if to_run:
             with engine:
-                _make_log_folder(jobs[0])
+                try:
+                    jobs[0].log.parent.mkdir(parents=True, exist_ok=True)
+                except OSError as error:
+                    raise InputError(
+                        f"{jobs[0].out} cannot be written ({error.strerror}): name another folder with --out"
+                    ) from error
                 for index, outcome in engine.run(Attempt(run_job, installed_versions()), to_run):
                     outcomes[index] = outcome
                     progress.end(index, jobs[index], outcome)
     return outcomes
-
-
-def _make_log_folder(job: Job) -> None:
-    try:
-        job.log.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{job.out} cannot be written ({error.strerror}): name another folder with --out") from error
 
 
 def _refuse_shared_folders(jobs: list[Job]) -> None:
@@ -198,3 +198,95 @@ def _refuse_shared_folders(jobs: list[Job]) -> None:
                 f"{job.folder.path} would hold both runs of {other.method}, seed {other.seed} and of {job.method}, "
                 f"seed {job.seed}: write the study's folder with {{method}} and {{seed}}"
             )
+
+
+def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
+    """Draw a panel for each sweep: the success rate of all seeds against the quantity.
+
+    The band spans the seeds' own 95 % intervals. Harder values are to the right. A cross marks where a method that
+    began above `BREAKING_SUCCESS` falls below it.
+
+    Args:
+        study: Study of the sweeps.
+        rows: Rows of its table; of a method evaluated after several numbers of episodes, the largest counts.
+        path: Picture to write.
+    """
+    width = max(4.4 * len(study.sweeps), 1.3 * len(study.methods))  # the legend is one line
+    figure, axes = new_figure(1, len(study.sweeps), (width, 3.6))
+    for axis, sweep in zip(axes.flat, study.sweeps, strict=True):
+        for index, name in enumerate(study.methods):
+            values, points = curve(sweep, rows, name)
+            if not values:
+                continue
+            x = np.array(values)
+            rate, low, high = np.array(points, dtype=float).T
+            style = LINE_STYLES[index % len(LINE_STYLES)]
+            (line,) = axis.plot(
+                x, rate, f"o{style}", color=f"C{index % 10}", markersize=3, label=name.replace("_", " ")
+            )
+            axis.fill_between(x, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
+            at = breaking_point(values, rate.tolist())
+            if isinstance(at, float):
+                axis.plot(at, BREAKING_SUCCESS, "x", color=line.get_color(), markersize=9, markeredgewidth=2)
+        axis.axhline(BREAKING_SUCCESS, color="0.7", linewidth=0.7, linestyle=":")
+        axis.set(xlabel=sweep.quantity, ylabel="success", ylim=(-0.03, 1.03))
+        values = list(sweep.at)
+        if values[0] > values[-1]:
+            axis.invert_xaxis()
+    legend(figure, axes.flat[0])
+    return save_figure(figure, path)
+
+
+def breaking_points(study: Study, rows: pd.DataFrame) -> dict[str, str]:
+    """Return where each method breaks in each sweep, as text by a label."""
+    texts = {}
+    for sweep in study.sweeps:
+        for name in study.methods:
+            values, points = curve(sweep, rows, name)
+            if values:
+                label = f"{name}, below {BREAKING_SUCCESS:.0%} at {sweep.quantity}"
+                texts[label] = format_breaking_point(values, points)
+    return texts
+
+
+def format_breaking_point(values: Sequence[float], points: Sequence[tuple[float, float, float]]) -> str:
+    """Return the breaking point of a curve as a number, or as `NEVER` or `AT_ONCE`."""
+    at = breaking_point(values, [rate for rate, _, _ in points])
+    return at if isinstance(at, str) else f"{at:.3g}"
+
+
+def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], list[tuple[float, float, float]]]:
+    """Return the values at which a method was evaluated, the easiest first, and its success rate with its interval."""
+    points = {value: _success(rows, name, sweep.eval_set(value).name) for value in sweep.at}
+    evaluated = {value: point for value, point in points.items() if point is not None}
+    return list(evaluated), list(evaluated.values())
+
+
+def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | str:
+    """Return where the success rate first falls below `BREAKING_SUCCESS`, interpolated linearly.
+
+    Args:
+        values: Values of the quantity, the easiest first.
+        rates: Success rate at each value.
+
+    Returns:
+        The value, `AT_ONCE` if already the easiest value is below, or `NEVER`.
+    """
+    if rates[0] < BREAKING_SUCCESS:
+        return AT_ONCE
+    for (v0, r0), (v1, r1) in itertools.pairwise(zip(values, rates, strict=True)):
+        if r1 < BREAKING_SUCCESS:
+            return float(v0 + (v1 - v0) * (r0 - BREAKING_SUCCESS) / (r0 - r1))
+    return NEVER
+
+
+def _success(rows: pd.DataFrame, method: str, eval_set: str) -> tuple[float, float, float] | None:
+    """Return the success rate of all seeds, and the lowest and highest end of their intervals."""
+    selected = rows[(rows["method"] == method) & (rows["eval_set"] == eval_set)]
+    selected = selected[selected["after_episodes"] == selected["after_episodes"].max()]
+    if not len(selected):
+        return None
+    episodes = selected["episodes"].astype(int)
+    successes = (selected["success_rate"] * episodes).astype(float).round().astype(int)
+    lows, highs = zip(*wilson_of_each(successes, episodes), strict=True)
+    return successes.sum() / episodes.sum(), min(lows), max(highs)

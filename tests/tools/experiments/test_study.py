@@ -16,13 +16,15 @@ from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.job import Job, check_job
 from guiderail.tools.experiments.study import (
+    AT_ONCE,
+    NEVER,
+    breaking_point,
     differences_by_method,
     each,
     ratio,
     run_study,
     study_command,
 )
-from guiderail.tools.experiments.sweep import AT_ONCE, NEVER, breaking_point
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
 from research.studies import study_names, study_path

@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.tools.evaluation.metrics import wilson
 from guiderail.tools.experiments.declaration import Study
-from guiderail.tools.experiments.sweep import _success, draw_sweeps
+from guiderail.tools.experiments.study import _success, draw_sweeps
 
 
 def rows(*rates):

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.worker import Attempt, count_attempts
+from guiderail.tools.experiments.job import Attempt, count_attempts
 from guiderail.tools.learning.run_folder import installed_versions
 
 
