@@ -24,8 +24,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 
 import guiderail.systems
 from guiderail.diagrams.envs.env import GuidedEnv
-from guiderail.tools.learning import checkpoint, off_policy, trainer
-from guiderail.tools.learning.fast_sb3 import batched_mlp, flat_adam, training_step
+from guiderail.tools.learning import batched_mlp, checkpoint, fast_sb3, off_policy, trainer
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
 
@@ -48,11 +47,11 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (off_policy.OffPolicyLearner, "store", "replay buffer"),
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
     (NStepReplayBuffer, "sample", "replay"),
-    (training_step.FastTrainingStep, "train", "gradient step"),
+    (fast_sb3.FastTrainingStep, "train", "gradient step"),
     (batched_mlp.BatchedMLP, "forward", "forward"),
     (batched_mlp.BatchedMLP, "backward", "backward"),
     (batched_mlp.BatchedMLP, "input_gradient", "backward"),
-    (flat_adam.FlatAdam, "step", "optimizer"),
+    (batched_mlp.FlatAdam, "step", "optimizer"),
     (checkpoint, "save_checkpoint", "checkpoint"),
 )
 REST = "everything else"

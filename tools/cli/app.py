@@ -43,7 +43,7 @@ LISTED: dict[str, Callable[[], list[str]]] = {
     "stations": _names("diagrams.stations.registry", "STATIONS"),
     "robots": _names("models.robots.robot", "robot_names"),
     "presets": _names("tools.learning.config", "PRESETS"),
-    "learners": _names("tools.learning.learner", "learner_names"),
+    "learners": _names("tools.learning.learner", "LEARNERS"),
 }
 """Lists that `guiderail list` prints, by name."""
 
@@ -52,7 +52,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
     "observations": _declared_by_tasks("observations"),
     "templates": _names("models.templates.schema", "shipped_templates"),
     "engines": _names("tools.experiments.engines.engine", "ENGINES"),
-    "log_formats": _names("tools.learning.learning_log", "FORMATS"),
+    "log_formats": _names("tools.learning.learner", "LOG_FORMATS"),
     "pictures": _names("tools.files", "PICTURES"),
     "videos": _names("tools.files", "VIDEOS"),
     "baselines": _names("tools.evaluation.baselines", "BASELINES"),

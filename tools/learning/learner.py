@@ -1,4 +1,4 @@
-"""Interface of a learner, and the registry of learners.
+"""Interface of a learner, the registry of learners, and the log of losses and values that they record.
 
 A learner is one file: a subclass of `Learner` (or of `guiderail.tools.learning.off_policy.OffPolicyLearner`, for an
 algorithm of Stable-Baselines3) that is registered by `register_learner` or by an entry point of the group
@@ -8,18 +8,30 @@ algorithm of Stable-Baselines3) that is registered by `register_learner` or by a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from guiderail.models.common.errors import InputError
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Callback
+
+LOG_FORMATS = ("tensorboard", "csv", "json", "log", "stdout")
+# Name in the log of each column of an episode's row that is logged.
+LOGGED_COLUMNS = {
+    "return": "rollout/return",
+    "success": "rollout/success",
+    "steps": "rollout/steps",
+    "peak_force": "rollout/peak_force",
+    "max_commanded_violation": "rollout/max_commanded_violation",
+}
 
 
 def reject_bool(value: Any) -> Any:
@@ -155,7 +167,6 @@ LEARNERS: Registry[Any] = Registry(
     entry_points="guiderail.learners",
 )
 register_learner = LEARNERS.register
-learner_names = LEARNERS.names
 
 
 def divergence_error() -> InputError:
@@ -180,3 +191,55 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
         "max_transitions": config.episodes * -(-task.num_steps // config.action_repeat),
         "symmetry": None if is_corrected else symmetry,
     }
+
+
+def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of log formats as a tuple.
+
+    Raises:
+        InputError: If a format is unknown, or its package is not installed.
+    """
+    names = (formats,) if isinstance(formats, str) else tuple(formats)
+    for name in names:
+        if name not in LOG_FORMATS:
+            raise InputError(f"there is no log format {brief(name)}: {did_you_mean(name, LOG_FORMATS)}")
+    if "tensorboard" in names and find_spec("tensorboard") is None:
+        raise InputError("the log format tensorboard needs TensorBoard: pip install 'guiderail[tensorboard]'")
+    return names
+
+
+class LearningLog:
+    """Learning log of a run in formats of Stable-Baselines3's logger, with an entry per episode; none without formats.
+
+    An entry has columns of the episode's row and the metrics of the learner, at the run's number of control steps.
+    """
+
+    def __init__(self, folder: Path, formats: str | Sequence[str] = ()):
+        """Construct the log; files in `folder` are opened at the first entry. See `check_log_formats` for errors."""
+        self._folder, self._formats = folder, check_log_formats(formats)
+        self._logger: Any = None
+
+    def record(self, rows: Sequence[Mapping[str, Any]], metrics: Callable[[], Mapping[str, float]]) -> None:
+        """Write the entry of the last of all episodes' `rows`; `metrics` returns the metrics of the learner."""
+        if not self._formats:
+            return
+        row = rows[-1]
+        if self._logger is None:
+            from stable_baselines3.common.logger import Logger, make_output_format  # PyTorch takes seconds
+
+            # A resumed run must not overwrite the files of its first part.
+            suffix = f"-from-{row['episode']}" if row["episode"] else ""
+            self._folder.mkdir(parents=True, exist_ok=True)
+            outputs = [make_output_format(name, str(self._folder), suffix) for name in self._formats]
+            self._logger = Logger(str(self._folder), outputs)
+        for column, name in LOGGED_COLUMNS.items():
+            if column in row:
+                self._logger.record(name, row[column])
+        for name, value in metrics().items():
+            self._logger.record(name, value)
+        self._logger.dump(sum(int(one["steps"]) for one in rows))
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._logger is not None:
+            self._logger.close()

@@ -32,7 +32,7 @@ from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import CheckpointSelection
 from guiderail.tools.learning.config import OffPolicyConfig, action_gamma
-from guiderail.tools.learning.fast_sb3.training_step import FastSac, FastTqc
+from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error
 
 IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22×28×3

@@ -20,7 +20,7 @@ from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
 from guiderail.tools.learning.config import config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.interventions import Supervisor
-from guiderail.tools.learning.learning_log import check_formats
+from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
 DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
@@ -160,7 +160,7 @@ def start_or_resume(
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
     folder = RunFolder(out)
-    imports, formats = import_modules(imports), check_formats(log)
+    imports, formats = import_modules(imports), check_log_formats(log)
     choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
     choices["human_in_the_loop"] = None if make_supervisor is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}

@@ -14,8 +14,7 @@ from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
-from guiderail.tools.learning.learner import LEARNERS, Learner, divergence_error, learner_arguments
-from guiderail.tools.learning.learning_log import LearningLog
+from guiderail.tools.learning.learner import LEARNERS, Learner, LearningLog, divergence_error, learner_arguments
 from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text

@@ -18,8 +18,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
-from guiderail.tools.learning.fast_sb3.batched_mlp import BatchedMLP, Linear
-from guiderail.tools.learning.fast_sb3.flat_adam import FlatAdam, flatten
+from guiderail.tools.learning.batched_mlp import BatchedMLP, FlatAdam, Linear, flatten
 
 _SQUASH_EPSILON = 1e-6  # Stable-Baselines3 adds it to the derivative of tanh before taking the logarithm
 _MAX_GATHERED = 2**22  # numbers of states that are gathered at once: those of a whole training, unless they are images
@@ -81,18 +80,15 @@ class FastTrainingStep(_Algorithm):
             + _layers(values[shared:].view(2, -1), gradient[shared:].view(2, -1), head),
             layer_norm,
         )
-        outputs = critic.q_networks[0][-1].out_features
-        sizes = [self._features + self._actions, *actor.net_arch, outputs]
-        networks = len(critic.q_networks)
-        self._critic = BatchedMLP(
-            _layers(critic.optimizer.values.view(networks, -1), critic.optimizer.gradient.view(networks, -1), sizes),
-            layer_norm,
-        )
+        sizes = [self._features + self._actions, *actor.net_arch, critic.q_networks[0][-1].out_features]
+
+        def batched_critics(values: torch.Tensor, gradient: torch.Tensor) -> BatchedMLP:
+            shape = (len(critic.q_networks), -1)
+            return BatchedMLP(_layers(values.view(shape), gradient.view(shape), sizes), layer_norm)
+
+        self._critic = batched_critics(critic.optimizer.values, critic.optimizer.gradient)
         self._target_parameters = flatten(self.policy.critic_target.parameters())
-        unused = torch.empty_like(self._target_parameters)
-        self._target = BatchedMLP(
-            _layers(self._target_parameters.view(networks, -1), unused.view(networks, -1), sizes), layer_norm
-        )
+        self._target = batched_critics(self._target_parameters, torch.empty_like(self._target_parameters))
 
     @torch.inference_mode()
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -162,9 +158,8 @@ class FastTrainingStep(_Algorithm):
         values, critic_cache = self._critic.forward(states[None, :batch])
         if self.records_metrics:
             self._record("actor_loss", (ent_coef * log_prob[:batch] - self._actor_value(values)).mean())
-        d_action = self._critic.input_gradient(critic_cache, self._value_gradient(values), slice(self._features, None))[
-            0
-        ]
+        d_values = self._value_gradient(values)
+        d_action = self._critic.input_gradient(critic_cache, d_values, slice(self._features, None))[0]
         slope, weight = slope[:batch], ent_coef / batch
         d_mean = (d_action + 2 * weight * actions[:batch] / (slope + _SQUASH_EPSILON)) * slope
         d_log_std = (d_mean * deviation[:batch] - weight) * (log_std[:batch] == clamped[:batch])

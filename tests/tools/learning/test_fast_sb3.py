@@ -11,7 +11,7 @@ from torch.nn.utils import parameters_to_vector
 
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import resolve_preset
-from guiderail.tools.learning.fast_sb3.training_step import FastTrainingStep
+from guiderail.tools.learning.fast_sb3 import FastTrainingStep
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
 
 STEPS, BATCH = 6, 64
@@ -140,7 +140,7 @@ def test_fast_step_refuses_unsupported_activations():
 def test_learning_does_not_import_pytorchs_compiler(forks):
     code = """
 import sys
-from guiderail.tools.learning.fast_sb3.training_step import FastSac, FastTqc
+from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from gymnasium import Env, spaces
 class Vector(Env):
     observation_space = action_space = spaces.Box(-1, 1, (2,))
