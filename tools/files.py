@@ -24,12 +24,11 @@ def remove_partial_files(folder: Path) -> None:
     Files that another process is still writing stay, and so does everything in a subfolder with a lock of its own.
     """
     for parent, subfolders, files in os.walk(folder):
-        left = [name for name in subfolders if _is_abandoned(name)]
+        for name in filter(_is_abandoned, subfolders):
+            shutil.rmtree(Path(parent, name), ignore_errors=True)
         subfolders[:] = [
             name for name in subfolders if not _PARTIAL.fullmatch(name) and not Path(parent, name, LOCK).exists()
         ]
-        for name in left:
-            shutil.rmtree(Path(parent, name), ignore_errors=True)
         for name in filter(_is_abandoned, files):
             Path(parent, name).unlink(missing_ok=True)
 
@@ -49,29 +48,17 @@ def _is_abandoned(name: str) -> bool:
 
 
 def check_picture(path: Path) -> None:
-    """Check that a picture can be written.
-
-    Raises:
-        InputError: If the ending is none of `PICTURES`, or the file cannot be written.
-    """
+    """Raise an InputError if the ending is none of `PICTURES`, or the file cannot be written."""
     _check_ending(path, "picture", PICTURES)
 
 
 def check_video(path: Path) -> None:
-    """Check that a video can be written.
-
-    Raises:
-        InputError: If the ending is none of `VIDEOS`, or the file cannot be written.
-    """
+    """Raise an InputError if the ending is none of `VIDEOS`, or the file cannot be written."""
     _check_ending(path, "video", VIDEOS)
 
 
 def check_page(path: Path) -> None:
-    """Check that an HTML page can be written.
-
-    Raises:
-        InputError: If the ending is none of `PAGES`, or the file cannot be written.
-    """
+    """Raise an InputError if the ending is none of `PAGES`, or the file cannot be written."""
     _check_ending(path, "page", PAGES)
 
 
@@ -95,7 +82,7 @@ def check_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=parent):  # permission bits do not suffice: they do not bind root
             pass
     except OSError as error:
-        raise _write_error(path, error) from error
+        raise write_error(path, error) from error
 
 
 @contextmanager
@@ -112,10 +99,11 @@ def atomic_folder(out: Path) -> Iterator[Path]:
         yield temporary
         temporary.rename(out)
     except OSError as error:
-        raise _write_error(out, error) from error
+        raise write_error(out, error) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _write_error(path: Path, error: OSError) -> InputError:
+def write_error(path: Path, error: OSError) -> InputError:
+    """Return the error for a path that cannot be written."""
     return InputError(f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write")

@@ -168,28 +168,16 @@ class Study(_Strict):
         return "-".join([self.name, *methods, *seeds]) if methods or seeds else None
 
     def subset(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
-        """Return the study with some of its methods, or with other seeds.
-
-        Raises:
-            InputError: If the study has no such method.
-        """
-        chosen = self.methods if methods is None else {}
+        """Return the study with some of its methods, or with other seeds; raise an InputError for an unknown method."""
         for name in methods or ():
             if name not in self.methods:
                 raise InputError(f"the study {self.name} has no method {name!r}: {did_you_mean(name, self.methods)}")
-            chosen[name] = self.methods[name]
+        chosen = self.methods if methods is None else {name: self.methods[name] for name in methods}
         return self.model_copy(update={"methods": chosen, "seeds": tuple(self.seeds if seeds is None else seeds)})
 
 
 def load_study(file: Path | str) -> Study:
-    """Read a study's YAML file.
-
-    Args:
-        file: Path of the file.
-
-    Raises:
-        InputError: If there is no such file, or its content is not a valid study.
-    """
+    """Read a study's YAML file; raise an InputError if there is none, or its content is not a valid study."""
     path = Path(file)
     if not path.is_file():
         raise InputError(f"there is no file {path}: name a study's YAML file")

@@ -325,42 +325,36 @@ def _best_constant(job: Job) -> np.ndarray:
     return load_or_compute(file, compare).iloc[0].filter(like="action_").to_numpy(float)
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """Work on a job, with a log: always ends in an outcome, and refuses a worker whose results would differ.
+def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: Mapping[str, str]) -> Outcome:
+    """Return the rows of a job, or one sentence on its failure, and log the attempt; raise nothing.
 
-    Attributes:
+    Args:
+        job: Job.
         work: Returns the rows of a job.
-        versions: Package versions that the worker must have: other versions give other bits.
+        versions: Package versions without which a worker is refused: other versions give other bits.
     """
-
-    work: Callable[[Job], list[dict[str, Any]]]
-    versions: Mapping[str, str]
-
-    def __call__(self, job: Job) -> Outcome:
-        """Return the rows of a job, or one sentence on its failure."""
-        host = socket.gethostname()
-        if not job.log.parent.is_dir():
-            return Outcome(failure=f"{host} has no {job.log.parent}: --out must be a folder that all workers share")
-        installed = installed_versions()
-        for name, version in self.versions.items():
-            if installed.get(name) != version:
-                return Outcome(
-                    failure=f"{host} has {name} {installed.get(name)} instead of {version}: install the same versions "
-                    "everywhere, because results depend on them"
-                )
-        _append(job, f"{BEGIN}{host}, process {os.getpid()}\n")
-        try:
-            rows = self.work(job)
-        except InputError as error:
-            _append(job, f" failed: {error}\n")
-            return Outcome(failure=str(error))
-        except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
-            _append(job, f" failed:\n{traceback.format_exc()}")
-            message = " ".join(str(error).split())[:200]
-            return Outcome(failure=f"{type(error).__name__}: {message} (the traceback is in {job.log})")
-        _append(job, " is done\n")
-        return Outcome(tuple(rows))
+    host = socket.gethostname()
+    if not job.log.parent.is_dir():
+        return Outcome(failure=f"{host} has no {job.log.parent}: --out must be a folder that all workers share")
+    installed = installed_versions()
+    for name, version in versions.items():
+        if installed.get(name) != version:
+            return Outcome(
+                failure=f"{host} has {name} {installed.get(name)} instead of {version}: install the same versions "
+                "everywhere, because results depend on them"
+            )
+    _append(job, f"{BEGIN}{host}, process {os.getpid()}\n")
+    try:
+        rows = work(job)
+    except InputError as error:
+        _append(job, f" failed: {error}\n")
+        return Outcome(failure=str(error))
+    except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
+        _append(job, f" failed:\n{traceback.format_exc()}")
+        message = " ".join(str(error).split())[:200]
+        return Outcome(failure=f"{type(error).__name__}: {message} (the traceback is in {job.log})")
+    _append(job, " is done\n")
+    return Outcome(tuple(rows))
 
 
 def count_attempts(log: Path, start: int = 0) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from rich.console import Console, Group
@@ -31,7 +32,7 @@ class StudyProgress:
         Args:
             jobs: Jobs to run by key.
             total: Number of jobs of the study, including those that are done.
-            console: Console to print on; standard error by default, so that results can be piped.
+            console: Console; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
         self._open = {
@@ -59,13 +60,13 @@ class StudyProgress:
 
     def end(self, key: int, job: Any, outcome: Outcome) -> None:
         """Print the outcome of a job."""
-        entry = self._open.get(key)
-        attempts = count_attempts(job.log, entry[2]) if entry is not None else 0
-        self._open = {other: one for other, one in self._open.items() if other != key}
+        attempts = count_attempts(job.log, self._open[key][2]) if key in self._open else 0
+        self._open = {other: one for other, one in self._open.items() if other != key}  # the other thread may iterate
         self._num_ended += 1
         self._num_failed += bool(outcome.failure)
-        text = "".join(f": {row['eval_set']} {row['success_rate']:.0%}" for row in outcome.rows[-1:] if row["eval_set"])
-        text = f": failed: {outcome.failure}" if outcome.failure else text
+        text = f": failed: {outcome.failure}" if outcome.failure else ""
+        if outcome.rows and (last := outcome.rows[-1])["eval_set"]:
+            text = f": {last['eval_set']} {last['success_rate']:.0%}"
         again = f" (by worker {attempts}, those before it were lost)" if attempts > 1 else ""
         self._print(f"{self._num_ended}/{self._total} {job.method}, seed {job.seed}{text}{again}")
 
@@ -86,18 +87,13 @@ class StudyProgress:
             attempts = count_attempts(job.log, log_size)
             if not attempts:
                 continue
+            done, episodes = 0, job.after_episodes[-1]
+            with suppress(OSError):
+                done = table.read_bytes().count(b"\n") - 1
+            state = f"{done}/{episodes} episodes" if done < episodes else "evaluated"
             again = f", by worker {attempts}" if attempts > 1 else ""
-            running.append((f"{job.method}, seed {job.seed}", self._state(job, table) + again))
+            running.append((f"{job.method}, seed {job.seed}", state + again))
         return running
-
-    @staticmethod
-    def _state(job: Any, table: Any) -> str:
-        episodes = job.after_episodes[-1]
-        try:
-            done = table.read_bytes().count(b"\n") - 1
-        except OSError:
-            done = 0
-        return f"{done}/{episodes} episodes" if done < episodes else "evaluated"
 
     def _counts(self) -> str:
         num_waiting = len(self._open) - len(self._running())
@@ -110,5 +106,4 @@ class StudyProgress:
         for name, state in running[:MAX_SHOWN]:
             table.add_row(name, state)
         more = f"and {len(running) - MAX_SHOWN} more running; " if len(running) > MAX_SHOWN else ""
-        counts = Text(more + self._counts())
-        return Group(table, counts) if running else Group(counts)
+        return Group(*([table] if running else []), Text(more + self._counts()))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,7 +23,7 @@ from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.metrics import wilson_of_each
 from guiderail.tools.experiments.declaration import Ratio, Study, Sweep
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
-from guiderail.tools.experiments.job import EVALUATED, TRAINING, Attempt, Job, check_job, is_done, run_job
+from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, is_done, run_job
 from guiderail.tools.experiments.progress import StudyProgress
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import write_table
@@ -83,18 +84,10 @@ def study_command(
     table: str | None = None,
     describe_differences: DescribeDifferences | None = None,
 ) -> dict[str, Any]:
-    """Run a study, write its table as `.csv` and `.md`, and return a summary with each seed by itself.
+    """Run a study by `run_study`, write its table as `.csv` and `.md`, and return a summary with each seed by itself.
 
-    Args:
-        study: Study.
-        out: Folder of the study.
-        engine: Engine that runs the jobs; two processes by default.
-        table: Name of the table; the study's name by default.
-        describe_differences: Describes how a run's configuration differs from a reference, such as a publication.
-
-    Returns:
-        The summary; `differences` has the sentences of `describe_differences` by method, and `failed` those of failed
-        jobs, which the table does not have.
+    The table has the study's name by default. In the summary, `differences` has the sentences of `describe_differences`
+    by method, and `failed` those of failed jobs, which the table does not have.
     """
     result: dict[str, Any] = {}
     try:
@@ -112,9 +105,8 @@ def study_command(
         if eval_set:
             result[f"{method}{after}, {eval_set}, success of each seed"] = each(group, "success_rate", "{:.0%}")
         if episodes:
-            result[f"{method}{after}, episodes to convergence, each seed"] = each(
-                group, "training_episodes_to_convergence"
-            )
+            converged = each(group, "training_episodes_to_convergence")
+            result[f"{method}{after}, episodes to convergence, each seed"] = converged
     for one in study.ratios:
         result |= ratio(rows, one)
     if describe_differences is not None:
@@ -175,6 +167,7 @@ def _run_jobs(jobs: list[Job], engine: Engine, console: Console | None) -> dict[
                 outcomes[index] = Outcome(failure=str(error))
             progress.end(index, job, outcomes[index])
         if to_run:
+            work = partial(attempt, work=run_job, versions=installed_versions())
             with engine:
                 try:
                     jobs[0].log.parent.mkdir(parents=True, exist_ok=True)
@@ -182,7 +175,7 @@ def _run_jobs(jobs: list[Job], engine: Engine, console: Console | None) -> dict[
                     raise InputError(
                         f"{jobs[0].out} cannot be written ({error.strerror}): name another folder with --out"
                     ) from error
-                for index, outcome in engine.run(Attempt(run_job, installed_versions()), to_run):
+                for index, outcome in engine.run(work, to_run):
                     outcomes[index] = outcome
                     progress.end(index, jobs[index], outcome)
     return outcomes
@@ -206,10 +199,7 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
     The band spans the seeds' own 95 % intervals. Harder values are to the right. A cross marks where a method that
     began above `BREAKING_SUCCESS` falls below it.
 
-    Args:
-        study: Study of the sweeps.
-        rows: Rows of its table; of a method evaluated after several numbers of episodes, the largest counts.
-        path: Picture to write.
+    Of a method evaluated after several numbers of episodes, the largest counts. Return the path of the picture.
     """
     width = max(4.4 * len(study.sweeps), 1.3 * len(study.methods))  # the legend is one line
     figure, axes = new_figure(1, len(study.sweeps), (width, 3.6))
@@ -218,13 +208,10 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
             values, points = curve(sweep, rows, name)
             if not values:
                 continue
-            x = np.array(values)
             rate, low, high = np.array(points, dtype=float).T
-            style = LINE_STYLES[index % len(LINE_STYLES)]
-            (line,) = axis.plot(
-                x, rate, f"o{style}", color=f"C{index % 10}", markersize=3, label=name.replace("_", " ")
-            )
-            axis.fill_between(x, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
+            style, label = f"o{LINE_STYLES[index % len(LINE_STYLES)]}", name.replace("_", " ")
+            (line,) = axis.plot(values, rate, style, color=f"C{index % 10}", markersize=3, label=label)
+            axis.fill_between(values, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
             at = breaking_point(values, rate.tolist())
             if isinstance(at, float):
                 axis.plot(at, BREAKING_SUCCESS, "x", color=line.get_color(), markersize=9, markeredgewidth=2)

@@ -1,8 +1,8 @@
 """Several multilayer perceptrons of equal shape as one batched network with gradients written out, and their optimizer.
 
-At a hundred units and batches of 64, a gradient step that calls one small layer after the other spends most of its time
-on the calls and on autograd's bookkeeping. Here a layer of all networks is one call, forward and backward, and a step of
-Adam is one call for all parameters.
+With a hundred units and batches of 64, calling one small layer after the other spends most of the time on the calls and
+on autograd's bookkeeping. Here a layer of all networks is one call, forward and backward, and so is a step of Adam on
+all parameters.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -141,8 +141,7 @@ def flatten(parameters: Iterable[torch.Tensor]) -> torch.Tensor:
     return flat
 
 
-def _parts(flat: torch.Tensor, shapes: Iterable[torch.Size]) -> list[torch.Tensor]:
-    shapes = list(shapes)
+def _parts(flat: torch.Tensor, shapes: Sequence[torch.Size]) -> list[torch.Tensor]:
     sizes = [shape.numel() for shape in shapes]
     return [part.view(shape) for part, shape in zip(flat.split(sizes), shapes, strict=True)]
 

@@ -48,12 +48,7 @@ class SupervisedEnv(gymnasium.Wrapper):
     """Environment whose episodes a supervisor can end."""
 
     def __init__(self, env: gymnasium.Env, supervisor: Supervisor):
-        """Wrap an environment.
-
-        Args:
-            env: Environment.
-            supervisor: Supervisor whose labels end an episode.
-        """
+        """Wrap `env`; labels of `supervisor` end its episodes."""
         super().__init__(env)
         self._supervisor = supervisor
 
@@ -76,14 +71,7 @@ class InterventionPolicy(Callback):
     """
 
     def __init__(self, env: gymnasium.Env, supervisor: Supervisor, act: PolicyFn, corrections: ViaPointCorrections):
-        """Construct the policy.
-
-        Args:
-            env: Environment.
-            supervisor: Supervisor whose corrections override the policy.
-            act: Policy.
-            corrections: Via-points of the environment so far.
-        """
+        """Construct the policy: `act`, overridden by `supervisor`; `corrections` are the via-points of `env` so far."""
         self._env, self._supervisor, self._act, self._corrections = env, supervisor, act, corrections
         self._offsets: dict[int, np.ndarray] = {}
         self._offset: np.ndarray | None = None
@@ -126,11 +114,7 @@ class ViaPointCorrections:
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any]):
-        """Construct the corrections.
-
-        Args:
-            task: Name of the task.
-            environment: Options of the environment.
+        """Construct the corrections of a task's environment, given its options.
 
         Raises:
             InputError: If the guidance has no demonstrations to correct.

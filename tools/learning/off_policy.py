@@ -46,12 +46,7 @@ class AveragePooledImage(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: spaces.Box, pool: int):
-        """Construct the extractor.
-
-        Args:
-            observation_space: Space of images (channels, height, width).
-            pool: Side of the squares [pixels].
-        """
+        """Construct the extractor for images (channels, height, width), with squares of side `pool` [pixels]."""
         channels, height, width = observation_space.shape
         super().__init__(observation_space, channels * (height // pool) * (width // pool))
         self.pool = pool
@@ -148,8 +143,8 @@ class OffPolicyLearner(Learner):
         if config.layer_norm:
             networks["activation_fn"] = NormalizedReLU
         if is_image_space(env.observation_space):
-            pooling = {"features_extractor_kwargs": {"pool": IMAGE_POOL}}
-            networks |= {"features_extractor_class": AveragePooledImage, **pooling}
+            networks["features_extractor_class"] = AveragePooledImage
+            networks["features_extractor_kwargs"] = {"pool": IMAGE_POOL}
         self.config = config
         self.transitions = 0
         arguments = {
@@ -314,9 +309,9 @@ class OffPolicyLearner(Learner):
 
     def metrics(self) -> Mapping[str, float]:
         """Return what the last training recorded in Stable-Baselines3's logger, such as `train/critic_loss`."""
-        found = dict(self.model.logger.name_to_value)
+        recorded = dict(self.model.logger.name_to_value)
         self.model.logger.dump()
-        return found
+        return recorded
 
     def actor(self) -> Any:
         """Return the network whose mean is the greedy action: the averaged actor if there is one."""

@@ -19,12 +19,13 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import check_environment, import_modules, task_content
 from guiderail.tools.evaluation.metrics import check_rows
-from guiderail.tools.files import LOCK, remove_partial_files, write_atomically
+from guiderail.tools.files import LOCK, remove_partial_files, write_atomically, write_error
 from guiderail.tools.learning.config import config_values, make_config
 from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
+_version = cache(metadata.version)  # reads files
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -63,11 +64,6 @@ def installed_versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES}
 
 
-@cache
-def _version(name: str) -> str:
-    return metadata.version(name)
-
-
 class RunFolder:
     """Files of one run.
 
@@ -79,11 +75,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path | str):
-        """Construct the folder's interface.
-
-        Args:
-            path: The folder; it need not exist.
-        """
+        """Construct the interface of the folder `path`, which need not exist."""
         self.path = Path(path)
 
     @property
@@ -115,9 +107,7 @@ class RunFolder:
         except filelock.Timeout:
             raise InputError(f"another process writes into {self.path}: wait for it, or name another folder") from None
         except OSError as error:
-            raise InputError(
-                f"{self.path} cannot be written ({error.strerror}): choose a folder with room to write"
-            ) from error
+            raise write_error(self.path, error) from error
         try:
             remove_partial_files(self.path)
             yield
@@ -126,20 +116,12 @@ class RunFolder:
             lock.release()
 
     def create(self, config: RunConfig) -> None:
-        """Write the configuration of a new run.
-
-        Raises:
-            InputError: If the folder is not empty.
-        """
+        """Write the configuration of a new run; raise an InputError if the folder is not empty."""
         self.refuse_existing()
         self.write_config(config)
 
     def remove_unstarted(self, *, remove_folder: bool) -> None:
-        """Remove the configuration of a run that has written nothing else; otherwise do nothing.
-
-        Args:
-            remove_folder: Remove the folder too.
-        """
+        """Remove the configuration of a run that has written nothing else, and with `remove_folder` the folder too."""
         if [one.name for one in self.path.iterdir() if not one.name.startswith(".")] != ["config.yaml"]:
             return
         (self.path / "config.yaml").unlink()
@@ -223,11 +205,7 @@ class RunFolder:
         write_atomically(self.path / "episodes.csv", table_text(rows).encode())
 
     def episodes(self) -> pd.DataFrame:
-        """Read `episodes.csv`.
-
-        Raises:
-            InputError: If the file is missing or not a table of episodes.
-        """
+        """Read `episodes.csv`; raise an InputError if it is missing or not a table of episodes."""
         return check_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
 
 

@@ -135,27 +135,15 @@ def start_or_resume(
 ) -> Run:
     """Train with a progress bar and draw the learning curve and the replay page; None stands for a default.
 
-    A resumed run keeps its configuration; only `episodes` may be larger.
+    A resumed run keeps its configuration; only `episodes` may be larger. The arguments are those of `train` and:
 
-    Args:
-        task: Name of the task; None with `resume`.
-        out: Folder of the run.
-        environment: Options of the environment by name.
-        algorithm: Registered name of the learner.
-        preset: Name of the learner's preset.
-        settings: Settings of the learner by name.
-        episodes: Total number of episodes.
-        seed: Seed of everything random.
-        resume: Continue the run in `out`.
-        imports: Modules or files (.py) that register the task, the learner, …
-        step_log: Whether every control step is written to the step log.
-        log: Formats of the learning log.
-        make_supervisor: Constructs the supervisor of a run with a human in the loop.
-        find_demonstrator: Returns the policy of the learner's `demonstration_episodes` for a task's name, or raises an
-            InputError if there is none.
-
-    Raises:
-        InputError: As `train`.
+    - `task`: name of the task; None with `resume`.
+    - `environment`: options of the environment by name.
+    - `imports`: modules or files (.py) that register the task, the learner, …
+    - `step_log`: whether every control step is written to the step log.
+    - `make_supervisor`: constructs the supervisor of a run with a human in the loop.
+    - `find_demonstrator`: returns the policy of the learner's `demonstration_episodes` for a task's name, or raises an
+      InputError if there is none.
     """
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
@@ -202,17 +190,8 @@ def configure(
 ) -> RunConfig:
     """Return a checked configuration with everything resolved.
 
-    Args:
-        task: Name of the task.
-        environment: Options of the environment by name.
-        algorithm: Registered name of the learner; None for the preset's.
-        preset: Name of the learner's preset; None for the learner's default.
-        settings: Settings of the learner by name.
-        episodes: Total number of episodes.
-        seed: Seed of everything random.
-        imports: Modules or files that register what is not installed, as `import_modules` returns them.
-        step_log: Whether every control step is written to the step log.
-        human_in_the_loop: Whether the run has a supervisor.
+    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. The algorithm is the
+    preset's by default, and the preset the algorithm's; `with_defaults` supplies the task's instead.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.

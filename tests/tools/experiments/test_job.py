@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.job import Attempt, count_attempts
+from guiderail.tools.experiments.job import attempt, count_attempts
 from guiderail.tools.learning.run_folder import installed_versions
 
 
@@ -21,13 +21,13 @@ def work(job):
 
 
 def test_log_has_the_attempts_and_the_outcome(tmp_path):
-    job, attempt = Job(tmp_path / "log.txt"), Attempt(work, installed_versions())
+    job, versions = Job(tmp_path / "log.txt"), installed_versions()
     assert count_attempts(job.log) == 0
-    assert attempt(job).rows == ({"success_rate": 1.0},)
+    assert attempt(job, work=work, versions=versions).rows == ({"success_rate": 1.0},)
     known = job.log.stat().st_size
     assert (count_attempts(job.log), count_attempts(job.log, known)) == (1, 0)
     assert "is done" in job.log.read_text()
-    attempt(job)
+    attempt(job, work=work, versions=versions)
     assert count_attempts(job.log, known) == 1
 
 
@@ -41,7 +41,7 @@ def test_log_has_the_attempts_and_the_outcome(tmp_path):
 )
 def test_failure_of_any_kind_is_one_sentence(error, sentence, traced, tmp_path):
     job = Job(tmp_path / "log.txt", error)
-    failure = Attempt(work, installed_versions())(job).failure
+    failure = attempt(job, work=work, versions=installed_versions()).failure
     assert failure.startswith(sentence)
     assert "\n" not in failure
     assert ("Traceback" in job.log.read_text()) == traced
@@ -49,12 +49,13 @@ def test_failure_of_any_kind_is_one_sentence(error, sentence, traced, tmp_path):
 
 def test_worker_with_other_versions_is_refused(tmp_path):
     job = Job(tmp_path / "log.txt")
-    failure = Attempt(work, installed_versions() | {"numpy": "0.9"})(job).failure
+    failure = attempt(job, work=work, versions=installed_versions() | {"numpy": "0.9"}).failure
     assert "instead of 0.9: install the same versions" in failure
     assert not job.log.exists()
 
 
 def test_worker_without_the_folder_is_refused(tmp_path):
-    failure = Attempt(work, installed_versions())(Job(tmp_path / "elsewhere" / "log.txt")).failure
+    job = Job(tmp_path / "elsewhere" / "log.txt")
+    failure = attempt(job, work=work, versions=installed_versions()).failure
     assert "--out must be a folder that all workers share" in failure
     assert not (tmp_path / "elsewhere").exists()

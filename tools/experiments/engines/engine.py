@@ -64,12 +64,7 @@ register_engine = ENGINES.register
 
 
 def make_engine(name: str = "process", processes: int | None = None, address: str | None = None) -> Engine:
-    """Return an engine by name.
-
-    Args:
-        name: Registered name.
-        processes: Number of jobs that run at once.
-        address: Address of a cluster.
+    """Return the engine of a registered name for a number of jobs at once, or for the address of a cluster.
 
     Raises:
         InputError: If the name is unknown, or an argument is out of range or not supported by the engine.

@@ -22,15 +22,7 @@ class ProcessEngine(Engine):
     """Processes of this machine; a single one is the current process."""
 
     def __init__(self, processes: int | None = None, address: str | None = None):
-        """Construct the engine.
-
-        Args:
-            processes: Number of processes; 2 by default.
-            address: Must be None.
-
-        Raises:
-            InputError: If an address is given.
-        """
+        """Construct the engine with a number of processes, 2 by default; raise an InputError if `address` is given."""
         if address is not None:
             raise InputError("--address is that of a Ray cluster: give --engine ray too, or leave it out")
         self.processes = DEFAULT_PROCESSES if processes is None else processes
