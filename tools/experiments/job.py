@@ -63,19 +63,12 @@ EVALUATED = (
 
 @dataclass(frozen=True)
 class Job:
-    """One method of a study with one seed.
-
-    Attributes:
-        study: The study.
-        method: Name of the method.
-        seed: Seed of training.
-        out: Folder of the study.
-    """
+    """One method of a study with one seed."""
 
     study: Study
-    method: str
-    seed: int
-    out: Path
+    method: str  # name of the method
+    seed: int  # seed of training
+    out: Path  # folder of the study
 
     @property
     def learns(self) -> bool:
@@ -84,11 +77,7 @@ class Job:
 
     @property
     def after_episodes(self) -> list[int]:
-        """Numbers of training episodes after which the policy is evaluated; [0] without training.
-
-        Raises:
-            InputError: If the study does not tell the number of training episodes.
-        """
+        """Numbers of training episodes after which the policy is evaluated; [0] without training."""
         if not self.learns:
             return [0]
         own, common = self.study.methods[self.method].learner.episodes, self.study.learner.episodes
@@ -100,11 +89,7 @@ class Job:
         return sorted({number for number in self.study.after_episodes if number < episodes} | {episodes})
 
     def config(self, episodes: int) -> RunConfig:
-        """Return the configuration of the run with a number of episodes.
-
-        Raises:
-            InputError: If a name is unknown or a value is out of range.
-        """
+        """Return the configuration of the run with a number of episodes; raise an InputError as `configure` does."""
         study, method = self.study, self.study.methods[self.method]
         choices = [study.learner, method.learner]
         given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
@@ -133,11 +118,7 @@ class Job:
 
 
 def check_job(job: Job) -> None:
-    """Check a job before anything runs.
-
-    Raises:
-        InputError: If the declaration makes no sense for the task, or the folder holds another run.
-    """
+    """Raise an InputError if the declaration of a job is not possible for its task, or its folder holds another run."""
     config, policy = job.config(job.after_episodes[-1]), job.study.methods[job.method].policy
     if policy not in (LEARNED, BEST_CONSTANT):
         make_baseline(job.study.task, policy)
@@ -229,7 +210,7 @@ def _refuse_lost_policy(job: Job, episodes: int) -> None:
 def digest(job: Job, eval_set: EvalSet | None = None, episodes: int = 0) -> str:
     """Return the digest of everything that decides evaluated episodes, for the name of their file.
 
-    The environment counts as resolved, because the options that a difficulty stands for may change.
+    It contains the resolved environment, because the options that a difficulty stands for may change.
     """
     method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     evaluation = "" if eval_set is None else eval_set.model_dump_json(exclude={"name", "file"})

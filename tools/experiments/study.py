@@ -66,12 +66,9 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
         check_job(job)
     _refuse_shared_folders(jobs)
     outcomes = _run_jobs(jobs, engine or make_engine(), console)
-    rows = pd.DataFrame([row for index in range(len(jobs)) for row in outcomes[index].rows], dtype=object)
-    failed = [
-        f"{job.method}, seed {job.seed}, failed: {outcomes[index].failure}"
-        for index, job in enumerate(jobs)
-        if outcomes[index].failure
-    ]
+    pairs = [(job, outcomes[index]) for index, job in enumerate(jobs)]
+    rows = pd.DataFrame([row for _, outcome in pairs for row in outcome.rows], dtype=object)
+    failed = [f"{job.method}, seed {job.seed}, failed: {one.failure}" for job, one in pairs if one.failure]
     if failed:
         raise RunsFailedError(failed, rows)
     return rows
@@ -250,14 +247,9 @@ def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], lis
 
 
 def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | str:
-    """Return where the success rate first falls below `BREAKING_SUCCESS`, interpolated linearly.
+    """Return the value where the success rate first falls below `BREAKING_SUCCESS`, interpolated linearly.
 
-    Args:
-        values: Values of the quantity, the easiest first.
-        rates: Success rate at each value.
-
-    Returns:
-        The value, `AT_ONCE` if already the easiest value is below, or `NEVER`.
+    It is `AT_ONCE` if already the first value, the easiest one, is below, and `NEVER` if none is.
     """
     if rates[0] < BREAKING_SUCCESS:
         return AT_ONCE

@@ -21,17 +21,11 @@ Actor = dict[str, torch.Tensor]
 
 @dataclass
 class Candidate:
-    """Actor with the number of consecutive greedy successes around it.
+    """Actor with the number of consecutive greedy successes around it."""
 
-    Attributes:
-        actor: Parameters by name.
-        before: Consecutive greedy successes before its episode.
-        since: Consecutive greedy successes from its own episode on.
-    """
-
-    actor: Actor
-    before: int
-    since: int = 0
+    actor: Actor  # parameters by name
+    before: int  # successes before its episode
+    since: int = 0  # successes from its own episode on
 
     def score(self) -> int:
         """Return the successes on the weaker side: an actor that succeeds by luck has few on one of them."""
@@ -47,11 +41,7 @@ class CheckpointSelection:
     """
 
     def __init__(self, window: int):
-        """Construct the selection.
-
-        Args:
-            window: Successes before and after an actor beyond which more do not count; then the latest actor is taken.
-        """
+        """Construct the selection; more than `window` successes before or after an actor count as `window`."""
         self.window = window
         self._selected: Candidate | None = None
         self._open: list[Candidate] = []  # candidates of the current streak

@@ -143,12 +143,9 @@ def action_gamma(config: OffPolicyConfig, action_repeat: int) -> float:
 def resolve_preset(
     preset: str | None, algorithm: str | None = None, settings: Mapping[str, Any] | None = None
 ) -> LearnerConfig:
-    """Return the configuration of a learner: a preset with single settings replaced.
+    """Return the configuration of a learner: a preset, by default `default_preset`, with single settings replaced.
 
-    Args:
-        preset: Name of the preset; None for `default_preset` of the algorithm.
-        algorithm: Registered name of the learner; None for the preset's.
-        settings: Values by name, as numbers or as text.
+    The algorithm is the preset's by default. Settings are numbers or text by name.
 
     Raises:
         InputError: If a name is unknown, the preset is of another kind of learner, or a value is out of range.
@@ -171,11 +168,7 @@ def default_preset(algorithm: str) -> str | None:
 
 
 def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
-    """Validate settings against the configuration class of a learner.
-
-    Args:
-        algorithm: Registered name of the learner.
-        settings: Values by name; the class's defaults stand for those that are missing.
+    """Validate settings against the configuration class of a learner, whose defaults stand for missing ones.
 
     Raises:
         InputError: If there is no such learner or setting, or a value is out of range.

@@ -161,10 +161,7 @@ class DeferredLearner(NamedTuple):
 
 # An entry is a class derived from `Learner`, or a callable with its arguments and a `Config`.
 LEARNERS: Registry[Any] = Registry(
-    "algorithm",
-    package="guiderail.tools.learning",
-    decorator="register_learner",
-    entry_points="guiderail.learners",
+    "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners"
 )
 register_learner = LEARNERS.register
 
@@ -175,13 +172,9 @@ def divergence_error() -> InputError:
 
 
 def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
-    """Return the keyword arguments that a learner is constructed with.
+    """Return the keyword arguments of a learner for the `RunConfig` and the task of a run.
 
     There is no symmetry if the demonstrations have been corrected by via-points: they are not symmetric then.
-
-    Args:
-        config: `RunConfig` of the run.
-        task: Task of the run.
     """
     symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
     is_corrected = config.human_in_the_loop or bool(config.environment.get("via_points"))
@@ -194,11 +187,7 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
 
 
 def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the names of log formats as a tuple.
-
-    Raises:
-        InputError: If a format is unknown, or its package is not installed.
-    """
+    """Return the names of log formats; raise an InputError if one is unknown, or its package is not installed."""
     names = (formats,) if isinstance(formats, str) else tuple(formats)
     for name in names:
         if name not in LOG_FORMATS:

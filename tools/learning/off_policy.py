@@ -69,9 +69,7 @@ class NormalizedReLU(torch.nn.Module):
 def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     """Return the policy of a Stable-Baselines3 actor: linear layers with rectifiers between them, and a final tanh.
 
-    Args:
-        actor: The actor network.
-        description: Further entries of the policy's description, such as the observation's shape.
+    `description` holds further entries of the policy's description, such as the observation's shape.
 
     Raises:
         InputError: If the actor has other layers.
@@ -127,16 +125,7 @@ class OffPolicyLearner(Learner):
         max_transitions: int,
         symmetry: Symmetry | None = None,
     ):
-        """Construct the learner.
-
-        Args:
-            config: Settings.
-            env: Environment; only its spaces are used.
-            action_repeat: Control steps that an action lasts.
-            seed: Seed of the networks and of everything random in training.
-            max_transitions: Largest number of transitions of the run, which bounds the replay buffer's memory.
-            symmetry: Symmetry of the task; used if the settings say so.
-        """
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.symmetry = symmetry if config.symmetry else None
         self._copies = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)  # of a transition in the buffer
         networks: dict[str, Any] = {"net_arch": list(config.net_arch), "optimizer_kwargs": {"fused": True}}
@@ -345,9 +334,9 @@ class OffPolicyLearner(Learner):
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
-        arrays = {
-            f"{m}/{k}": v.numpy() for m, module in self._modules().items() for k, v in module.state_dict().items()
-        }
+        arrays: dict[str, np.ndarray] = {}
+        for name, module in self._modules().items():
+            arrays |= {f"{name}/{key}": value.numpy() for key, value in module.state_dict().items()}
         for name, optimizer in self._optimizers().items():
             for index, moments in optimizer.state_dict()["state"].items():
                 arrays |= {f"optimizer/{name}/{index}/{key}": value.numpy() for key, value in moments.items()}
@@ -359,9 +348,8 @@ class OffPolicyLearner(Learner):
             arrays |= {f"selection/{key}": value.numpy() for key, value in actors.items()}
         buffer = self.model.replay_buffer
         arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in _BUFFER_ARRAYS}
-        arrays["random/torch"] = torch.get_rng_state().numpy()
         kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
-        arrays["random/numpy"] = np.asarray(keys)
+        arrays |= {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
         return arrays, {
             "transitions": self.transitions,
             "episodes": self.episodes,
@@ -395,8 +383,7 @@ class OffPolicyLearner(Learner):
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.transitions, self.model._n_updates = values["transitions"], values["updates"]
-        self.episodes = values["episodes"]
-        self._greedy_successes = values["greedy_successes"]
+        self.episodes, self._greedy_successes = values["episodes"], values["greedy_successes"]
         if self.selection is not None:
             actors = {key.removeprefix("selection/"): v for key, v in tensors.items() if key.startswith("selection/")}
             self.selection.restore(actors, values["selection"])

@@ -195,10 +195,8 @@ class PipelinedLearner(Learner):
         if (message := self._receive()) is not None:
             raise ValueError(message)
         if parts["pending"]:
-            columns = [parts["pending"][name] for name in _STORED]
-            self._pending = [
-                Transition(**dict(zip(_STORED, one, strict=True)), info={}) for one in zip(*columns, strict=True)
-            ]
+            columns = zip(*(parts["pending"][name] for name in _STORED), strict=True)
+            self._pending = [Transition(**dict(zip(_STORED, one, strict=True)), info={}) for one in columns]
         self.submit_episode()
 
     def _send(self, message: tuple[Any, ...]) -> None:

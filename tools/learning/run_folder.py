@@ -144,21 +144,17 @@ class RunFolder:
         if is_taken:
             raise InputError(f"{self.path} already exists: name another folder, or resume that run with --resume")
 
-    def refuse_another(self, config: RunConfig, also: Sequence[str] = ()) -> None:
+    def refuse_another(self, config: RunConfig) -> None:
         """Check that the folder holds the run of a configuration.
 
-        Args:
-            config: The configuration.
-            also: Further fields to compare.
-
         Raises:
-            InputError: If task, environment, learner, seed, the files of the task or one of `also` differs.
+            InputError: If task, environment, learner, seed or the files of the task differ.
         """
         stored = self.config()
         stored.refuse_changed_task(self.path)
         # An option that is missing in the stored configuration has its default.
         stored = replace(stored, environment=as_arguments(check_environment(stored.task, stored.environment)))
-        for key in ("task", "environment", "learner", "seed", *also):
+        for key in ("task", "environment", "learner", "seed"):
             if getattr(stored, key) != getattr(config, key):
                 raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
 

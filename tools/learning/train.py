@@ -208,12 +208,9 @@ def configure(
 
 
 def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Complete arguments of `configure` by the task's own learner.
+    """Complete the arguments of `configure` by the task's own learner.
 
-    Args:
-        task: Name of the task.
-        given: Arguments of `configure`. The task's learner is used if neither `algorithm` nor `preset` is among them;
-            `settings` replaces single settings of it.
+    It is used if neither `algorithm` nor `preset` is given; the given `settings` replace single settings of it.
     """
     has_learner = given.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     learner: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
@@ -250,7 +247,9 @@ def _resumed_config(
     config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
     stored |= {"step_log": config.step_log, "human_in_the_loop": config.human_in_the_loop} | config.environment
-    environment = {key: check_environment(config.task, environment).get(key, environment[key]) for key in environment}
+    if environment:
+        resolved = check_environment(config.task, environment)
+        environment = {key: resolved.get(key, value) for key, value in environment.items()}
     wanted = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in wanted.items():
         if key == "episodes" and value < config.episodes:

@@ -11,15 +11,17 @@ from guiderail.tools.cli.main import main
 from guiderail.tools.environments import import_modules, make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.metrics import statistics_of
+from guiderail.tools.evaluation.metrics import statistics_of, wilson
 from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.job import Job, check_job
 from guiderail.tools.experiments.study import (
     AT_ONCE,
     NEVER,
+    _success,
     breaking_point,
     differences_by_method,
+    draw_sweeps,
     each,
     ratio,
     run_study,
@@ -120,7 +122,7 @@ def test_study_imports_what_registers_its_task(tmp_path):
         "if 'guiderail/Pearl-v0' not in gymnasium.registry:\n"
         "    gymnasium.register('guiderail/Pearl-v0', entry_point=bead.Bead)\n"
     )
-    with pytest.raises(InputError, match="there is no .*file or task folder"):
+    with pytest.raises(InputError, match=r"there is no .*file or task folder"):
         run(study(task="Pearl", imports=[str(tmp_path / "perl.py")], after_episodes=[2]), tmp_path / "out")
     rows = run(study(task="Pearl", imports=[str(file)], seeds=[5], after_episodes=[2]), tmp_path / "out")
     assert rows["seed"].tolist() == [5]
@@ -423,3 +425,26 @@ def test_subset_of_a_study_has_a_table_of_its_own(tmp_path):
         name = "-".join(["beads", *words[1:]])
         assert len(read_table(tmp_path / "out" / f"{name}.csv")) == rows
     assert len(read_table(tmp_path / "out" / "beads.csv")) == 4
+
+
+def sweep_rows(*rates):
+    found = [
+        {"method": "one", "eval_set": "x", "seed": k, "after_episodes": 60, "episodes": 50} for k in range(len(rates))
+    ]
+    return pd.DataFrame(found, dtype=object).assign(success_rate=rates)
+
+
+def test_band_spans_the_intervals_of_all_seeds():
+    assert _success(sweep_rows(0.8), "one", "x") == pytest.approx((0.8, *wilson(40, 50)))
+    assert _success(sweep_rows(1.0, 0.0), "one", "x") == pytest.approx((0.5, wilson(0, 50)[0], wilson(50, 50)[1]))
+    assert _success(sweep_rows(1.0, 1.0), "one", "x") == pytest.approx((1.0, *wilson(50, 50)))
+    assert _success(sweep_rows(1.0), "another", "x") is None
+
+
+def test_sweep_of_one_value_is_drawn(tmp_path):
+    one = Study.model_validate(
+        {"name": "one", "task": "Bead", "methods": {"one": {"policy": "zero"}}, "seeds": [0], "eval_set": [],
+         "sweeps": [{"quantity": "x", "at": {1.0: {}}}]}
+    )  # fmt: skip
+    found = sweep_rows(0.5).assign(eval_set="x 1")
+    assert draw_sweeps(one, found, tmp_path / "one.png").is_file()

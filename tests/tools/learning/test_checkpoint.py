@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+import torch
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.checkpoint import CheckpointSelection, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
@@ -43,3 +44,63 @@ def test_load_checkpoint_refuses_a_flipped_bit(checkpoint):
 def test_load_checkpoint_names_a_missing_file(tmp_path):
     with pytest.raises(InputError, match=r"state\.safetensors"):
         load_checkpoint(tmp_path / "state.safetensors")
+
+
+def run_greedy_episodes(selection, outcomes, first=0, row=0):
+    """Run greedy episodes with these outcomes; the weight of each actor is the number of its episode."""
+    for number, success in enumerate(outcomes, first):
+        actor = torch.nn.Linear(1, 1)
+        torch.nn.init.constant_(actor.weight, number)
+        selection.begin(actor, row)
+        selection.finish(success)
+        row = row + 1 if success else 0
+    return selection
+
+
+def selected(selection):
+    result = selection.result()
+    return None if result is None else int(result["weight"])
+
+
+def test_selection_is_empty_without_successes_on_both_sides():
+    assert selected(run_greedy_episodes(CheckpointSelection(3), [1])) is None
+    assert selected(run_greedy_episodes(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
+    assert selected(run_greedy_episodes(CheckpointSelection(3), [0, 1, 1])) == 2
+
+
+def test_selection_takes_the_middle_of_the_longest_streak():
+    #                                  0  1  2  3  4  5  6  7  8  9 10 11
+    assert selected(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
+    assert selected(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7  # two on each side
+
+
+def test_selection_keeps_a_long_streak_over_a_later_short_one():
+    # The actor of episode 9 was followed by six that succeeded, but nothing before it did.
+    assert selected(run_greedy_episodes(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
+
+
+def test_selection_takes_the_latest_beyond_the_window():
+    assert selected(run_greedy_episodes(CheckpointSelection(2), [1] * 9)) == 7
+    assert selected(run_greedy_episodes(CheckpointSelection(2), [1] * 9 + [0])) == 7
+
+
+def test_selection_continues_when_restored():
+    first = run_greedy_episodes(CheckpointSelection(3), [0, 1, 1, 0, 1])
+    second = CheckpointSelection(3)
+    second.restore(*first.state())
+    for one in (first, second):
+        run_greedy_episodes(one, [1, 1, 1, 1, 1], first=5, row=1)
+    assert selected(first) == selected(second) == 7
+    assert first.state()[1] == second.state()[1]
+
+
+def test_selection_ignores_an_excluded_episode():
+    plain, excluded = (
+        run_greedy_episodes(CheckpointSelection(3), [0, 1, 1]),
+        run_greedy_episodes(CheckpointSelection(3), [0, 1]),
+    )
+    excluded.begin(torch.nn.Linear(1, 1), 1)
+    excluded.exclude()
+    run_greedy_episodes(excluded, [1], first=2, row=1)
+    assert selected(excluded) == selected(plain) == 2
+    assert excluded.state()[1] == plain.state()[1]
