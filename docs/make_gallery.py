@@ -214,8 +214,8 @@ def _created_task(name: str) -> str:
     folder, drawn = Path(SCRATCH.name) / name, PARTS[name]()
     folder.mkdir()
     turn = float(dict(zip(drawn.options[::2], drawn.options[1::2], strict=True)).get("--turn", 0.0))
-    create_task(*drawn.write(folder), folder / "task", unit="mm", turn=turn)
-    return task_named(str(folder / "task"))[0]
+    create_task(*drawn.write(folder), folder / f"{name}_task", unit="mm", turn=turn)
+    return task_named(str(folder / f"{name}_task"))[0]
 
 
 def _with_offset(distance: float) -> dict[str, Any]:
@@ -257,9 +257,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "passage_learned": (
         lambda: [
-            Panel(
-                "before learning", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, describe=_obstacle
-            ),
+            Panel("before learning", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, describe=_obstacle),
             Panel(
                 f"after {LEARNING_EPISODES} episodes, sKGRL",
                 "NarrowPassage",
@@ -283,7 +281,10 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
         lambda: [
             Panel("demonstration", "BncConnector", {"guidance": "kgrl"}, zero_policy),
             Panel(
-                "scripted, through KGRL", "BncConnector", {"guidance": "kgrl"}, make_baseline("BncConnector", "scripted")
+                "scripted, through KGRL",
+                "BncConnector",
+                {"guidance": "kgrl"},
+                make_baseline("BncConnector", "scripted"),
             ),
         ],
         SQUARE,
@@ -311,9 +312,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "parts": (
         lambda: [
             Panel("bayonet", partial(_created_task, "bayonet"), _with_offset(0.0), zero_policy),
-            Panel(
-                "the same, 1.5 mm off", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy
-            ),
+            Panel("the same, 1.5 mm off", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy),
             Panel("snap-fit", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
         ],
         SQUARE,

@@ -90,7 +90,7 @@ def test_policy_is_refused_with_the_options_that_differ():
     env = make_environment("NarrowPassage", {"guidance": "kgrl"})
     learned_in = check_environment("NarrowPassage", {"guidance": "kgrl", **HARD})
     with pytest.raises(
-        InputError, match="it learned with difficulty='hard' instead of 'standard', gap_width=0.03 inst"
+        InputError, match=r"it learned with difficulty='hard' instead of 'standard', gap_width=0.03 inst"
     ):
         check_compatible(policy(4, 2), env, learned_in)
 

@@ -84,7 +84,7 @@ def test_same_seed_repeats_an_episode_bit_for_bit(guidance):
     actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
 
     def episode(env):
-        rewards, observations, infos = play(env, lambda k: actions[k], seed=5)
+        rewards, observations, _ = play(env, lambda k: actions[k], seed=5)
         return rewards, observations, env.trace.measured.copy(), env.trace.force.copy(), env.trace.statistics()
 
     used = make(guidance)

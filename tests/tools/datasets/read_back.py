@@ -1,8 +1,8 @@
 """Read exported demonstrations with the libraries of the formats: LeRobot's, and MCAP's for ROS 2.
 
 `python tests/tools/datasets/read_back.py --environment FOLDER [--interpreter python3.12]` creates an environment
-there with both libraries, which cannot be installed together with this package (5 GB), or uses an existing one. The exit
-code is 1 if a number differs by more than the rounding of its format.
+there with both libraries, which cannot be installed together with this package (5 GB), or uses an existing one. The
+exit code is 1 if a number differs by more than the rounding of its format.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Learn six parts that no parameter was tuned for: create their tasks, train and evaluate with the commands alone.
 
 `python tests/tools/parts/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60] [--held-out 100]
-[--seed 0] [--processes 2]`; `--episodes 0` creates the tasks only. The same command resumes an interrupted run. It writes `table.md` and a
-log of each part.
+[--seed 0] [--processes 2]`; `--episodes 0` creates the tasks only. The same command resumes an interrupted
+run. It writes `table.md` and a log of each part.
 """
 
 import argparse

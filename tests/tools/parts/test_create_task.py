@@ -214,7 +214,7 @@ def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
 
 
 def test_parts_drawn_in_another_pose_give_the_same_task(tmp_path):
-    """Drawn lying along x, and the plug apart from its socket: --axis and --plug-pose bring both to the target frame."""
+    """Parts along x, the plug apart from its socket: --axis and --plug-pose bring both to the target frame."""
     from guiderail.tools.parts.create_task import read_parts
 
     plug, socket = PARTS["square_peg"]().write(tmp_path)
