@@ -75,8 +75,8 @@ class GuidedEnv(DrakeGymEnv):
 
     The simulation fails if Drake reports a solver that does not converge or NaN, while it advances the diagram or
     evaluates a port, or if a pose or a joint speed is implausible. The failed control step is dropped, the episode is
-    truncated with the last valid observation, and `info["simulation_failure"]` is the message. After a failed
-    reset the first step truncates the episode. A failure before the first valid observation and every other error propagate.
+    truncated with the last valid observation, and `info["simulation_failure"]` is the message. After a failed reset the
+    first step truncates the episode. A failure before the first valid observation and every other error propagate.
 
     Attributes:
         task: The `TaskDiagram`.

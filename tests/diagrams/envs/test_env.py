@@ -255,7 +255,7 @@ def test_simulation_failure_truncates_with_the_last_observation(error):
 
 
 PORTS = [port.get_name() for port in map(Toy().get_output_port, range(Toy().num_output_ports()))]
-READ_AT_RESET = {"observation", "pose", "commanded_violation", "measured_violation", "fallback"}
+READ_AT_RESET = ("observation", "pose", "commanded_violation", "measured_violation", "fallback")
 
 
 @pytest.mark.parametrize("port", PORTS)
