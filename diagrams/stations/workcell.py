@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import ClassVar, Protocol, runtime_checkable
 
 from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
+from pydrake.systems.framework import Context
 
+from guiderail.models.common.parsing import add_model
 from guiderail.models.objects.surfaces import Surface
 
 
@@ -45,11 +49,62 @@ class ConvexWorkcell(Protocol):
         """Return the contact surfaces of the workpiece, in its body's frame."""
 
 
-def movable_frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:
-    """Return a frame with a pose in its parent that can be set in the context; bodies welded to it follow."""
-    frame = plant.GetFrameByName(name)
-    assert isinstance(frame, FixedOffsetFrame)
-    return frame
+class MovableWorkcell(ABC):
+    """Workcell with a fixture and a workpiece on frames, which a reset moves in the context.
+
+    Attributes:
+        fixture: Name of the fixture's body.
+        workpiece: Name of the workpiece's body.
+    """
+
+    fixture: ClassVar[str]
+    workpiece: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def X_WF(self) -> RigidTransform:
+        """Pose of the nominal fixture."""
+
+    @property
+    @abstractmethod
+    def X_FT(self) -> RigidTransform:
+        """Pose of the target on the fixture."""
+
+    @abstractmethod
+    def sdf(self, body: str) -> Path:
+        """Return the path of the SDF file of a body."""
+
+    @property
+    def X_WT(self) -> RigidTransform:
+        """Pose of the target: the workpiece in the nominal fixture."""
+        return self.X_WF @ self.X_FT
+
+    def add_fixture(self, plant: MultibodyPlant) -> None:
+        """Add the fixture, on a frame that `set_fixture_offset` moves."""
+        self._add(plant, self.fixture, FixedOffsetFrame("fixture_mount", plant.world_frame(), self.X_WF))
+
+    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
+        """Add the workpiece, on a frame that `set_grasp_offset` moves."""
+        return self._add(plant, self.workpiece, FixedOffsetFrame("grasp", tool_center, RigidTransform()))
+
+    def _add(self, plant: MultibodyPlant, name: str, frame: FixedOffsetFrame) -> RigidBody:
+        body = plant.GetBodyByName(name, add_model(plant, self.sdf(name)))
+        plant.WeldFrames(plant.AddFrame(frame), body.body_frame())
+        return body
+
+    def set_fixture_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
+        """Move the fixture so that the task is done at X_TTactual instead of at the target."""
+        X_WF = self.X_WT @ X_TTactual @ self.X_FT.inverse()
+        plant.GetFrameByName("fixture_mount").SetPoseInParentFrame(plant_context, X_WF)
+
+    def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PWorkpiece: RigidTransform) -> None:
+        """Move the workpiece in the tool."""
+        plant.GetFrameByName("grasp").SetPoseInParentFrame(plant_context, X_PWorkpiece)
+
+    def workpiece_in_target(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
+        """Return the pose of the workpiece from its place in the actual fixture: the identity when the task is done."""
+        X_FWorkpiece = plant.GetFrameByName(self.workpiece).CalcPose(plant_context, plant.GetFrameByName(self.fixture))
+        return self.X_FT.inverse() @ X_FWorkpiece
 
 
 def exclude_contacts(

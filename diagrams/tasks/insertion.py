@@ -8,13 +8,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.observation import affine
 from guiderail.diagrams.envs.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.offsets import HiddenOffsets
+from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.task import Task
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
+from guiderail.models.primitives import LinearConstraints
+from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
 
@@ -97,17 +103,55 @@ class InsertionTask(Task):
         station.set_pose(context, self.start_pose(rng))
         return {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 
-    @abstractmethod
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Move fixture and workpiece by their offsets.
+        """Move fixture and workpiece of a `MovableWorkcell` by their offsets.
 
         Args:
             station: Station.
             context: Root context.
-            fixture: Offset of the fixture, (n,), as this task samples it.
-            workpiece: Offset of the workpiece, (n,).
+            fixture: (x, y) of the fixture [m], and its turn about z [rad] if it has one.
+            workpiece: (x, y) of the workpiece in the tool [m], and its tilt about x and y [rad] if it has one.
         """
+        plant, workcell = station.plant, self.workcell()
+        own = plant.GetMyMutableContextFromRoot(context)
+        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
+        tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
+        workcell.set_fixture_offset(plant, own, RigidTransform(turn, [*fixture[:2], 0.0]))
+        workcell.set_grasp_offset(plant, own, RigidTransform(tilt, [*workpiece[:2], 0.0]))
 
     @abstractmethod
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return the pose at which an episode starts, (6,)."""
+
+
+class DemonstratedInsertion(InsertionTask):
+    """Insertion with demonstrations and box constraints, and with the center of pressure as a signal."""
+
+    isotropic_groups = ((0, 1, 2), (3, 4, 5))
+    options: Any  # with `start_offset_max`
+
+    @abstractmethod
+    def constraints(self) -> LinearConstraints:
+        """Return the bounds of every commanded pose."""
+
+    def keep_out(self) -> KeepOut:
+        """Return no walls: safe residual learning is projected to the constraints alone."""
+        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Return the workpiece's pose in the fixture and the center of pressure."""
+        system = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
+        builder.Connect(station.get_wrench_output_port(), system.get_wrench_input_port())
+        return {**super().signals(builder, station), "center_of_pressure": system.get_center_of_pressure_output_port()}
+
+    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
+        """Return the demonstrations' start plus a sampled offset, inside the constraints."""
+        start = self.reference().means[0].copy()
+        if self.options.start_offset_max > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
+        return self.constraints().nearest(start)
+
+    def action_dims(self) -> list[int]:
+        """Return the indices of the outputs that an action moves."""
+        chosen = self.config.options["action_dims"]
+        return list(range(POSE_SIZE) if chosen is None else chosen)

@@ -143,7 +143,7 @@ def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1
     station = STATIONS.get(name).build(workcell)
     times = np.array([0.0, 0.6, 1.4])
     driven = DrivenStation(station, along(times, motion), round(times[-1] / CONTROL_PERIOD))
-    workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
+    workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
     if modulus != 1.0:
         station.set_contact(driven.context, 1.0, modulus)
     driven.start(motion[0])

@@ -39,7 +39,7 @@ def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], floa
     station = GantryStation(workcell, time_step=time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     if isinstance(workcell, BncWorkcell):
-        workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform(np.array(offset)))
+        workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform(np.array(offset)))
     driven.start(poses[0])
     start = time.process_time()
     signals = driven.run().signals

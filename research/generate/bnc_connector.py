@@ -44,7 +44,7 @@ def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
     """Drive a motion, (N, 6), through the gantry's impedance; return the recording and whether the plug is locked."""
     workcell = BncWorkcell()
     driven, recording = drive_along(GantryStation(workcell, time_step=TIME_STEP), TIMES, motion)
-    return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
+    return recording, workcell.is_locked(workcell.workpiece_in_target(driven.station.plant, driven.plant_context))
 
 
 def record_session(session: Session, seed: int) -> list[Recording] | None:

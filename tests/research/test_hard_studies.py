@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR
-from guiderail.diagrams.tasks.pouring.scripted import scripted_pour_aimed, scripted_pour_blind
-from guiderail.diagrams.tasks.pouring.task import POSITION_SCALE
+from guiderail.diagrams.tasks.pouring.task import POSITION_SCALE, scripted_pour_aimed, scripted_pour_blind
 from guiderail.tools.experiments.declaration import LEARNED, load_study
 from guiderail.tools.experiments.job import Job
 from research.studies import study_path

@@ -138,7 +138,7 @@ def insert(
     workcell = write_workcell(folder, file)
     station = GantryStation(workcell, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
-    workcell.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
+    workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {
         name: triangles_of(folder / part.visual)
         for name, part in ((PLUG, file.plug), (SOCKET, file.socket))

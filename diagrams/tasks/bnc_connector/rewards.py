@@ -24,13 +24,19 @@ POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
 
-def observation_terms(observation: str, num_steps: int = NUM_STEPS) -> tuple[ObservationTerm, ...]:
+def observation_terms(
+    observation: str,
+    num_steps: int = NUM_STEPS,
+    centre: np.ndarray = POSE_CENTRE,
+    scale: np.ndarray = POSE_SCALE,
+    wrench_scale: np.ndarray = WRENCH_SCALE,
+) -> tuple[ObservationTerm, ...]:
     """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
     half = 0.5 * num_steps * CONTROL_PERIOD
     state = (
         ObservationTerm("time", half, half),
-        ObservationTerm("pose", POSE_CENTRE, POSE_SCALE),
-        ObservationTerm("wrench", 0.0, WRENCH_SCALE),
+        ObservationTerm("pose", centre, scale),
+        ObservationTerm("wrench", 0.0, wrench_scale),
     )
     if observation == "state":
         return state

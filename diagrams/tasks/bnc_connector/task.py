@@ -8,44 +8,45 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import (
     OBSERVATIONS,
+    POSE_CENTRE,
+    POSE_SCALE,
     REWARDS,
     half_turn,
     observation_terms,
     reward_terms,
     sides_of_the_rim,
 )
-from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure, scripted_torque_search
 from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, BncWorkcell
-from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.offsets import in_ring, reference_of_file
+from guiderail.diagrams.tasks.insertion import DemonstratedInsertion
+from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector import demonstrations as inserting
 from guiderail.models.objects.bnc_connector import search_demonstrations as searching
-from guiderail.models.objects.insertion import HISTORY_VARIANCE, MIN_CONTACT_FORCE, REPEATABILITY_STD
+from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS, RIM
+from guiderail.models.objects.bnc_connector.search_demonstrations import HOLD_UNTIL, SEARCH
+from guiderail.models.objects.insertion import COMMAND_SCALE, HISTORY_VARIANCE, LEVER_SCALE, REPEATABILITY_STD
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
+COMPONENTS = 16
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting, "search": searching}
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
@@ -65,8 +66,53 @@ def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
 
 
+# Indices into the observation [time, pose, wrench, center of pressure, command].
+TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y, CENTER_OF_PRESSURE, COMMAND = 0, 3, 9, 10, 11, slice(13, 15), slice(15, 17)
+
+# Against the contact torque, while the demonstrations "insert" press on the rim.
+GAIN = 1.5  # action per scaled contact torque
+PRESSING = (60, 185)  # control steps
+SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTRE[2]) / POSE_SCALE[2]  # scaled height above which the plug is not in yet
+CONTACT_FORCE = 0.2  # scaled force along z above which the plug is in contact
+
+# Along the center of pressure, while the demonstrations "search" do.
+STEP = 0.5 * MM  # per action
+REACH = 3.1 * MM  # displacement that an action of one leads to
+ON_RIM = RIM - 0.5 * MM  # height above which the plug is not in yet
+MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the rim [s]
+
+
+def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
+    """Return an action in x and y against the contact torque, which tells on which side the plug stands, (2,)."""
+    step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
+    is_on_rim = observation[Z] > SCALED_RIM and observation[FORCE_Z] > CONTACT_FORCE
+    if not (PRESSING[0] < step < PRESSING[1] and is_on_rim):
+        return np.zeros(2)
+    return np.clip(GAIN * np.array([-observation[TORQUE_Y], observation[TORQUE_X]]), -1.0, 1.0)
+
+
+def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
+    """Return an action that moves the command a step towards the center of pressure, where the jack is, (2,).
+
+    After the plug has dropped in, the command stays. The policy has no memory: the last command is observed.
+
+    Raises:
+        InputError: If the observation has no center of pressure.
+    """
+    if len(observation) < COMMAND.stop:
+        raise InputError('this policy needs the center of pressure: choose observation="center_of_pressure"')
+    time = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS * CONTROL_PERIOD
+    if not MAY_PRESS < time < HOLD_UNTIL:
+        return np.zeros(2)
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+    height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTRE[2], float(np.linalg.norm(lever))
+    if height > ON_RIM and length > 0.0:
+        command = command + STEP * lever / max(length, MM)
+    return np.clip(command / REACH, -1.0, 1.0)
+
+
 @register_task("BncConnector")
-class BncConnector(InsertionTask):
+class BncConnector(DemonstratedInsertion):
     """Insert, align and lock the connector.
 
     Rewards: "sparse" is the thesis's (4.27, 4.28); "shaped" and "aligned" add to it.
@@ -86,7 +132,6 @@ class BncConnector(InsertionTask):
         "action_dims": (0, 1),
         "history_variance": HISTORY_VARIANCE,
     }
-    isotropic_groups = ((0, 1, 2), (3, 4, 5))
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
@@ -111,16 +156,6 @@ class BncConnector(InsertionTask):
         bound = np.array([self.options.bound, self.options.bound, np.inf, np.inf, np.inf, np.inf])
         return LinearConstraints.box(-bound, bound)
 
-    def keep_out(self) -> KeepOut:
-        """Return no walls: safe residual learning is projected to the alignment constraint alone."""
-        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
-
-    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Return the plug's pose in the jack and the center of pressure."""
-        lever = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
-        builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
-        return {**super().signals(builder, station), "center_of_pressure": lever.get_center_of_pressure_output_port()}
-
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimate of height and turn; lateral offset cannot be measured, and is checked by pulling."""
         size = self._workcell.dimensions
@@ -143,38 +178,18 @@ class BncConnector(InsertionTask):
 
     def symmetry(self) -> Symmetry:
         """Return half a turn about the jack's axis."""
-        action_dims = self.config.options["action_dims"]
-        action = HALF_TURN if action_dims is None else HALF_TURN[list(action_dims)]
-        return Symmetry.of_signs(half_turn(self.config.observation), action)
+        return Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()])
 
     def near_symmetry(self) -> Symmetry:
         """Return quarter turns and reflections too, which hold while the plug stands on the rim."""
-        action_dims = self.config.options["action_dims"]
-        sides = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
+        sides = sides_of_the_rim(self.config.observation, self.action_dims())
         return self.symmetry() if sides is None else Symmetry(*sides)
-
-    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Move the jack by (x, y) and its turn, and the plug by (x, y) and its tilt about x and y, if they have any."""
-        plant_context = station.plant.GetMyMutableContextFromRoot(context)
-        tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
-        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
-        self._workcell.set_jack_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
-        self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform(tilt, [*workpiece[:2], 0.0]))
-
-    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Return the demonstrations' start plus a sampled offset, inside the constraints."""
-        start = self.reference().means[0].copy()
-        if self.options.start_offset_max > 0.0:
-            start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
-        return self.constraints().nearest(start)
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        policies = (scripted_torque_search, scripted_center_of_pressure)
         default = scripted_center_of_pressure if difficulty == "hard" else scripted_torque_search
-        ordered = sorted(policies, key=lambda policy: policy is not default)
-        return {policy.__name__: policy for policy in ordered}
+        return {one.__name__: one for one in (default, scripted_torque_search, scripted_center_of_pressure)}
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the jack."""
@@ -185,17 +200,13 @@ class BncConnector(InsertionTask):
         """Return the demonstrations and the box of the alignment constraint."""
         to_world = in_frame(self._workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
-        bound = self.options.bound
+        bound, name = self.options.bound, self.options.demonstrations
+        demonstrations = DEMONSTRATIONS[name].load() if name in DEMONSTRATIONS else Demonstrations.load(Path(name))
         return Scene(
             to_world=to_world,
-            demonstrations=tuple(_load_demonstrations(self.options.demonstrations).outputs),
+            demonstrations=tuple(demonstrations.outputs),
             constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
         )
-
-
-def _load_demonstrations(demonstrations: str) -> Demonstrations:
-    known = DEMONSTRATIONS.get(demonstrations)
-    return Demonstrations.load(Path(demonstrations)) if known is None else known.load()

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
-from pydrake.systems.framework import Context
 
-from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
-from guiderail.models.common.parsing import add_model
+from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
 from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_of
 from guiderail.models.objects.bnc_connector.surfaces import jack_surfaces, plug_surfaces
@@ -38,7 +36,7 @@ HALF_TURN_OF_WRENCH = np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class BncWorkcell:
+class BncWorkcell(MovableWorkcell):
     """Jack in front of the robot's base, turned so that the target frame's axes are the world's.
 
     Attributes:
@@ -50,6 +48,8 @@ class BncWorkcell:
             barrel's lies inside its circle and the bore's outside, and the plug drops in with a larger offset.
     """
 
+    fixture: ClassVar[str] = "jack"
+    workpiece: ClassVar[str] = "plug"
     dimensions: BncDimensions = field(default_factory=BncDimensions)
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)
     friction: float = FRICTION
@@ -57,41 +57,28 @@ class BncWorkcell:
     equal_area: bool = False
 
     @property
-    def X_WJ(self) -> RigidTransform:
-        """Pose of the nominal jack."""
+    def X_WF(self) -> RigidTransform:
+        """Pose of the nominal jack, X_WJ."""
         return RigidTransform(RotationMatrix.MakeZRotation(self.dimensions.detent_angle), np.array(self.p_WJ))
 
     @property
-    def X_JT(self) -> RigidTransform:
-        """Pose of the locked plug on the jack."""
+    def X_FT(self) -> RigidTransform:
+        """Pose of the locked plug on the jack, X_JT."""
         return RigidTransform(
             RotationMatrix.MakeZRotation(-self.dimensions.detent_angle), [0.0, 0.0, self.dimensions.locked_height]
         )
 
-    @property
-    def X_WT(self) -> RigidTransform:
-        """Pose of the target: the plug locked on the nominal jack."""
-        return self.X_WJ @ self.X_JT
+    def sdf(self, body: str) -> Path:
+        """Return the path of the SDF file of jack or plug."""
+        name = JACK_SDF.name if body == self.fixture else PLUG_SDF.name
+        return folder_of(self.dimensions, self.friction, self.margin, self.equal_area) / name
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
-        """Add the jack, on a frame that `set_jack_offset` moves, and a board under it without collision geometry."""
-        model = add_model(plant, self._folder() / JACK_SDF.name)
-        mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
-        plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
+        """Add the jack, and a board under it without collision geometry."""
+        super().add_fixture(plant)
         depth, width, thickness = BOARD
         below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])
         plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOUR)
-
-    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
-        """Add the plug, on a frame that `set_grasp_offset` moves."""
-        model = add_model(plant, self._folder() / PLUG_SDF.name)
-        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_center, RigidTransform()))
-        plug = plant.GetBodyByName("plug", model)
-        plant.WeldFrames(grasp, plug.body_frame())
-        return plug
-
-    def _folder(self) -> Path:
-        return folder_of(self.dimensions, self.friction, self.margin, self.equal_area)
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Allow contacts of barrel and bore, lugs and slots, and pad and seat only."""
@@ -104,20 +91,6 @@ class BncWorkcell:
     def workpiece_surfaces(self) -> list[Surface]:
         """Return the collision surfaces of the plug, in its frame."""
         return plug_surfaces(self.dimensions, self.friction)
-
-    def set_jack_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
-        """Move the jack so that the plug locks at X_TTactual instead of at the target."""
-        X_WJ = self.X_WT @ X_TTactual @ self.X_JT.inverse()
-        movable_frame(plant, "jack_mount").SetPoseInParentFrame(plant_context, X_WJ)
-
-    def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PPlug: RigidTransform) -> None:
-        """Move the plug in the tool."""
-        movable_frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PPlug)
-
-    def plug_in_locked_frame(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
-        """Return the plug's pose in the frame of the locked plug, offsets included: the identity when it is locked."""
-        X_JPlug = plant.GetFrameByName("plug").CalcPose(plant_context, plant.GetFrameByName("jack"))
-        return self.X_JT.inverse() @ X_JPlug
 
     def locks(self, plug: np.ndarray) -> bool:
         """Return True if a plug is locked and on the jack's axis.

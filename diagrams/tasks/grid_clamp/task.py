@@ -9,21 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, field_validator
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
-from guiderail.diagrams.tasks.grid_clamp.scripted import (
-    CENTRE,
-    SCALE,
-    scripted_gentle_search,
-    scripted_search,
-    straight_descent,
-)
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
@@ -203,6 +195,68 @@ def make_template() -> SharedControlTemplate:
     return load_template("grid_clamp")
 
 
+# Centre and scale of the observation [position, force].
+CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
+SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
+
+ON_TABLE = GridClampDimensions().peg_length  # height of the clamp while the pegs stand on the table [m]
+NEAR = 1.5 * MM  # height above the table below which it descends slowly and searches
+IN_HOLE = 0.5 * MM  # depth below the table at which a peg is in its hole
+LANES = np.array([-1.1, 0.0, 1.1]) * MM  # places along y; no peg can pass between two of them without dropping
+LANE_ENDS = 3.7 * MM  # along x, beyond the largest offset
+PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
+SNAP_FORCE = 12.0  # largest force while it snaps in [N]
+GENTLE_SNAP_FORCE = 8.5  # the same for a force limit of 10 N
+HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N], [m/s/N] and [1/s]
+_PARAMETERS = load_template("grid_clamp").parameters
+SPEED = _PARAMETERS["speed_m_per_s"]  # speed of a full input
+LIFT = _PARAMETERS["lift"]  # fraction of it, upwards
+STIFFNESS = Impedance().stiffness[0]
+
+
+def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
+    """Return the inputs of a search without memory, (3,) in [−1, 1].
+
+    Above the table the clamp moves to the start of the first lane. On the table it presses lightly and follows the
+    lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in.
+
+    Args:
+        observation: Scaled position and force, (6,).
+        snap_force: Largest force while it snaps in [N].
+    """
+    position, force = observation[:3] * SCALE[:3] + CENTRE[:3], observation[3:] * SCALE[3:]
+    command = position - force / STIFFNESS  # the impedance's spring separates it from the measured position
+    if position[2] > ON_TABLE + NEAR:
+        velocity = np.array([*(LANE_GAIN * (np.array([-LANE_ENDS, LANES[0]]) - position[:2])), -SPEED])
+        if position[2] < ON_TABLE + 3 * NEAR and np.hypot(position[0] + LANE_ENDS, position[1] - LANES[0]) > 0.5 * MM:
+            velocity[2] = 0.0  # no descent before it is at the start
+    elif position[2] > ON_TABLE - IN_HOLE:
+        velocity = np.array([*_lane_velocity(command[:2]), HEIGHT_GAIN * (force[2] - PRESS)])
+    else:
+        velocity = np.array([*(YIELD_GAIN * force[:2]), HEIGHT_GAIN * (force[2] - snap_force)])
+    speeds = np.array([SPEED, SPEED, LIFT * SPEED if velocity[2] > 0.0 else SPEED])
+    return np.clip(velocity / speeds, -1.0, 1.0)
+
+
+def _lane_velocity(xy: np.ndarray) -> np.ndarray:
+    """Return the velocity along the lanes at `xy`, (2,)."""
+    lane = int(np.argmin(np.abs(LANES - xy[1])))
+    forward = 1.0 if lane % 2 == 0 else -1.0
+    if forward * xy[0] < LANE_ENDS - 0.1 * MM:
+        return np.array([forward * SEARCH_SPEED, LANE_GAIN * (LANES[lane] - xy[1])])
+    return np.array([0.0, SEARCH_SPEED])
+
+
+def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:
+    """Return the inputs of `scripted_search` for a force limit of 10 N, (3,)."""
+    return scripted_search(observation, GENTLE_SNAP_FORCE)
+
+
+def straight_descent(observation: np.ndarray) -> np.ndarray:
+    """Return a full input downwards, (3,)."""
+    return np.array([0.0, 0.0, -1.0])
+
+
 @register_task("GridClamp")
 class GridClamp(InsertionTask):
     """Insert the clamp.
@@ -264,12 +318,6 @@ class GridClamp(InsertionTask):
         seated = TerminationTerm("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
         return [seated, self.force_limit()]
 
-    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Move the table, and the clamp in the tool, by (x, y)."""
-        plant_context = station.plant.GetMyMutableContextFromRoot(context)
-        self._workcell.set_table_offset(station.plant, plant_context, RigidTransform([*fixture, 0.0]))
-        self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece, 0.0]))
-
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return a sampled pose of the hand-over by the preceding skill."""
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
@@ -279,10 +327,8 @@ class GridClamp(InsertionTask):
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        policies = (scripted_search, scripted_gentle_search, straight_descent)
         default = scripted_gentle_search if difficulty == "hard" else scripted_search
-        ordered = sorted(policies, key=lambda policy: policy is not default)
-        return {policy.__name__: policy for policy in ordered}
+        return {one.__name__: one for one in (default, scripted_search, scripted_gentle_search, straight_descent)}
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the holes."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
-from pydrake.systems.framework import Context
 
-from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
-from guiderail.models.common.parsing import add_model
+from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
 from guiderail.models.objects.grid_clamp.geometry import CLAMP_SDF, TABLE_SDF, GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION, folder_of
 from guiderail.models.objects.grid_clamp.surfaces import clamp_surfaces, table_surfaces
@@ -39,7 +38,7 @@ FILTERED_PAIRS = [
 
 
 @dataclass(frozen=True)
-class GridClampWorkcell:
+class GridClampWorkcell(MovableWorkcell):
     """Table in front of the robot's base; the target frame's axes are the world's.
 
     Attributes:
@@ -48,39 +47,30 @@ class GridClampWorkcell:
         friction: Friction coefficient of pegs, holes and the table's face.
     """
 
+    fixture: ClassVar[str] = "table"
+    workpiece: ClassVar[str] = "clamp"
     dimensions: GridClampDimensions = field(default_factory=GridClampDimensions)
     p_WG: tuple[float, float, float] = (0.55, 0.0, 0.15)
     friction: float = FRICTION
 
     @property
-    def X_WG(self) -> RigidTransform:
-        """Pose of the nominal table."""
+    def X_WF(self) -> RigidTransform:
+        """Pose of the nominal table, X_WG."""
         return RigidTransform(np.array(self.p_WG))
 
     @property
-    def X_GT(self) -> RigidTransform:
-        """Pose of the seated clamp on the table."""
+    def X_FT(self) -> RigidTransform:
+        """Pose of the seated clamp on the table, X_GT."""
         return RigidTransform([0.0, 0.0, -self.dimensions.peg_length])
 
-    @property
-    def X_WT(self) -> RigidTransform:
-        """Pose of the target: the clamp seated on the nominal table."""
-        return self.X_WG @ self.X_GT
+    def sdf(self, body: str) -> Path:
+        """Return the path of the SDF file of table or clamp."""
+        return folder_of(self.dimensions, self.friction) / (TABLE_SDF if body == self.fixture else CLAMP_SDF).name
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
-        """Add the table, on a frame that `set_table_offset` moves, and set the plant's stiction tolerance."""
+        """Add the table, and set the plant's stiction tolerance."""
         plant.set_stiction_tolerance(STICTION_TOLERANCE)
-        model = add_model(plant, folder_of(self.dimensions, self.friction) / TABLE_SDF.name)
-        mount = plant.AddFrame(FixedOffsetFrame("table_mount", plant.world_frame(), self.X_WG))
-        plant.WeldFrames(mount, plant.GetFrameByName("table", model))
-
-    def add_workpiece(self, plant: MultibodyPlant, tool_center: Frame) -> RigidBody:
-        """Add the clamp, on a frame that `set_grasp_offset` moves."""
-        model = add_model(plant, folder_of(self.dimensions, self.friction) / CLAMP_SDF.name)
-        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_center, RigidTransform()))
-        clamp = plant.GetBodyByName("clamp", model)
-        plant.WeldFrames(grasp, clamp.body_frame())
-        return clamp
+        super().add_fixture(plant)
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Allow contacts of each peg and its hole, bead and lip, and pad and slab only."""
@@ -94,22 +84,8 @@ class GridClampWorkcell:
         """Return the collision surfaces of the clamp, in its frame."""
         return clamp_surfaces(self.dimensions, self.friction)
 
-    def set_table_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
-        """Move the table so that the clamp snaps in at X_TTactual instead of at the target."""
-        X_WG = self.X_WT @ X_TTactual @ self.X_GT.inverse()
-        movable_frame(plant, "table_mount").SetPoseInParentFrame(plant_context, X_WG)
-
-    def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PClamp: RigidTransform) -> None:
-        """Move the clamp in the tool."""
-        movable_frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PClamp)
-
-    def clamp_in_target(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
-        """Return the clamp's pose in the frame of the seated clamp, offsets included: the identity when seated."""
-        X_GClamp = plant.GetFrameByName("clamp").CalcPose(plant_context, plant.GetFrameByName("table"))
-        return self.X_GT.inverse() @ X_GClamp
-
     def is_seated(self, clamp: np.ndarray) -> bool:
         """Return True if a clamp with X_GClamp, as position and rotation vector (6,), has snapped in."""
         return bool(
-            clamp[2] - self.X_GT.translation()[2] < SEATED_HEIGHT and np.hypot(clamp[0], clamp[1]) < SEATED_OFFSET
+            clamp[2] - self.X_FT.translation()[2] < SEATED_HEIGHT and np.hypot(clamp[0], clamp[1]) < SEATED_OFFSET
         )

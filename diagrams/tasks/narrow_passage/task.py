@@ -315,9 +315,8 @@ class NarrowPassage(Task):
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        policies = (scripted_slalom,)
-        return {policy.__name__: policy for policy in policies}
+        """Return the scripted policy by its name."""
+        return {"scripted_slalom": scripted_slalom}
 
     def camera(self) -> Camera:
         """Return a camera above the plane."""

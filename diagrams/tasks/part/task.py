@@ -2,44 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 from pydantic import Field
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.rewards import REWARDS, reward_terms, sides_of_the_rim
-from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, in_ring, reference_of_file
+from guiderail.diagrams.tasks.bnc_connector.rewards import (
+    OBSERVATIONS,
+    REWARDS,
+    observation_terms,
+    reward_terms,
+    sides_of_the_rim,
+)
+from guiderail.diagrams.tasks.insertion import DemonstratedInsertion
+from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, reference_of_file
 from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.tasks.task import Threshold
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.objects.insertion import (
-    COLLISION_FORCE,
-    COMMAND_SCALE,
-    HISTORY_VARIANCE,
-    LEVER_SCALE,
-    MIN_CONTACT_FORCE,
-)
+from guiderail.models.objects.insertion import COLLISION_FORCE, HISTORY_VARIANCE
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
@@ -61,7 +56,7 @@ class PartOptions(FixtureOffsetOptions):
     )
 
 
-class PartInsertion(InsertionTask):
+class PartInsertion(DemonstratedInsertion):
     """Insert a plug into a socket.
 
     Rewards: "sparse" has costs of action and force and a terminal reward, "shaped" adds the depth gained, and "aligned"
@@ -77,8 +72,7 @@ class PartInsertion(InsertionTask):
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
     rewards = REWARDS
-    observations = ("state", "center_of_pressure")
-    isotropic_groups = ((0, 1, 2), (3, 4, 5))
+    observations = OBSERVATIONS
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]
 
@@ -111,34 +105,12 @@ class PartInsertion(InsertionTask):
         changes = cls.file.bounds.phases is not None
         return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
 
-    def keep_out(self) -> KeepOut:
-        """Return no walls: safe residual learning is projected to the bounds alone."""
-        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
-
-    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Return the plug's pose in the socket and the center of pressure."""
-        lever = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
-        builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
-        return {**super().signals(builder, station), "center_of_pressure": lever.get_center_of_pressure_output_port()}
-
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
-        half = 0.5 * self.num_steps * CONTROL_PERIOD
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         centre = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
-        state = (
-            ObservationTerm("time", half, half),
-            ObservationTerm("pose", centre, scale),
-            ObservationTerm("wrench", 0.0, WRENCH_SCALE),
-        )
-        if self.config.observation == "state":
-            return state
-        return (
-            *state,
-            ObservationTerm("center_of_pressure", 0.0, LEVER_SCALE),
-            ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)),
-        )
+        return observation_terms(self.config.observation, self.num_steps, centre, scale, WRENCH_SCALE)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return the terms of `config.reward`."""
@@ -158,8 +130,7 @@ class PartInsertion(InsertionTask):
         return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
 
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
-        action_dims = self.config.options["action_dims"]
-        every = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
+        every = sides_of_the_rim(self.config.observation, self.action_dims())
         chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
         return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
 
@@ -172,21 +143,6 @@ class PartInsertion(InsertionTask):
             and np.hypot(plug[0], plug[1]) < tolerance.lateral
             and abs(plug[5]) < tolerance.turn * DEGREE
         )
-
-    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Move the socket, and the plug in the tool, by (x, y)."""
-        plant_context = station.plant.GetMyMutableContextFromRoot(context)
-        workcell = self.workcell()
-        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
-        workcell.set_socket_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
-        workcell.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
-
-    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Return the demonstrations' start plus a sampled offset, inside the bounds."""
-        start = self.reference().means[0].copy()
-        if self.options.start_offset_max > 0.0:
-            start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
-        return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the socket."""
@@ -231,8 +187,7 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             write_atomically(path, text.encode())  # other processes read it at the same time
     return PartWorkcell(
-        str(folder / f"{PLUG}.sdf"),
-        str(folder / f"{SOCKET}.sdf"),
+        folder,
         cast(tuple[float, float, float], file.place),
         file.stiction_tolerance,
         tuple(str(folder / name) for name in file.scenario),

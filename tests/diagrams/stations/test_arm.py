@@ -37,7 +37,7 @@ class Held:
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
         self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
-        WORKCELL.set_jack_offset(self.plant, self.plant_context, RigidTransform([0.0, 0.0, -0.5]))
+        WORKCELL.set_fixture_offset(self.plant, self.plant_context, RigidTransform([0.0, 0.0, -0.5]))
         self.push(np.zeros(6))
         self.desired = self.station.get_desired_pose_input_port().FixValue(self.context, pose)
         self.station.set_pose(self.context, pose)
@@ -77,7 +77,7 @@ def displacement(before, after):
 def test_arm_inserts_and_locks_at_the_nominal_pose(robot):
     times, motion = insert_and_lock()
     driven, recording = drive_along(ArmStation(WORKCELL, robot=robot), times, motion)
-    X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
+    X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert WORKCELL.is_locked(X)
     assert np.abs(X.translation()).max() < 0.3 * MM
     assert recording["contact_force"].max() < 15.0

@@ -130,10 +130,10 @@ def test_plug_locks_on_a_jack_moved_in_the_context():
     shifted = motion + np.array([*X_TTactual.translation(), 0, 0, 0])
 
     def move(plant, context):
-        WORKCELL.set_jack_offset(plant, context, X_TTactual)
+        WORKCELL.set_fixture_offset(plant, context, X_TTactual)
 
     driven, recording = drive_along(GantryStation(WORKCELL), times, shifted, move)
-    X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
+    X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
     np.testing.assert_allclose(recording["pose"][-1, :3], X_TTactual.translation(), atol=0.3 * MM)
 
@@ -151,13 +151,13 @@ def test_plug_locks_with_a_grasp_offset():
     dense[:, 0] -= offset[0] * np.cos(dense[:, 3])
     dense[:, 1] -= offset[0] * np.sin(dense[:, 3])
     driven, _ = drive_along(GantryStation(WORKCELL), fine, dense, grasp)
-    X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
+    X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
 
 
 def test_uncorrected_offset_of_1_5_mm_jams():
     def move(plant, context):
-        WORKCELL.set_jack_offset(plant, context, RigidTransform([1.5 * MM, 0.0, 0.0]))
+        WORKCELL.set_fixture_offset(plant, context, RigidTransform([1.5 * MM, 0.0, 0.0]))
 
     times, motion = insert_and_lock()
     _, recording = drive_along(GantryStation(WORKCELL), times, motion, move)

@@ -30,7 +30,7 @@ class Held:
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
         self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
-        WORKCELL.set_jack_offset(self.plant, self.plant_context, RigidTransform([0.0, 0.0, -0.5]))
+        WORKCELL.set_fixture_offset(self.plant, self.plant_context, RigidTransform([0.0, 0.0, -0.5]))
         self.push(np.zeros(6))
         self.station.get_desired_pose_input_port().FixValue(self.context, pose)
         self.station.set_pose(self.context, pose)

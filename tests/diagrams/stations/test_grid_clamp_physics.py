@@ -28,7 +28,7 @@ def descend(times, z_mm, *, xy_mm=(0.0, 0.0), tilt_deg=0.0, grasp_mm=None, table
         if grasp_mm is not None:
             WORKCELL.set_grasp_offset(plant, context, RigidTransform([*(np.array(grasp_mm) * MM), 0.0]))
         if table_mm is not None:
-            WORKCELL.set_table_offset(plant, context, RigidTransform([*(np.array(table_mm) * MM), 0.0]))
+            WORKCELL.set_fixture_offset(plant, context, RigidTransform([*(np.array(table_mm) * MM), 0.0]))
 
     return drive_along(station(WORKCELL, **kw), times, poses, offset)
 
@@ -40,7 +40,7 @@ def inserted():
 
 def test_clamp_snaps_in_with_at_most_10_n(inserted):
     driven, recording = inserted
-    X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
+    X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.1 * MM
     assert recording["contact_force"].max() <= 10.0
     assert np.abs(recording["wrench"][:, :3]).max() <= 10.0
@@ -71,7 +71,7 @@ def test_pegs_do_not_tunnel_through_the_table_at_60_n(xy_mm, tilt_deg):
         [0, 0.5, 1.5, 2.5], [22, 12, -40, -40], xy_mm=xy_mm, tilt_deg=tilt_deg, impedance=PUSH_60_N
     )
     assert recording["wrench"][-1, 2] == pytest.approx(60.0, abs=1.0)
-    X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
+    X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     d = WORKCELL.dimensions
     tips = X @ np.column_stack([d.peg_positions, np.zeros(5)]).T
     is_outside = np.hypot(*(tips[:2] - d.peg_positions.T)) > MAX_OFFSET
@@ -85,7 +85,9 @@ def test_seated_clamp_does_not_tunnel_sideways_at_60_n():
     poses[2:, 0] = 60.0 * MM
     driven, recording = drive_along(GantryStation(WORKCELL, PUSH_60_N), [0, 0.8, 2.0, 2.5], poses)
     assert abs(recording["wrench"][-1, 0]) > 50.0
-    assert np.abs(WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context).translation()).max() < 0.3 * MM
+    assert (
+        np.abs(WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context).translation()).max() < 0.3 * MM
+    )
 
 
 def test_snap_is_insensitive_to_the_time_step(inserted):
@@ -124,6 +126,6 @@ def test_sticking_contact_does_not_creep():
 
 def test_arm_inserts_the_clamp():
     driven, recording = descend([0.0, 1.8, 2.0], [16.0, -6.0, -6.0], station=ArmStation)
-    X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
+    X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
     assert recording["contact_force"].max() <= 10.0

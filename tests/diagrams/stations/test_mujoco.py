@@ -51,7 +51,7 @@ def locked_and_pulled():
     motion = np.concatenate([motion, [pull, pull]]) + np.array([*offset, 0.0, 0.0, 0.0])
 
     def move(plant, context):
-        CONNECTOR.set_jack_offset(plant, context, RigidTransform(offset))
+        CONNECTOR.set_fixture_offset(plant, context, RigidTransform(offset))
 
     driven, recording = drive(CONNECTOR, np.concatenate([times, times[-1] + [1.0, 1.5]]), motion, move)
     return driven, recording, offset
@@ -81,7 +81,7 @@ def test_locked_plug_resists_a_pull(locked_and_pulled):
     assert recording["saturation"][-1, 0] == 1.0
     assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
     assert recording["pose"][-1, 2] - offset[2] < 0.5 * MM
-    assert CONNECTOR.is_locked(CONNECTOR.X_JT.inverse() @ workpiece_in_fixture(driven, "plug", "jack"))
+    assert CONNECTOR.is_locked(CONNECTOR.X_FT.inverse() @ workpiece_in_fixture(driven, "plug", "jack"))
 
 
 def test_rotation_is_blocked_before_insertion():
@@ -116,7 +116,7 @@ def inserted():
 def test_snap_resists_then_yields(inserted):
     driven, recording = inserted
     tip = workpiece_in_fixture(driven, "clamp", "table")
-    assert np.abs((CLAMP.X_GT.inverse() @ tip).translation()).max() < 0.1 * MM
+    assert np.abs((CLAMP.X_FT.inverse() @ tip).translation()).max() < 0.1 * MM
     assert recording["contact_force"].max() <= 10.0
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     resistance = force[z > 0.85].max()
@@ -241,7 +241,7 @@ def test_engine_has_the_offsets_of_the_task():
     env.step(np.zeros(2))
     model = station.gantry.model
     X_TT = RigidTransform([*info["jack_offset"], 0.0])
-    expected = (X_TT @ CONNECTOR.X_JT.inverse()).translation()
+    expected = (X_TT @ CONNECTOR.X_FT.inverse()).translation()
     np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)
     np.testing.assert_allclose(model.body("workpiece").pos[:2], info["grasp_offset"][:2], atol=1e-12)
 

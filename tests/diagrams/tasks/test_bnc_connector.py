@@ -10,8 +10,7 @@ import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import ALIGNMENT_REWARD, DEPTH_REWARD
-from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_torque_search
-from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, reference_trajectory, scripted_torque_search
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector.options import LARGEST_GRASP_ANGLE, BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_torque_search
+from guiderail.diagrams.tasks.bnc_connector.task import scripted_torque_search
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.evaluate import evaluate_policy

@@ -7,10 +7,9 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector import options as bnc_options
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory, scripted_center_of_pressure
 from guiderail.diagrams.tasks.grid_clamp import task as grid_clamp_options
-from guiderail.diagrams.tasks.grid_clamp.scripted import scripted_gentle_search, straight_descent
+from guiderail.diagrams.tasks.grid_clamp.task import scripted_gentle_search, straight_descent
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM

@@ -8,14 +8,16 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.grid_clamp.scripted import STIFFNESS, scripted_search, straight_descent
 from guiderail.diagrams.tasks.grid_clamp.task import (
     CENTRE,
     COLLISION_FORCE,
     MAX_TRACKING_ERROR,
     SCALE,
+    STIFFNESS,
     GridClampUncertainty,
     make_template,
+    scripted_search,
+    straight_descent,
 )
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError

@@ -3,13 +3,13 @@ import pytest
 
 from guiderail.diagrams.tasks.bnc_connector import scripted
 from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTRE, POSE_SCALE
-from guiderail.diagrams.tasks.bnc_connector.scripted import (
+from guiderail.diagrams.tasks.bnc_connector.task import (
     REACH,
     STEP,
     scripted_center_of_pressure,
     scripted_torque_search,
 )
-from guiderail.diagrams.tasks.grid_clamp.scripted import CENTRE, LANE_ENDS, LANES, SCALE, scripted_search
+from guiderail.diagrams.tasks.grid_clamp.task import CENTRE, LANE_ENDS, LANES, SCALE, scripted_search
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.demonstrations import RIM

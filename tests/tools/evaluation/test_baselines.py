@@ -1,9 +1,17 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector.scripted import GAIN, PRESSING, SCALED_RIM, TIME, TORQUE_X, TORQUE_Y, Z
-from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS
-from guiderail.diagrams.tasks.grid_clamp.scripted import scripted_gentle_search, scripted_search, straight_descent
+from guiderail.diagrams.tasks.bnc_connector.task import (
+    GAIN,
+    NUM_STEPS,
+    PRESSING,
+    SCALED_RIM,
+    TIME,
+    TORQUE_X,
+    TORQUE_Y,
+    Z,
+)
+from guiderail.diagrams.tasks.grid_clamp.task import scripted_gentle_search, scripted_search, straight_descent
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
