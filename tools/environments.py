@@ -196,15 +196,10 @@ def check_reset(task: str, options: Mapping[str, Any]) -> None:
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an environment that differ from the defaults.
+    """Return the arguments, out of all of an environment's, that differ from the defaults.
 
-    Args:
-        task: Name of the task.
-        environment: All arguments of the environment.
-
-    Returns:
-        Guidance, station and difficulty if they are not the task's defaults, and other arguments that differ from the
-        defaults for these three.
+    These are guidance, station and difficulty if they are not the task's defaults, and other arguments that differ from
+    the defaults for these three.
 
     Raises:
         InputError: If the task or one of the three is unknown.
@@ -216,15 +211,10 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
 
 
 def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a run's environment with changes.
+    """Return all arguments of a run's environment with changes.
 
     Another difficulty replaces the settings that the run has only from its own difficulty. For another station, options
     that it does not have are removed.
-
-    Args:
-        task: Task of the run.
-        environment: All arguments of the run's environment.
-        changes: Arguments to change.
 
     Raises:
         InputError: If there is no such difficulty.

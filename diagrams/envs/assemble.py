@@ -38,10 +38,6 @@ HALF_TURN_MARGIN = 0.1  # [rad] how much further actions and contact can turn a 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """Return the prior knowledge that a task provides to guidance on a station.
 
-    Args:
-        task: Task, with the options of its primitive and its guidance.
-        station: Station, for its period and sizes.
-
     Raises:
         InputError: If the steps of the reference trajectory are not control periods, or it comes near an angle at which
             the station's pose jumps.
@@ -101,13 +97,7 @@ class Signals:
     """Ports by name while a diagram is built; "last_x" is the value of x one control step earlier."""
 
     def __init__(self, builder: DiagramBuilder, period: float, ports: Mapping[str, OutputPort]):
-        """Construct the collection.
-
-        Args:
-            builder: Builder that holds are added to.
-            period: Control period [s].
-            ports: Ports by name.
-        """
+        """Construct the collection; holds are added to the builder, with the control period [s]."""
         self._builder, self._period, self._ports = builder, period, dict(ports)
 
     def add(self, ports: Mapping[str, OutputPort]) -> None:
@@ -115,11 +105,7 @@ class Signals:
         self._ports |= ports
 
     def get(self, name: str, user: str) -> OutputPort:
-        """Return the port of a signal.
-
-        Args:
-            name: Name of the signal.
-            user: Part that uses it, for the message.
+        """Return the port of a signal; a message names the part of the task that needs it, the `user`.
 
         Raises:
             InputError: If there is none of that name.
@@ -137,12 +123,7 @@ class Signals:
         return self._ports[name]
 
     def connect(self, system: Any, names: Mapping[str, int], user: str) -> None:
-        """Connect a system's inputs to the signals of the same names.
-
-        Args:
-            system: System with `get_signal_input_port`.
-            names: Size of each input by name.
-            user: Part that the system belongs to, for the message.
+        """Connect a system's `get_signal_input_port` of each name to the signal of that name and of the given size.
 
         Raises:
             InputError: If a signal is missing or has another size.
@@ -203,11 +184,7 @@ def build_task_diagram(
 ) -> TaskDiagram:
     """Wire a task: its loop, reward and episode monitor. The policy's `action` is an input.
 
-    Args:
-        task: Task.
-        station: Station.
-        guidance: Diagram with the ports of `Guidance`.
-        render_mode: "rgb_array" exports the image of the task's camera; a browser view is not part of the diagram.
+    With `render_mode="rgb_array"` the image of the task's camera is exported; a browser view is not in the diagram.
 
     Raises:
         InputError: If a signal that the task names does not exist, a port has the wrong size, or the name of a reward
@@ -309,13 +286,9 @@ def build_skill_diagram(
 ) -> SkillDiagram:
     """Wire a learned skill, without reward and episode monitor.
 
-    Args:
-        task: Task that the skill was learned on.
-        station: Station.
-        guidance: Diagram with the ports of `Guidance`.
-        policy: Function from an observation to an action, which a `PolicySystem` calls every `action_repeat` control
-            periods; or system with an input `observation` and an output `action`.
-        render_mode: None, or "human" for a browser view.
+    The policy is a function from an observation to an action, which a `PolicySystem` calls every `action_repeat`
+    control periods, or a system with an input `observation` and an output `action`. `render_mode="human"` adds a
+    browser view.
 
     Raises:
         InputError: As `build_task_diagram`, or if the sizes of the policy's ports do not match.

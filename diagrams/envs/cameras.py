@@ -90,13 +90,7 @@ def add_camera(
 ) -> OutputPort:
     """Add a camera and return the port of its colour image, an `ImageRgba8U`.
 
-    Args:
-        builder: Builder of the root diagram.
-        scene_graph: Scene graph.
-        query: Query port of the scene.
-        name: Name of the camera's system.
-        camera: Camera.
-        is_picture: Light the scene for a picture instead of an observation.
+    With `is_picture` the scene is lit for a picture instead of an observation.
 
     Raises:
         InputError: If this machine lacks the library that renders without a display.
@@ -141,8 +135,7 @@ def check_rendering() -> None:
 def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
     """Open a browser view on localhost; Meshcat would listen on every interface by default.
 
-    Args:
-        meshcat: Existing page; default: a new one.
+    Without an existing page, a new one is opened.
 
     Raises:
         InputError: If the environment forbids Drake to open a network port.

@@ -148,7 +148,7 @@ def _cache_key(task: type[Task], options: Mapping[str, Any]) -> Hashable:
     The registered names and the working directory belong to it because defaults and relative paths depend on them.
     """
     try:
-        values = tuple(sorted((name, _freeze(value)) for name, value in options.items()))
+        values = tuple(sorted((name, freeze(value)) for name, value in options.items()))
         key = (task, values, tuple(GUIDANCE.names()), tuple(STATIONS.names()), os.getcwd())
         hash(key)
     except (TypeError, OSError):
@@ -156,16 +156,16 @@ def _cache_key(task: type[Task], options: Mapping[str, Any]) -> Hashable:
     return key
 
 
-def _freeze(value: Any) -> tuple[str, Any]:
+def freeze(value: Any) -> tuple[str, Any]:
     """Return a plain value with its type, because True, 1 and 1.0 are equal.
 
     Raises:
         TypeError: If the value is not plain.
     """
     if isinstance(value, dict):
-        return "dict", tuple(sorted((name, _freeze(entry)) for name, entry in value.items()))
+        return "dict", tuple(sorted((name, freeze(entry)) for name, entry in value.items()))
     if isinstance(value, list | tuple):
-        return "list", tuple(_freeze(entry) for entry in value)
+        return "list", tuple(freeze(entry) for entry in value)
     if value is not None and type(value) not in (bool, int, float, str):
         raise TypeError
     return type(value).__name__, repr(value)

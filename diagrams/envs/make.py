@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Diagram, System
@@ -20,7 +20,7 @@ from guiderail.diagrams.envs.assemble import (
     build_task_diagram,
     make_randomize,
 )
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, freeze
 from guiderail.diagrams.envs.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
@@ -31,30 +31,7 @@ from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
 
-Built = TypeVar("Built")
-
 logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO
-
-
-class DiagramPool(Generic[Built]):
-    """Pool of built diagrams, for reuse by later environments with the same configuration.
-
-    A diagram that contains a LeafSystem written in Python is never freed: C++ holds references to the system's methods,
-    the methods hold the system, and no garbage collector finds this cycle. Reuse is safe because everything that
-    changes during a simulation is in a context, and each environment creates its own.
-    """
-
-    def __init__(self) -> None:
-        self._idle: dict[Hashable, list[Built]] = defaultdict(list)
-
-    def take(self, key: Hashable, build: Callable[[], Built]) -> Built:
-        """Return an idle diagram of this key, or build one; it is reserved until it is given back."""
-        idle = self._idle[key]
-        return idle.pop() if idle else build()
-
-    def give_back(self, key: Hashable, built: Built) -> None:
-        """Return `built` to the pool."""
-        self._idle[key].append(built)
 
 
 def make_station(task: Task) -> Station:
@@ -86,12 +63,7 @@ def make_guidance(task: Task, station: Station) -> Diagram:
 def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledge:
     """Return the prior knowledge that an environment's guidance is built from, such as its primitive or template.
 
-    Args:
-        task: Configuration, or name of the task.
-        options: Options of the environment, if `task` is a name.
-
-    Raises:
-        InputError: As `make_env`.
+    The arguments are those of `make_env`, and so are the errors.
     """
     declared = _config(task, options).make_task()
     return build_prior_knowledge(declared, make_station(declared))
@@ -122,14 +94,14 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     exported = render_mode if render_mode == "rgb_array" else None
     declared = config.make_task()
     key = _key(declared, exported)
-    built = _POOL.take(key, lambda: _build(declared, exported))
+    built = _IDLE[key].pop() if _IDLE[key] else _build(declared, exported)
     # The sources that a reset sets are part of the diagram, so the new task adopts those of the task that built it.
     # What is hidden for a run belongs to the new task alone.
     assert built.diagram.declaration is not None
     declared.episode_constants = built.diagram.declaration.episode_constants
     randomize = make_randomize(declared, built.station, built.guidance)
     diagram = replace(built.diagram, randomize=randomize, declaration=declared)
-    release = partial(_POOL.give_back, key, built)
+    release = partial(_IDLE[key].append, built)
     try:
         return GuidedEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
     except BaseException:  # such as a browser view that finds no port
@@ -168,7 +140,13 @@ class _Built:
     guidance: Diagram
 
 
-_POOL: DiagramPool[_Built] = DiagramPool()
+_IDLE: defaultdict[Hashable, list[_Built]] = defaultdict(list)
+"""Built diagrams that no environment uses, by configuration, for reuse by later environments.
+
+A diagram that contains a LeafSystem written in Python is never freed: C++ holds references to the system's methods, the
+methods hold the system, and no garbage collector finds this cycle. Reuse is safe because everything that changes during
+a simulation is in a context, and each environment creates its own.
+"""
 
 
 def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
@@ -190,11 +168,7 @@ def _build(task: Task, render_mode: str | None) -> _Built:
 def _key(task: Task, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments with equal diagrams."""
     config = task.config
-    options = config.options
-    options |= {name: tuple(sorted(value.items())) for name, value in options.items() if isinstance(value, dict)}
-    key = (type(task), config.guidance_kind, config.station_kind, render_mode, *sorted(options.items()))
     try:
-        hash(key)
+        return type(task), config.guidance_kind, config.station_kind, render_mode, freeze(config.options)
     except TypeError:
         return object()  # an option is not comparable, so the diagram is not shared
-    return key

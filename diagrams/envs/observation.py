@@ -10,6 +10,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import AffineSystem, Multiplexer, PassThrough, Saturation, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
+from scipy.linalg import block_diag
 
 from guiderail.models.common.errors import InputError, brief
 
@@ -86,7 +87,7 @@ class Observation(Diagram):
             builder.Connect(builder.GetSubsystemByName(one.signal).get_output_port(0), together.get_input_port(index))
         scale = np.concatenate([scale for _, _, scale in rows])
         centre = np.concatenate([centre for _, centre, _ in rows])
-        D = _block_diagonal([selection for selection, _, _ in rows]) / scale[:, None]
+        D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]
         scaled = builder.AddNamedSystem("scaled", affine(D, -centre / scale))
         clipped = builder.AddNamedSystem("clipped", Saturation(np.full(self.size, -clip), np.full(self.size, clip)))
         builder.Connect(together.get_output_port(), scaled.get_input_port())
@@ -153,12 +154,3 @@ def _numbers(one: ObservationTerm, name: str, number: int, of: str) -> np.ndarra
             f"not {brief(given)}"
         ) from None
     return numbers
-
-
-def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    rows, columns = (sum(block.shape[i] for block in blocks) for i in range(2))
-    matrix, row, column = np.zeros((rows, columns)), 0, 0
-    for block in blocks:
-        matrix[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
-    return matrix

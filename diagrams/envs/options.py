@@ -119,12 +119,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validate_options(model: type[Model], values: Mapping[str, Any], context: str) -> Model:
-    """Validate and convert options by their model.
-
-    Args:
-        model: Option model.
-        values: Options by name.
-        context: Subject of an error message, such as the name of the task.
+    """Validate and convert options by their model; `context` is the subject of an error message.
 
     Raises:
         InputError: If a name is unknown, or a value has the wrong type or is out of range.

@@ -11,7 +11,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE, Station
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.systems.recorder import Recorder, Recording
 
 SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_force": 1, "saturation": 1}
@@ -33,8 +34,7 @@ class DrivenStation:
             station: Station; it becomes part of the diagram.
             source: System with the desired pose as first output, such as a trajectory, an input device or a policy.
             num_samples: Largest number of control periods to record.
-            add_to_builder: Function of the builder and the station that is called before the diagram is built, to add
-                a camera or a visualizer.
+            add_to_builder: Function that adds further systems, such as a camera, before the diagram is built.
         """
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
@@ -85,13 +85,9 @@ def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
 def drive_along(
     station: Station, times: np.ndarray, poses: np.ndarray, prepare: Callable[[Any, Any], None] | None = None
 ) -> tuple[DrivenStation, Recording]:
-    """Drive a station along poses and return it with the recording.
+    """Drive a station along poses (N, 6) at times (N,) [s]; return it with the recording.
 
-    Args:
-        station: Station.
-        times: Times of the poses, (N,) [s].
-        poses: Poses, (N, 6).
-        prepare: Function of the plant and its context that is called before the start.
+    `prepare` is called with the plant and its context before the start.
     """
     times, poses = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))

@@ -27,11 +27,7 @@ class View:
     meshcat: Meshcat
 
     def __init__(self, query: OutputPort, meshcat: Meshcat | None = None):
-        """Open the view.
-
-        Args:
-            query: Query port of a scene graph inside a diagram.
-            meshcat: Existing page; default: a new one.
+        """Open the view of a scene graph's query port, on a new page if none is given.
 
         Raises:
             InputError: If the environment forbids Drake to open a network port.
@@ -107,15 +103,7 @@ def viewpoint(eye: np.ndarray, target: np.ndarray) -> Viewpoint:
 
 
 def box_edges(lower: ArrayLike, upper: ArrayLike) -> list[np.ndarray]:
-    """Return the edges of a box, as lines without sharp turns.
-
-    Args:
-        lower: Lower corner, (3,).
-        upper: Upper corner, (3,).
-
-    Returns:
-        Twelve edges, (2, 3) each.
-    """
+    """Return the twelve edges of a box from corner `lower` (3,) to corner `upper` (3,), (2, 3) each."""
     (left, front, low), (right, back, high) = np.array([lower, upper], dtype=float)
     square = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
     rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]

@@ -31,14 +31,7 @@ class EpisodeTrace:
     """
 
     def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
-        """Construct an empty trace.
-
-        Args:
-            num_steps: Largest number of control steps in an episode.
-            num_outputs: O, size of a pose.
-            period: Control period [s].
-            signals: Sizes of further signals by name.
-        """
+        """Construct an empty trace of at most `num_steps` control steps, with signals of given sizes by name."""
         self.period = period
         self._length = 0
         self._commanded = np.empty((num_steps, num_outputs))
@@ -88,14 +81,9 @@ class EpisodeTrace:
         reward: float,
         signals: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Record one control step.
+        """Record one control step: poses (O,), contact force [N], reward and signals.
 
-        Args:
-            commanded: Commanded pose, (O,).
-            measured: Measured pose, (O,).
-            force: Contact force [N].
-            reward: Reward of the control step.
-            signals: Values of all further signals by name; NaN is recorded if they are left out.
+        NaN is recorded for signals that are left out.
         """
         n = self._length
         self._commanded[n] = commanded
@@ -138,11 +126,9 @@ class EpisodeTrace:
 
 
 def mean_jerk(positions: np.ndarray, period: float) -> float:
-    """Return the mean norm of the third derivative of `positions`, by finite differences; 0 for fewer than four.
+    """Return the mean norm of the third derivative of `positions` (n, O), by finite differences over a `period` [s].
 
-    Args:
-        positions: Positions at equal intervals, (n, O).
-        period: Interval [s].
+    It is 0 for fewer than four positions.
     """
     if len(positions) < 4:
         return 0.0

@@ -25,9 +25,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort
+from pydrake.systems.framework import Context, Diagram
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 INPUTS = ("action", "pose", "wrench")
 OUTPUTS = ("desired_pose", "held_action", "constraint_violation", "fallback")
@@ -53,43 +54,21 @@ class Guidance(Diagram):
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
         """Set the poses of objects in this episode, by name; guidance without objects does nothing."""
 
-    def get_action_input_port(self) -> InputPort:
-        """Return the port of the policy's action in [−1, 1], (A,)."""
-        return self.GetInputPort("action")
-
-    def get_pose_input_port(self) -> InputPort:
-        """Return the port of the measured pose, (O,)."""
-        return self.GetInputPort("pose")
-
-    def get_wrench_input_port(self) -> InputPort:
-        """Return the port of the measured wrench, (W,)."""
-        return self.GetInputPort("wrench")
-
-    def get_desired_pose_output_port(self) -> OutputPort:
-        """Return the port of the commanded pose, (O,)."""
-        return self.GetOutputPort("desired_pose")
-
-    def get_held_action_output_port(self) -> OutputPort:
-        """Return the port of the current action, (A,)."""
-        return self.GetOutputPort("held_action")
-
-    def get_constraint_violation_output_port(self) -> OutputPort:
-        """Return the port of max(c − G y) of the command, (1,)."""
-        return self.GetOutputPort("constraint_violation")
-
-    def get_fallback_output_port(self) -> OutputPort:
-        """Return the port that is 1 if a safe pose is commanded instead of the requested one, (1,)."""
-        return self.GetOutputPort("fallback")
+    get_action_input_port = input_getter("action", "policy's action in [−1, 1], (A,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,)")
+    get_wrench_input_port = input_getter("wrench", "measured wrench, (W,)")
+    get_desired_pose_output_port = output_getter("desired_pose", "commanded pose, (O,)")
+    get_held_action_output_port = output_getter("held_action", "current action, (A,)")
+    get_constraint_violation_output_port = output_getter("constraint_violation", "command's max(c − G y), (1,)")
+    get_fallback_output_port = output_getter(
+        "fallback", "flag, 1 if a safe pose is commanded instead of the requested one, (1,)"
+    )
 
 
 def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, kind: str = "") -> None:
-    """Refuse a diagram with ports that do not fit a station.
+    """Refuse a diagram with ports that do not fit a station with poses (O,) and wrenches (W,).
 
-    Args:
-        guidance: Diagram.
-        pose_size: O of the station.
-        wrench_size: W of the station.
-        kind: Name of the guidance for the message; default: the diagram's.
+    The message names the `kind` of guidance, or else the diagram.
 
     Raises:
         InputError: If a port of the contract is missing or has another size.

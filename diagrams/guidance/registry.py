@@ -53,8 +53,7 @@ class GuidanceKind:
     def missing_requirements(self, known: Collection[str]) -> tuple[str, ...]:
         """Return the missing requirements of the alternative that lacks fewest; empty if one is complete.
 
-        Args:
-            known: Requirements that the task provides.
+        `known` are the requirements that the task provides.
         """
         lacking = [tuple(one for one in needed if one not in known) for needed in self.needs]
         return min(lacking, key=len, default=())
@@ -80,14 +79,7 @@ def register_guidance(
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
     """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
 
-    Args:
-        name: Value of the option `guidance`.
-        needs: See `GuidanceKind`.
-        label: Label in figures; default: its name.
-        colour: Colour in figures, "#rrggbb".
-        demonstrates: See `GuidanceKind`.
-        displaces: See `GuidanceKind`.
-        options: Model of further options of the environment.
+    The arguments are those of `GuidanceKind`; the label is the name by default.
     """
 
     def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
@@ -104,12 +96,7 @@ def possible_guidance(known: Collection[str]) -> list[str]:
 
 
 def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
-    """Return the kind of guidance of a name, if a task meets its requirements.
-
-    Args:
-        name: Name of the kind.
-        known: Requirements that the task provides.
-        task: Name of the task, for the message.
+    """Return the kind of guidance of a name, if it needs no more than the `known` requirements of a task.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing, which the message names.
@@ -125,12 +112,7 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
 
 
 def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") -> Diagram:
-    """Build the guidance of a name from prior knowledge.
-
-    Args:
-        name: Name of the kind.
-        known: Prior knowledge.
-        task: Name of the task, for the message.
+    """Build the guidance of a name from prior knowledge; a message names the task.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing.

@@ -125,12 +125,7 @@ def find_driver(robot: Robot | str) -> type[Driver]:
 
 
 def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> SafetyLimits:
-    """Return limits below those at which the driver stops by itself, and below the limits of the joints.
-
-    Args:
-        plant: The arm's controller plant.
-        driver: Driver of the arm.
-    """
+    """Return limits below those at which the driver stops by itself, and below those of the arm's controller plant."""
     reflex_limits = np.array(driver.torque_reflex_limits)
     return SafetyLimits(
         velocity=tuple((VELOCITY_SHARE * plant.GetVelocityUpperLimits()).tolist()),

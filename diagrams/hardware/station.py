@@ -9,7 +9,7 @@ from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.envs.options import Number, Options
@@ -27,6 +27,7 @@ from guiderail.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.pose_rate_limiter import PoseRateLimiter
 from guiderail.systems.status_watchdog import StatusWatchdog
+from guiderail.systems.support.declarations import output_getter
 from guiderail.systems.torque_publisher import TorquePublisher
 from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
 
@@ -105,10 +106,12 @@ class HardwareStation(Station):
             robot: The arm, or its name.
             lcm_url: Address of the driver; LCM's default if empty.
             limits: Limits of measurements and torques; `safety_limits` by default.
-            status_limits: Limits of a status; by default they follow from the joints' velocities and the period.
+            status_limits: Limits of a status; by default they follow from the joints' velocities, the period and the
+                driver's hold-off.
 
         Raises:
-            InputError: If the robot has no driver, or the address is unusable.
+            InputError: If the robot has no driver, the address is unusable, or the settling time is shorter than the
+                driver's hold-off.
         """
         super().__init__()
         robot = find_robot(robot)
@@ -117,7 +120,14 @@ class HardwareStation(Station):
         self.controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         plant = self.controller_plant.plant
         self.limits = limits or safety_limits(plant, driver)
-        self.status_limits = status_limits or StatusLimits.at_rate(plant.GetVelocityUpperLimits().tolist(), period)
+        self.status_limits = status_limits or StatusLimits.at_rate(
+            plant.GetVelocityUpperLimits().tolist(), period, settling_time=driver.hold_off
+        )
+        if self.status_limits.settling_time < driver.hold_off:
+            raise InputError(
+                f"the driver {driver.name} accepts no commands for {driver.hold_off:g} s: the settling time must be as "
+                f"long, not {self.status_limits.settling_time:g} s"
+            )
         self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
         self._robot_timeout, self._wrench_time_constant = robot_timeout, wrench_time_constant
         self._build()
@@ -200,13 +210,8 @@ class HardwareStation(Station):
             builder.ExportOutput(port, f"{self.driver.name}.{name}")
         builder.BuildInto(self)
 
-    def get_fault_output_port(self) -> OutputPort:
-        """Return the port of the reason of a stop, (1,), a code of `Fault`."""
-        return self.GetOutputPort("fault")
-
-    def get_arm_state_output_port(self) -> OutputPort:
-        """Return the port of the arm's state, (1,), a number of `ArmState`."""
-        return self.GetOutputPort("arm_state")
+    get_fault_output_port = output_getter("fault", "reason of a stop, (1,), a code of `Fault`")
+    get_arm_state_output_port = output_getter("arm_state", "arm's state, (1,), a number of `ArmState`")
 
     def start(self, simulator: Simulator) -> None:
         """Initialize a simulator that contains this station: wait for the robot, and hold its pose.

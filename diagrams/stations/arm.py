@@ -16,19 +16,15 @@ from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
-    POSE_SIZE,
     ContactOptions,
+    ControllerPlant,
     Impedance,
     Station,
     add_workcell_plant,
-    add_wrench_sensor,
-    check_pose,
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform
-from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import (
     DEFAULT_END_EFFECTOR,
@@ -39,6 +35,8 @@ from guiderail.models.robots.robot import (
     find_robot,
 )
 from guiderail.systems.gripper_command import GripperCommand
+from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.wrench_sensor import WrenchSensor
 
 # Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.
 MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
@@ -75,14 +73,9 @@ def add_arm(
     *,
     as_rigid: bool = False,
 ) -> ArmModel:
-    """Add the arm at the world's origin, the tool, and the workpiece.
+    """Add the arm at the world's origin, the tool, and the workpiece to a plant that is not finalized.
 
-    Args:
-        plant: Plant, not finalized.
-        workcell: Workpiece and target frame.
-        robot: The arm, or its name.
-        end_effector: The tool, or its name.
-        as_rigid: Model a gripper as one body, open.
+    Robot and end effector are given themselves or by name; `as_rigid` makes an open gripper one body.
     """
     robot, end_effector = find_robot(robot), find_end_effector(end_effector)
     arm = add_robot(plant, robot)
@@ -120,14 +113,13 @@ def controller_model(
     return plant, arm
 
 
-class ArmControllerPlant:
-    """Model of an arm for its controller; see `ControllerPlant`.
+class ArmControllerPlant(ControllerPlant):
+    """Model of an arm for its controller.
+
+    The posture is half way through the workpiece's quarter turn, so that both ends are equally far.
 
     Attributes:
-        plant: Plant with arm, tool and workpiece.
-        arm: The arm in this plant.
-        posture: Joint positions to which the null space returns, (n,): half way through the workpiece's quarter turn,
-            so that both ends are equally far.
+        arm: The arm in the plant.
     """
 
     def __init__(
@@ -136,36 +128,10 @@ class ArmControllerPlant:
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
     ):
-        """Construct the model.
-
-        Args:
-            workcell: Workpiece and target frame.
-            robot: The arm, or its name.
-            end_effector: The tool, or its name.
-        """
-        self.plant, self.arm = controller_model(workcell, robot, end_effector)
-        self.posture = self.solve(MID_TURN_POSE, np.array(find_robot(robot).home))
-
-    @property
-    def target(self) -> Frame:
-        """Target frame T."""
-        return self.arm.target
-
-    @property
-    def tool_center(self) -> Frame:
-        """Frame of the tool center P."""
-        return self.arm.tool_center
-
-    def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
-        """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""
-        arm = self.arm
-        return solve_inverse_kinematics(self.plant, arm.target, arm.tool_center, pose_to_transform(pose), posture)
-
-    def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
-        """Put the arm of a station's plant at rest with its tool center at `pose`, (6,), in the root context."""
-        plant_context = plant.GetMyMutableContextFromRoot(context)
-        plant.SetPositions(plant_context, model, self.solve(check_pose(pose, POSE_SIZE), self.posture))
-        plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
+        """Construct the model; robot and end effector are given themselves or by name."""
+        plant, self.arm = controller_model(workcell, robot, end_effector)
+        super().__init__(plant, self.arm.target, self.arm.tool_center, np.array(find_robot(robot).home))
+        self.posture = self.solve(MID_TURN_POSE, self.posture)
 
 
 def add_gripper_control(
@@ -183,7 +149,9 @@ def add_gripper_control(
         ),
     )
     # The model's state includes joints that mimic others.
-    num_positions, first = plant.num_positions(arm.tool_model), _first_position(plant, arm.tool_model)
+    num_positions = plant.num_positions(arm.tool_model)
+    every = [plant.get_joint(index) for index in plant.GetJointIndices(arm.tool_model)]
+    first = min(joint.position_start() for joint in every if joint.num_positions() > 0)
     actuated = np.zeros((2 * len(joints), plant.num_multibody_states(arm.tool_model)))
     for row, joint in enumerate(joints):
         column = joint.position_start() - first
@@ -251,14 +219,18 @@ class ArmStation(Station):
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)
         )
         plant, arm = self.plant, self.arm
-        wrench = add_wrench_sensor(builder, plant, workcell, arm.wrist, arm.tool, arm.tool_center, wrench_time_constant)
+        sensor = WrenchSensor(
+            plant, arm.wrist, arm.tool, arm.tool_center, workcell.X_WT.rotation(), time_step, wrench_time_constant
+        )
+        builder.AddNamedSystem("wrench_sensor", sensor)
+        sensor.connect(builder, plant)
         torque = add_impedance_control(
             builder,
             self._controller_plant,
             impedance,
             CONTROL_PERIOD,
             state=plant.get_state_output_port(arm.model),
-            wrench=wrench,
+            wrench=sensor.get_wrench_output_port(),
         )
         builder.Connect(torque, plant.get_actuation_input_port(arm.model))
         if arm.gripper:
@@ -268,13 +240,12 @@ class ArmStation(Station):
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 
-    def get_gripper_position_input_port(self) -> InputPort:
-        """Return the port of the desired positions of the gripper's actuated joints, (n,), if there is a gripper."""
-        return self.GetInputPort("gripper_position")
-
-    def get_gripper_state_output_port(self) -> OutputPort:
-        """Return the port of the state of the gripper's actuated joints, (2n,), if there is a gripper."""
-        return self.GetOutputPort("gripper_state")
+    get_gripper_position_input_port = input_getter(
+        "gripper_position", "desired positions of the gripper's actuated joints, (n,), if there is a gripper"
+    )
+    get_gripper_state_output_port = output_getter(
+        "gripper_state", "state of the gripper's actuated joints, (2n,), if there is a gripper"
+    )
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
@@ -284,9 +255,3 @@ class ArmStation(Station):
         """Add a mass [kg] to the tool that controller and sensor do not model; `context` is the root context."""
         own, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
         tool.SetMass(own, tool.default_mass() + mass)
-
-
-def _first_position(plant: MultibodyPlant, model: ModelInstanceIndex) -> int:
-    """Return the index of a model's first position among the plant's."""
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices(model)]
-    return min(joint.position_start() for joint in joints if joint.num_positions() > 0)

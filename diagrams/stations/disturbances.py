@@ -16,12 +16,12 @@ from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     OUTPUTS,
     PLANT_PERIOD,
-    POSE_SIZE,
     Impedance,
     Station,
     export_station_ports,
 )
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance
 
@@ -94,11 +94,7 @@ class DisturbedStation(Station):
     """
 
     def __init__(self, station: Station, disturbances: Disturbances):
-        """Construct the station.
-
-        Args:
-            station: Inner station, which becomes part of this one.
-            disturbances: The disturbances.
+        """Construct the station; the inner one becomes part of it.
 
         Raises:
             InputError: If the station does not have such a disturbance.
@@ -169,11 +165,7 @@ class DisturbedStation(Station):
 def disturbed(build: Callable[..., Station], disturbances: Disturbances, is_simulated: bool, name: str) -> Station:
     """Build a station, with disturbances if any is on.
 
-    Args:
-        build: Function that builds the station; has a parameter `impedance` if its stiffness can be disturbed.
-        disturbances: The disturbances.
-        is_simulated: True if it is a simulation.
-        name: Name of the station.
+    To disturb its stiffness, `build` needs a parameter `impedance`. The message names the station.
 
     Raises:
         InputError: If the station does not have such a disturbance.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -22,24 +21,22 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import LinearSystem, MatrixGain
 
-from guiderail.diagrams.stations.impedance_control import add_impedance_control
+from guiderail.diagrams.stations.impedance_control import add_impedance_control, add_joint_impedance
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
-    POSE_SIZE,
     ContactOptions,
+    ControllerPlant,
     Impedance,
     Station,
     add_workcell_plant,
     check_pose,
     export_simulation_ports,
-    export_station_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.systems.pose_wrench import PoseWrench
 
 GANTRY_JOINTS = (
@@ -122,7 +119,17 @@ class GantryStation(Station):
         builder.Connect(plant.get_state_output_port(gantry), pose.get_input_port())
         wrench = _add_wrench(builder, plant, gantry, pose.get_output_port(), wrench_time_constant)
         if is_joint:
-            _add_joint_control(builder, plant, gantry, impedance, pose=pose.get_output_port(), wrench=wrench)
+            desired = add_joint_impedance(
+                builder,
+                impedance,
+                pose=pose.get_output_port(),
+                wrench=wrench,
+                impedance_wrench=plant.get_net_actuation_output_port(gantry),
+            )
+            # The desired pose is the first half of the desired state; the desired velocity is zero.
+            state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
+            builder.Connect(desired, state.get_input_port())
+            builder.Connect(state.get_output_port(), plant.get_desired_state_input_port(gantry))
         else:
             torque = add_impedance_control(
                 builder,
@@ -165,52 +172,12 @@ def _check_time_step(impedance: Impedance, time_step: float) -> None:
         )
 
 
-@dataclass(frozen=True)
-class GantryControllerPlant:
-    """Model of the gantry for its controller; see `ControllerPlant`."""
-
-    plant: MultibodyPlant
-    target: Frame
-    tool_center: Frame
-    posture: np.ndarray
-
-
-def _controller_plant(workcell: Workcell, impedance: Impedance) -> GantryControllerPlant:
+def _controller_plant(workcell: Workcell, impedance: Impedance) -> ControllerPlant:
     plant = MultibodyPlant(0.0)
     _add_gantry(plant, workcell, impedance, with_gains=False)
     plant.Finalize()
     target, tool_center = (plant.GetFrameByName(name) for name in ("target", "tool_center"))
-    return GantryControllerPlant(plant, target, tool_center, np.zeros(POSE_SIZE))
-
-
-def _add_joint_control(
-    builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    gantry: ModelInstanceIndex,
-    impedance: Impedance,
-    *,
-    pose: OutputPort,
-    wrench: OutputPort,
-) -> None:
-    """Add the command of the joints' springs, and export the ports of a station."""
-    watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
-    # The desired pose is the first half of the desired state; the desired velocity is zero.
-    desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
-    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
-    builder.Connect(watchdog.get_safe_pose_output_port(), desired_state.get_input_port())
-    builder.Connect(pose, watchdog.get_pose_input_port())
-    builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(gantry))
-    builder.Connect(plant.get_net_actuation_output_port(gantry), monitor.get_impedance_wrench_input_port())
-    export_station_ports(
-        builder,
-        watchdog.get_desired_pose_input_port(),
-        watchdog.get_command_time_input_port(),
-        pose=pose,
-        wrench=wrench,
-        contact_force=monitor.get_contact_force_output_port(),
-        saturation=monitor.get_saturation_output_port(),
-        command_timed_out=watchdog.get_command_timed_out_output_port(),
-    )
+    return ControllerPlant(plant, target, tool_center, np.zeros(POSE_SIZE))
 
 
 def _add_gantry(

@@ -1,47 +1,20 @@
-"""Cartesian impedance controller of a station with an arm or a gantry."""
+"""Impedance of a station: that of a Cartesian controller, or that of joints which have springs and dampers."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from guiderail.diagrams.stations.station import Impedance, export_station_ports, to_wrench_order
+from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
+    ControllerPlant,
+    Impedance,
+    export_station_ports,
+    to_wrench_order,
+)
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
+from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
-
-
-class ControllerPlant(Protocol):
-    """Model of a robot for its controller: with tool and workpiece, without fixture and offsets."""
-
-    @property
-    def plant(self) -> MultibodyPlant:
-        """Plant with the robot only."""
-
-    @property
-    def target(self) -> Frame:
-        """Target frame T."""
-
-    @property
-    def tool_center(self) -> Frame:
-        """Frame of the tool center P."""
-
-    @property
-    def posture(self) -> np.ndarray:
-        """Joint positions to which the null space returns, (n,)."""
-
-
-def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains:
-    """Return the gains of the controller for a station's impedance."""
-    return ImpedanceGains(
-        stiffness=np.diag(to_wrench_order(impedance.stiffness)),
-        wrench_limits=to_wrench_order(impedance.limits),
-        posture=posture,
-        damping_ratio=impedance.damping_ratio,
-    )
 
 
 def add_controller(
@@ -59,7 +32,12 @@ def add_controller(
             controller_plant.plant,
             controller_plant.target,
             controller_plant.tool_center,
-            impedance_gains(impedance, controller_plant.posture),
+            ImpedanceGains(
+                stiffness=np.diag(to_wrench_order(impedance.stiffness)),
+                wrench_limits=to_wrench_order(impedance.limits),
+                posture=controller_plant.posture,
+                damping_ratio=impedance.damping_ratio,
+            ),
             period=period,
             compensate_gravity=compensate_gravity,
         ),
@@ -78,19 +56,9 @@ def add_impedance_control(
     wrench: OutputPort,
     compensate_gravity: bool = True,
 ) -> OutputPort:
-    """Add the controller of a robot, and export the ports of a station.
+    """Add the controller of a robot, sampled with `period` [s], and export the ports of a station.
 
-    Args:
-        builder: Builder of the station.
-        controller_plant: Model of the robot.
-        impedance: Impedance at the tool center.
-        period: Sampling period of the controller and its command watchdog [s].
-        state: Port of joint positions and velocities, (2n,).
-        wrench: Port of the wrench, (6,).
-        compensate_gravity: Add the torque of the robot's weight.
-
-    Returns:
-        The port of the torques, (n,).
+    The ports are the joints' positions and velocities, (2n,), and the wrench, (6,). Returns that of the torques, (n,).
     """
     controller, monitor = add_controller(
         builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity
@@ -108,3 +76,27 @@ def add_impedance_control(
         command_timed_out=controller.get_command_timed_out_output_port(),
     )
     return controller.get_generalized_force_output_port()
+
+
+def add_joint_impedance(
+    builder: DiagramBuilder, impedance: Impedance, *, pose: OutputPort, wrench: OutputPort, impedance_wrench: OutputPort
+) -> OutputPort:
+    """Add watchdog and monitor of six joints that have an impedance, and export the ports of a station.
+
+    All ports are (6,): positions, wrench, and forces of the joints. Returns the port of the desired positions.
+    """
+    watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
+    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
+    builder.Connect(pose, watchdog.get_pose_input_port())
+    builder.Connect(impedance_wrench, monitor.get_impedance_wrench_input_port())
+    export_station_ports(
+        builder,
+        watchdog.get_desired_pose_input_port(),
+        watchdog.get_command_time_input_port(),
+        pose=pose,
+        wrench=wrench,
+        contact_force=monitor.get_contact_force_output_port(),
+        saturation=monitor.get_saturation_output_port(),
+        command_timed_out=watchdog.get_command_timed_out_output_port(),
+    )
+    return watchdog.get_safe_pose_output_port()

@@ -12,22 +12,13 @@ from pydrake.multibody.tree import BodyIndex, FixedOffsetFrame, PrismaticJoint, 
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, damping
+from guiderail.diagrams.stations.impedance_control import add_joint_impedance
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import (
-    CONTROL_PERIOD,
-    PLANT_PERIOD,
-    POSE_SIZE,
-    ContactOptions,
-    Impedance,
-    Station,
-    check_pose,
-    export_station_ports,
-)
+from guiderail.diagrams.stations.station import PLANT_PERIOD, ContactOptions, Impedance, Station, check_pose
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.mujoco_gantry import MovedBodies, MujocoGantry, mujoco_engine
 
 if TYPE_CHECKING:
@@ -69,13 +60,7 @@ def mujoco_model(
 ) -> mujoco.MjModel:
     """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
-    Args:
-        fixture: Contact surfaces of the fixture, in its frame.
-        workpiece: Contact surfaces of the workpiece, in its frame.
-        inertia: Spatial inertia of the workpiece, in its frame.
-        impedance: Impedance of the joints.
-        contact: Parameters of contact and integration.
-        period: Time that is a whole number of steps [s].
+    Surfaces and inertia of a body are in its frame. A `period` [s] is a whole number of steps.
 
     Raises:
         InputError: If MuJoCo is not installed, or there are more kinds of pairs than a contact mask has bits.
@@ -213,24 +198,17 @@ class MujocoStation(Station):
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
         gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
         self.gantry = builder.AddNamedSystem("gantry", gantry)
-        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
-        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
         builder.Connect(plant.get_body_poses_output_port(), gantry.get_nominal_body_poses_input_port())
-        builder.Connect(watchdog.get_safe_pose_output_port(), gantry.get_desired_pose_input_port())
-        builder.Connect(gantry.get_pose_output_port(), watchdog.get_pose_input_port())
-        builder.Connect(gantry.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
-        builder.Connect(
-            gantry.get_geometry_poses_output_port(), self.scene_graph.get_source_pose_port(plant.get_source_id())
-        )
-        export_station_ports(
+        desired_pose = add_joint_impedance(
             builder,
-            watchdog.get_desired_pose_input_port(),
-            watchdog.get_command_time_input_port(),
+            impedance,
             pose=gantry.get_pose_output_port(),
             wrench=gantry.get_wrench_output_port(),
-            contact_force=monitor.get_contact_force_output_port(),
-            saturation=monitor.get_saturation_output_port(),
-            command_timed_out=watchdog.get_command_timed_out_output_port(),
+            impedance_wrench=gantry.get_impedance_wrench_output_port(),
+        )
+        builder.Connect(desired_pose, gantry.get_desired_pose_input_port())
+        builder.Connect(
+            gantry.get_geometry_poses_output_port(), self.scene_graph.get_source_pose_port(plant.get_source_id())
         )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.ExportOutput(gantry.get_body_poses_output_port(), "body_poses")

@@ -84,12 +84,7 @@ class PlaneStation(Station):
     """
 
     def __init__(self, world: PassageGeometry, config: PlaneConfig = PlaneConfig()):
-        """Construct the station.
-
-        Args:
-            world: Geometry of walls, goal and obstacles.
-            config: Parameters of the robot.
-        """
+        """Construct the station from the geometry of walls, goal and obstacles."""
         super().__init__()
         builder = DiagramBuilder()
         self.world, self.config = world, config

@@ -13,11 +13,9 @@ from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscrete
 
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import POSE_SIZE, Station, check_pose, export_station_ports
+from guiderail.diagrams.stations.station import ControllerPlant, Station, export_station_ports
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
-from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import DEFAULT_ROBOT, Robot, find_robot
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
@@ -170,22 +168,16 @@ class PouringStation(Station):
         plant.Finalize()
         thermos = plant.GetBodyByName("thermos")
 
-        self._controller_plant = MultibodyPlant(0.0)
-        _, tip, _ = add_arm_with_thermos(self._controller_plant, config)
-        self._target = self._controller_plant.AddFrame(
-            FixedOffsetFrame("target", self._controller_plant.world_frame(), config.X_WT)
+        model = MultibodyPlant(0.0)
+        _, tip, _ = add_arm_with_thermos(model, config)
+        target = model.AddFrame(FixedOffsetFrame("target", model.world_frame(), config.X_WT))
+        model.Finalize()
+        self._controller_plant = ControllerPlant(model, target, tip, np.array(config.arm.level_posture))
+        posture = self._controller_plant.posture = self._controller_plant.solve(
+            MID_POURING_POSE, self._controller_plant.posture
         )
-        self._controller_tip = tip
-        self._controller_plant.Finalize()
-        self.posture = self.solve(MID_POURING_POSE, np.array(config.arm.level_posture))
-
         controller = CartesianPositionController(
-            self._controller_plant,
-            self._target,
-            self._controller_tip,
-            posture=self.posture,
-            period=config.control_period,
-            speed_limits=SPEED_LIMITS,
+            model, target, tip, posture=posture, period=config.control_period, speed_limits=SPEED_LIMITS
         )
         builder.AddNamedSystem("controller", controller)
         # Without a desired velocity the drives' damping delays the arm by centimeters.
@@ -236,11 +228,6 @@ class PouringStation(Station):
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
 
-    def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
-        """Return the joint positions (n,) closest to `posture`, (n,), with the tip at `pose`, (6,)."""
-        X_TP = pose_to_transform(pose)
-        return solve_inverse_kinematics(self._controller_plant, self._target, self._controller_tip, X_TP, posture)
-
     def set_mug(self, root_context: Context, X_TMug: RigidTransform) -> None:
         """Move the mug so that its tip is at X_TMug."""
         context = self.plant.GetMyMutableContextFromRoot(root_context)
@@ -248,9 +235,8 @@ class PouringStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
+        self._controller_plant.place(self.plant, self.arm, context, pose)
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.arm, self.solve(check_pose(pose, POSE_SIZE), self.posture))
-        self.plant.SetVelocities(plant_context, self.arm, np.zeros(self.config.arm.num_joints))
         X_WP = self._tip.CalcPoseInWorld(plant_context)
         for ball, p_PB in zip(self._balls, self.config.stack(), strict=True):
             self.plant.SetFloatingBaseBodyPoseInWorldFrame(plant_context, ball, RigidTransform(X_WP @ p_PB))

@@ -39,14 +39,16 @@ from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
 from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.models.common.poses import POSE_SIZE, pose_to_transform
+from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 Robot = TypeVar("Robot")
 
@@ -54,7 +56,6 @@ INPUTS = ("desired_pose", "command_time")
 OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 """Output ports of every station; `INPUTS` are the input ports."""
 
-POSE_SIZE = 6
 CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
@@ -136,33 +137,15 @@ class Station(Diagram):
         """Number of coordinates of a wrench, W."""
         return self.get_wrench_output_port().size()
 
-    def get_desired_pose_input_port(self) -> InputPort:
-        """Return the port of the desired pose, (O,)."""
-        return self.GetInputPort("desired_pose")
-
-    def get_command_time_input_port(self) -> InputPort:
-        """Return the port of the time of the desired pose, (1,) [s]; optional."""
-        return self.GetInputPort("command_time")
-
-    def get_pose_output_port(self) -> OutputPort:
-        """Return the port of the measured pose, (O,)."""
-        return self.GetOutputPort("pose")
-
-    def get_wrench_output_port(self) -> OutputPort:
-        """Return the port of the wrench of the surroundings on the tool, (W,)."""
-        return self.GetOutputPort("wrench")
-
-    def get_contact_force_output_port(self) -> OutputPort:
-        """Return the port of the magnitude of the impedance's force, (1,) [N]."""
-        return self.GetOutputPort("contact_force")
-
-    def get_saturation_output_port(self) -> OutputPort:
-        """Return the port that is 1 while the controller is at a limit, (1,)."""
-        return self.GetOutputPort("saturation")
-
-    def get_command_timed_out_output_port(self) -> OutputPort:
-        """Return the port that is 1 while the last safe pose is held, (1,)."""
-        return self.GetOutputPort("command_timed_out")
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
+    get_command_time_input_port = input_getter("command_time", "time of the desired pose, (1,) [s]; optional")
+    get_pose_output_port = output_getter("pose", "measured pose, (O,)")
+    get_wrench_output_port = output_getter("wrench", "wrench of the surroundings on the tool, (W,)")
+    get_contact_force_output_port = output_getter("contact_force", "magnitude of the impedance's force, (1,) [N]")
+    get_saturation_output_port = output_getter("saturation", "flag, 1 while the controller is at a limit, (1,)")
+    get_command_timed_out_output_port = output_getter(
+        "command_timed_out", "flag, 1 while the last safe pose is held, (1,)"
+    )
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
@@ -173,18 +156,54 @@ class Station(Diagram):
         """
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiply friction and modulus of all contacts until the next reset.
+        """Multiply friction and modulus of all contacts until the next reset; `context` is the root context.
 
-        Args:
-            context: The root context.
-            friction: Factor of the friction.
-            modulus: Factor of the hydroelastic modulus, or of another engine's stiffness.
+        The modulus is the hydroelastic one, or another engine's stiffness.
         """
-        scale_contact(self.plant, self.scene_graph, context, friction, modulus)
+        own = self.scene_graph.GetMyMutableContextFromRoot(context)
+        inspector = self.scene_graph.model_inspector()
+        for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+            properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+            if properties.HasProperty("material", "coulomb_friction"):
+                nominal = properties.GetProperty("material", "coulomb_friction")
+                factored = CoulombFriction(friction * nominal.static_friction(), friction * nominal.dynamic_friction())
+                properties.UpdateProperty("material", "coulomb_friction", factored)
+            if properties.HasProperty("hydroelastic", "hydroelastic_modulus"):
+                nominal = properties.GetProperty("hydroelastic", "hydroelastic_modulus")
+                properties.UpdateProperty("hydroelastic", "hydroelastic_modulus", modulus * nominal)
+            self.scene_graph.AssignRole(own, self.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the station's own disturbances at a reset, and return them by name; `context` is the root context."""
         return {}
+
+
+@dataclass
+class ControllerPlant:
+    """Model of a robot for its controller: with tool and workpiece, without fixture and offsets.
+
+    Attributes:
+        plant: Plant with the robot only.
+        target: Target frame T.
+        tool_center: Frame of the tool center P.
+        posture: Joint positions to which the null space returns, (n,).
+    """
+
+    plant: MultibodyPlant
+    target: Frame
+    tool_center: Frame
+    posture: np.ndarray
+
+    def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
+        """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""
+        X_TP = pose_to_transform(pose)
+        return solve_inverse_kinematics(self.plant, self.target, self.tool_center, X_TP, posture)
+
+    def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
+        """Put the robot of a station's plant at rest with its tool center at `pose`, (6,), in the root context."""
+        plant_context = plant.GetMyMutableContextFromRoot(context)
+        plant.SetPositions(plant_context, model, self.solve(check_pose(pose, POSE_SIZE), self.posture))
+        plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
 
 
 def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
@@ -200,24 +219,6 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
     except (TypeError, ValueError):
         raise InputError(f"a robot is put to a pose of {size} finite numbers, not {brief(pose)}") from None
     return numbers
-
-
-def scale_contact(
-    plant: MultibodyPlant, scene_graph: SceneGraph, context: Context, friction: float, modulus: float
-) -> None:
-    """Multiply friction and hydroelastic modulus of all surfaces of a plant, in the root context only."""
-    own = scene_graph.GetMyMutableContextFromRoot(context)
-    inspector = scene_graph.model_inspector()
-    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
-        properties = ProximityProperties(inspector.GetProximityProperties(geometry))
-        if properties.HasProperty("material", "coulomb_friction"):
-            nominal = properties.GetProperty("material", "coulomb_friction")
-            factored = CoulombFriction(friction * nominal.static_friction(), friction * nominal.dynamic_friction())
-            properties.UpdateProperty("material", "coulomb_friction", factored)
-        if properties.HasProperty("hydroelastic", "hydroelastic_modulus"):
-            nominal = properties.GetProperty("hydroelastic", "hydroelastic_modulus")
-            properties.UpdateProperty("hydroelastic", "hydroelastic_modulus", modulus * nominal)
-        scene_graph.AssignRole(own, plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
 def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:
@@ -250,23 +251,6 @@ def add_workcell_plant(
     plant.Finalize()
     workcell.filter_contacts(plant, scene_graph)
     return plant, scene_graph, robot
-
-
-def add_wrench_sensor(
-    builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    workcell: Workcell,
-    wrist: WeldJoint,
-    tool: list[RigidBody],
-    tool_center: Frame,
-    time_constant: float,
-) -> OutputPort:
-    """Add a sensor at the wrist, to which `tool` is attached; return the wrench as a station exports it."""
-    axes = workcell.X_WT.rotation()
-    sensor = WrenchSensor(plant, wrist, tool, tool_center, axes, plant.time_step(), time_constant)
-    builder.AddNamedSystem("wrench_sensor", sensor)
-    sensor.connect(builder, plant)
-    return sensor.get_wrench_output_port()
 
 
 def to_wrench_order(values: Sequence[float]) -> np.ndarray:

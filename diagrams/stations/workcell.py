@@ -114,16 +114,9 @@ def exclude_contacts(
     workpiece: str,
     pairs: Iterable[tuple[Iterable[str], Iterable[str]]],
 ) -> None:
-    """Exclude contact between surfaces of fixture and workpiece.
+    """Exclude contact between pairs of surfaces of the fixture's and the workpiece's body, named in this order.
 
     `drake:collision_filter_group` in an SDF file filters whole bodies only.
-
-    Args:
-        plant: Finalized plant.
-        scene_graph: Its scene graph.
-        fixture: Name of the fixture's body.
-        workpiece: Name of the workpiece's body.
-        pairs: Pairs of surface names, of the fixture and of the workpiece.
     """
     fixture_ids, workpiece_ids = (_geometries(plant, scene_graph, body) for body in (fixture, workpiece))
     manager = scene_graph.collision_filter_manager()

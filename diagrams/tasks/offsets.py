@@ -85,12 +85,7 @@ class HiddenOffsets(ABC):
         self._run: Any = None
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the offsets (2,) [m] of the fixture and of the workpiece in the tool.
-
-        Args:
-            rng: Random generator of the environment.
-            options: Instance of `InsertionReset`.
-        """
+        """Return the offsets (2,) [m] of fixture and workpiece; `options` are an instance of `InsertionReset`."""
         # Every reset samples the same numbers, used or not, so that a seed has the same meaning at any reset.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)

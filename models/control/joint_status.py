@@ -156,10 +156,16 @@ class StatusLimits:
             raise InputError("a robot's settling time and its clock's drift must be finite and not negative")
 
     @classmethod
-    def at_rate(cls, velocity: Sequence[float], period: float) -> "StatusLimits":
-        """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`."""
+    def at_rate(cls, velocity: Sequence[float], period: float, **others: float) -> "StatusLimits":
+        """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`.
+
+        Args:
+            velocity: Velocity limits of the joints, (n,) [rad/s].
+            period: Period of the statuses [s].
+            others: Further limits by name.
+        """
         timeout = MAX_MISSED_MESSAGES * period
-        return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout)
+        return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout, **others)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import DrivenStation, along
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.tools.evaluation.baselines import make_baseline

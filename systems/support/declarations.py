@@ -14,6 +14,7 @@ from pydrake.systems.framework import (
     InputPort,
     LeafSystem,
     OutputPort,
+    System,
     ValueProducer,
 )
 
@@ -100,26 +101,28 @@ def declare_plant_context(
     )
 
 
-def input_getter(name: str, description: str) -> Callable[[LeafSystem], InputPort]:
-    """Return a method that returns the input port `name`, for the body of a system's class.
+def input_getter(name: str, description: str) -> Callable[[System], InputPort]:
+    """Return a method that returns the input port `name`, for the body of a class of systems or diagrams.
 
     Args:
-        name: Name of the port, which the system stores as `_<name>_port`.
+        name: Name of the port, which a system stores as `_<name>_port`.
         description: Signal, shape and unit, for the method's docstring.
     """
 
-    def getter(self: LeafSystem) -> InputPort:
-        return getattr(self, f"_{name}_port")
+    def getter(self: System) -> InputPort:
+        port = getattr(self, f"_{name}_port", None)
+        return self.GetInputPort(name) if port is None else port
 
     getter.__name__, getter.__doc__ = f"get_{name}_input_port", f"Return the port of the {description}."
     return getter
 
 
-def output_getter(name: str, description: str) -> Callable[[LeafSystem], OutputPort]:
+def output_getter(name: str, description: str) -> Callable[[System], OutputPort]:
     """Return a method that returns the output port `name`; see `input_getter`."""
 
-    def getter(self: LeafSystem) -> OutputPort:
-        return getattr(self, f"_{name}_port")
+    def getter(self: System) -> OutputPort:
+        port = getattr(self, f"_{name}_port", None)
+        return self.GetOutputPort(name) if port is None else port
 
     getter.__name__, getter.__doc__ = f"get_{name}_output_port", f"Return the port of the {description}."
     return getter

@@ -36,9 +36,6 @@ def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen[Any]]:
     """Run Python code in a child process that exits when its parent does, even if the parent is killed.
 
     The child's standard input is a pipe; the operating system closes its other end with the parent.
-
-    Args:
-        code: Program of the child.
     """
     program = f"from {__name__} import exit_with_parent; exit_with_parent()\n{code}"
     # A new session, because Ctrl-C is meant for this process, which needs the child to bring the arm to rest.
@@ -145,13 +142,7 @@ class RobotConnection:
 
     @contextmanager
     def simulated_driver(self, task: str, url: str, imports: Sequence[str] = ()) -> Iterator[None]:
-        """Run the simulated driver of an arm in front of a task's fixture; do nothing for a real robot.
-
-        Args:
-            task: Name of the task.
-            url: LCM URL of the driver's bus.
-            imports: Modules, files and task folders that register the task.
-        """
+        """Run the simulated driver of an arm in front of a task's fixture; do nothing for a real robot."""
         if not self.sim:
             yield
             return

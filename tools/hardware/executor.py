@@ -46,7 +46,7 @@ SIGNALS = {
     "arm_state": 1,
 }
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
-WARM_UP_TIME = 0.1  # less than a driver's hold-off [s]
+MAX_WARM_UP_TIME = 0.1  # [s]
 BLEND_TIMEOUT = 5.0  # longest time until the controller has full authority [s]
 COMPLETED = "done"
 
@@ -82,11 +82,7 @@ class SkillExecutor:
     def __init__(self, task: InsertionTask, skill: SkillDiagram, clock: Clock, is_stop_requested: Callable[[], bool]):
         """Connect to the robot.
 
-        Args:
-            task: Task of the skill.
-            skill: Skill with a `HardwareStation`.
-            clock: Clock of its station.
-            is_stop_requested: Function that returns True if the operator requests a stop; called in every control step.
+        The skill has a `HardwareStation`, and the clock is its. `is_stop_requested` is called in every control step.
 
         Raises:
             InputError: If no robot answers.
@@ -129,10 +125,11 @@ class SkillExecutor:
 
         The skill's station receives statuses, but not for long enough to send anything.
         """
+        duration = min(MAX_WARM_UP_TIME, 0.5 * self._skill_station.status_limits.settling_time)
         simulator = Simulator(self._diagram)
         self._skill_station.start(simulator)
         self._clock.begin()
-        self._clock.advance(simulator, self._skill_station, round(WARM_UP_TIME / self._skill_station.period))
+        self._clock.advance(simulator, self._skill_station, round(duration / self._skill_station.period))
 
     def _rest(self) -> None:
         station, context = self._active_station()

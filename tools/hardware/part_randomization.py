@@ -22,22 +22,12 @@ class PartRandomizer:
     """Sample the offsets of a task's parts, and send them to the simulated driver."""
 
     def __init__(self, task: InsertionTask, driver: LcmDriver, seed: int):
-        """Sample the offset of the run.
-
-        Args:
-            task: Task with the parts.
-            driver: Connection to the simulated driver.
-            seed: Seed of the offset that is fixed for the run: the same as in simulation with this seed.
-        """
+        """Sample the offset of the run; it is the same as in simulation with this seed."""
         self._task, self._driver = task, driver
         task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Move the parts to new offsets; `options` are those of a reset in simulation.
-
-        Returns:
-            The offsets by name.
-        """
+        """Move the parts to new offsets for the options of a reset in simulation; return the offsets by name."""
         reset = validate_options(self._task.Reset, options, "a simulated driver")
         fixture, workpiece = self._task.offsets.draw(rng, reset)
         self._driver.lcm.Publish(CHANNEL, json.dumps([fixture.tolist(), workpiece.tolist()]).encode())

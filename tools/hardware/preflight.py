@@ -39,13 +39,7 @@ class PreflightChecks:
     """
 
     def __init__(self, station: HardwareStation, clock: Clock, start: np.ndarray, num_steps: int):
-        """Receive the first statuses.
-
-        Args:
-            station: Station of the arm.
-            clock: Clock of the station.
-            start: Start pose of the skill, (6,).
-            num_steps: Status periods of a control step.
+        """Receive the first statuses; `num_steps` is the number of status periods of a control step.
 
         Raises:
             InputError: If no robot answers.
@@ -85,13 +79,10 @@ def start_simulator(station: HardwareStation, clock: Clock) -> Simulator:
 
 
 def check_robot(station: HardwareStation, context: Context, start: np.ndarray, num_commands: int) -> list[Check]:
-    """Check a robot's status, and list the assumptions about it.
+    """Check the status of a robot in the root context of its station, and list the assumptions about it.
 
-    Args:
-        station: Station that has received some statuses.
-        context: Root context of a simulator of the station alone.
-        start: Start pose of the skill, (6,).
-        num_commands: Number of commands that the robot received from other programs in the meantime.
+    `start` is the start pose of the skill, (6,), and `num_commands` the number of commands that the robot received from
+    other programs in the meantime.
     """
     plant, arm = station.controller_plant.plant, station.controller_plant.arm
     driver, limits = station.driver, station.limits
@@ -155,13 +146,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
 def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
     """Show the checks and have the operator confirm them; then repeat them, because the robot may have changed.
 
-    Args:
-        checks: The checks.
-        log: Function that shows a message.
-        assume_yes: Do not ask.
-
-    Returns:
-        The checks that were shown.
+    With `assume_yes` nothing is asked. Returns the checks that were shown.
 
     Raises:
         InputError: If a check fails, before or after the question, or the operator does not confirm.

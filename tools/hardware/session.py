@@ -46,13 +46,8 @@ def robot_session(
 ) -> Iterator[RobotSession]:
     """Wait for the robot, and have the pre-flight checks confirmed.
 
-    In front of a simulated driver a reset samples the offsets of the parts as in simulation.
-
-    Args:
-        config: Configuration of a run, with a hardware station.
-        connection: Connection to the robot driver.
-        assume_yes: Do not ask to confirm the checks; with a simulated driver, nor to resume after a stop.
-        log: Function that shows a message.
+    In front of a simulated driver a reset samples the offsets of the parts as in simulation. With `assume_yes` the
+    checks are not to be confirmed, and with a simulated driver neither is a resumption after a stop.
 
     Raises:
         InputError: If the task cannot be done on hardware, or a check fails or is not confirmed.

@@ -97,11 +97,7 @@ def run_sim_driver(
 def run_safety_monitor(url: str, robot: str, task: str, *, log: Callable[[str], None] = print) -> None:
     """Damp a robot to rest when torque commands stop arriving, until this process is terminated.
 
-    Args:
-        url: Address of the robot's driver; LCM's default if empty.
-        robot: Name of the arm.
-        task: Name of the insertion task with the workpiece that the arm carries.
-        log: Function that shows a message.
+    The arm carries the workpiece of the insertion task. The address of the robot's driver is LCM's default if empty.
 
     Raises:
         InputError: If the robot, the task or the address is unusable.

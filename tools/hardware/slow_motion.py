@@ -30,15 +30,9 @@ def is_near(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
-    """Return commands from `pose` to `target`, (6,), along a straight line at `SPEED`, then some to settle.
+    """Return commands (n, 6) from `pose` to `target`, (6,), along a straight line at `SPEED`, then some to settle.
 
-    Args:
-        pose: First pose, (6,).
-        target: Last pose, (6,).
-        period: Time between commands [s].
-
-    Returns:
-        Poses, (n, 6).
+    The time between commands is `period` [s].
     """
     distance, angle = pose_distance(target, pose)
     moving = int(np.ceil(max(distance / SPEED, angle / ANGULAR_SPEED) / period)) or 1
@@ -47,11 +41,9 @@ def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.nda
 
 
 def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
-    """Return commands backwards along a path, at its own speed but without the segments that are nearly at rest.
+    """Return commands backwards along poses (n, 6), at their own speed but without the segments nearly at rest.
 
-    Args:
-        path: Poses (n, 6), one per period.
-        period: Time between commands [s].
+    The time between poses is `period` [s].
     """
     poses: list[np.ndarray] = []
     for pose in path[::-1]:

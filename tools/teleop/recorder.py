@@ -23,9 +23,9 @@ from guiderail.diagrams.envs.cameras import add_meshcat
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.envs.scene import Viewpoint
-from guiderail.diagrams.stations.station import POSE_SIZE
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.primitives import Demonstrations
@@ -50,10 +50,7 @@ class ForceGauge:
     def __init__(self, meshcat: Any, view: Viewpoint, limit: float):
         """Add the gauge to a page.
 
-        Args:
-            meshcat: The page.
-            view: Viewpoint of its camera, which determines size and position.
-            limit: Force of a full bar, and of an arrow of full length [N].
+        The viewpoint of the camera determines size and position. At the force `limit` [N] bar and arrow are full.
         """
         self._meshcat, self._limit = meshcat, limit
         eye, target = (np.array(point) for point in view)
@@ -234,10 +231,7 @@ class DemonstrationRecorder:
     def run(self, log: Callable[[str], None], real_time: bool = True, max_steps: int = 10**9) -> None:
         """Follow the page until its end button; write each demonstration when it is kept.
 
-        Args:
-            log: Function that shows a message.
-            real_time: Run in real time, or in slow motion; otherwise as fast as possible.
-            max_steps: Largest number of control steps.
+        With `real_time` it runs in real time, or in slow motion; otherwise as fast as possible.
         """
         self.reset()
         for _ in range(max_steps):
@@ -408,15 +402,7 @@ def record_demonstrations(
 ) -> dict[str, Any]:
     """Open the page, wait for a browser, and record demonstrations until the operator ends it.
 
-    Args:
-        task: Name of the task, or a task folder.
-        environment: Environment options.
-        out: File of the demonstrations; see `DemonstrationRecorder`.
-        log: Function that shows a message.
-        wait: Wait for a browser to connect.
-
-    Returns:
-        The file, and statistics of the demonstrations.
+    Returns the file, and statistics of the demonstrations.
 
     Raises:
         InputError: As `DemonstrationRecorder`, or if no demonstration was kept.

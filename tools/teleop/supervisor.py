@@ -32,12 +32,7 @@ class MeshcatSupervisor(Supervisor):
     """
 
     def __init__(self, log: Callable[[str], None], meshcat: Any = None):
-        """Open the page.
-
-        Args:
-            log: Function that shows a message.
-            meshcat: The page; a new one on this machine by default.
-        """
+        """Open the page, a new one on this machine by default."""
         meshcat = open_meshcat()[0] if meshcat is None else meshcat
         self.panel = MeshcatPanel(meshcat, {}, {**LABEL_KEYS, RELEASE: RELEASE_KEY})
         self._log = log

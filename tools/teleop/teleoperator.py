@@ -52,13 +52,7 @@ class MeshcatPanel(Teleoperator):
     """
 
     def __init__(self, meshcat: Any, sliders: Mapping[str, Slider], buttons: Mapping[str, str]):
-        """Add the controls to a page.
-
-        Args:
-            meshcat: The page.
-            sliders: Sliders by name.
-            buttons: Keys of the buttons by name.
-        """
+        """Add sliders, and buttons with their keys, to a page."""
         self.meshcat = meshcat
         self._sliders: dict[str, Slider] = {}
         self._clicks: dict[str, int] = {}

@@ -51,11 +51,8 @@ class BncUncertainty(HiddenOffsets):
     ):
         """Construct the sampler.
 
-        Args:
-            kind: "per_run", "per_episode" or "none".
-            grasp_angle: Largest tilt of the plug in the tool [degrees].
-            offset_range: Least and greatest offset of the jack [m]; default: that of the kind.
-            jack_turn: Largest turn of the jack about its axis [degrees].
+        `grasp_angle` and `jack_turn` are the largest tilt of the plug and turn of the jack [degrees]. `offset_range`
+        is the least and greatest offset of the jack [m]; by default that of the kind.
         """
         super().__init__()
         self.kind = kind

@@ -97,15 +97,11 @@ REWARDS = ("sparse", "shaped", "aligned")
 
 
 def reward_terms(reward: str, num_actions: int) -> list[RewardTerm]:
-    """Return the terms of a reward.
+    """Return the terms of a reward, one of `REWARDS`.
 
     "sparse" is the thesis's reward, "shaped" adds the depth gained, and "aligned" also adds the distance gained towards
     the jack's axis. The latter is privileged: it uses simulation state that the policy does not observe. Both additions
     are differences of potentials.
-
-    Args:
-        reward: One of `REWARDS`.
-        num_actions: A.
     """
     terms = [
         RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),

@@ -55,11 +55,7 @@ LOCKED_STEPS = 3  # consecutive control steps that count as locked
 
 @cache
 def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
-    """Return the Gaussian mixture regression of demonstrations, fitted once a process.
-
-    Args:
-        demonstrations: Name of shipped demonstrations, or path of a file.
-    """
+    """Return the Gaussian mixture regression of shipped demonstrations or of a file's, fitted once a process."""
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
     loaded = DEMONSTRATIONS[demonstrations].load()

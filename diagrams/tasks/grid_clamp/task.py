@@ -156,11 +156,7 @@ class GridClampUncertainty(HiddenOffsets):
     """
 
     def __init__(self, kind: str):
-        """Construct the sampler.
-
-        Args:
-            kind: "per_run", "per_episode" or "none".
-        """
+        """Construct the sampler of "per_run", "per_episode" or "none"."""
         super().__init__()
         self.kind = kind
 
@@ -215,14 +211,11 @@ STIFFNESS = Impedance().stiffness[0]
 
 
 def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
-    """Return the inputs of a search without memory, (3,) in [−1, 1].
+    """Return the inputs of a search without memory, (3,) in [−1, 1], for a scaled position and force, (6,).
 
     Above the table the clamp moves to the start of the first lane. On the table it presses lightly and follows the
-    lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in.
-
-    Args:
-        observation: Scaled position and force, (6,).
-        snap_force: Largest force while it snaps in [N].
+    lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in, with at
+    most `snap_force` [N].
     """
     position, force = observation[:3] * SCALE[:3] + CENTRE[:3], observation[3:] * SCALE[3:]
     command = position - force / STIFFNESS  # the impedance's spring separates it from the measured position

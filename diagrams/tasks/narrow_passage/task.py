@@ -119,10 +119,8 @@ PROGRESS = 100.0  # shaped reward for progress [1/m]
 def reward_terms(reward: str, geometry: PassageGeometry, has_sampled_obstacles: bool = False) -> list[RewardTerm]:
     """Return the terms of a reward.
 
-    Args:
-        reward: "sparse" is the thesis's (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
-        geometry: Geometry of the passage.
-        has_sampled_obstacles: The signal `obstacles` holds the obstacles' positions, each of which costs.
+    "sparse" is the thesis's (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
+    With `has_sampled_obstacles` the signal `obstacles` holds the obstacles' positions, each of which costs.
     """
     two_poses = {"pose": 2, "last_pose": 2}
 
@@ -154,10 +152,8 @@ BLOCKED_PROGRESS = 1e-4  # [m] along y
 def termination_terms(geometry: PassageGeometry, is_touching_collision: bool = False) -> list[TerminationTerm]:
     """Return the termination terms: success at the goal, and blocked at a wall without progress.
 
-    Args:
-        geometry: Geometry of the passage.
-        is_touching_collision: Also end the episode, with priority, when the robot's centre is in an obstacle of the
-            signal `obstacles`.
+    With `is_touching_collision` an episode also ends, with priority, when the robot's centre is in an obstacle of the
+    signal `obstacles`.
     """
 
     def blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:

@@ -21,16 +21,10 @@ AIMING = 2000.0  # [1/m] 50 mm are worth half of the whole tilt
 
 
 def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = False) -> list[RewardTerm]:
-    """Return the terms of a reward.
+    """Return the terms of a reward, one of `REWARDS`.
 
     The reward of an action is the sum over its control steps. Values that the thesis defines per action are therefore
-    divided by `action_repeat`.
-
-    Args:
-        reward: One of `REWARDS`.
-        inputs: A, number of inputs.
-        action_repeat: Control steps per action.
-        aimed: Pour can be aimed; "shaped" then includes the distance gained towards the aim in Pour.
+    divided by `action_repeat`. If Pour can be aimed, "shaped" includes the distance gained towards the aim in Pour.
 
     Raises:
         InputError: If there is no such reward.

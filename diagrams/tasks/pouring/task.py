@@ -60,9 +60,7 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
 def termination_terms(config: PouringConfig, needed: int) -> list[TerminationTerm]:
     """Return the termination terms; a collision has priority, so that an episode that touched the mug is no success.
 
-    Args:
-        config: Configuration of the scene.
-        needed: Number of balls that have to be in the mug; an episode in which too many have fallen is spilled.
+    An episode is spilled if fewer balls than are `needed` in the mug can still get there.
     """
     mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2
     fall = config.mug.height + config.stand_height

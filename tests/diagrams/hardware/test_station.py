@@ -24,7 +24,7 @@ from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault
+from guiderail.models.control.joint_status import Fault, StatusLimits
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 
@@ -215,6 +215,16 @@ def test_station_sends_nothing_during_the_hold_off():
     assert both.commands == []
     both.go(START, 0.05)
     assert both.commands
+
+
+def test_station_settles_for_the_hold_off_of_its_driver():
+    class LateDriver(IiwaDriver):
+        hold_off = 0.6
+
+    driver = LateDriver(DrakeLcm("memq://"))
+    assert HardwareStation(WORKCELL, driver).status_limits.settling_time == 0.6
+    with pytest.raises(InputError, match=r"accepts no commands for 0.6 s.*not 0.25 s"):
+        HardwareStation(WORKCELL, driver, status_limits=StatusLimits((1.0,) * 7))
 
 
 def test_stop_damps_the_arm():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector import scripted
+from guiderail.diagrams.tasks.bnc_connector import task as connector
 from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTRE, POSE_SCALE
 from guiderail.diagrams.tasks.bnc_connector.task import (
     REACH,
@@ -18,11 +18,11 @@ from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 
 def seen_plug(**values):
     names = {
-        "time": scripted.TIME,
-        "z": scripted.Z,
-        "force_z": scripted.FORCE_Z,
-        "torque_x": scripted.TORQUE_X,
-        "torque_y": scripted.TORQUE_Y,
+        "time": connector.TIME,
+        "z": connector.Z,
+        "force_z": connector.FORCE_Z,
+        "torque_x": connector.TORQUE_X,
+        "torque_y": connector.TORQUE_Y,
     }
     result = np.zeros(13)
     searching = {"time": -0.4, "z": 0.68, "force_z": 0.5}
