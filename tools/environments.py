@@ -73,10 +73,8 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
 def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
     """Return a digest of the files that a task consists of; empty if there are only installed ones.
 
-    Args:
-        task: Name of the task.
-        environment: Options of its environment; a file that one names, such as demonstrations, is included.
-        imports: Imports that register the task, as `import_modules` returns them; files are included.
+    Files are the task folder, those that an option of the environment names, such as demonstrations, and those of the
+    imports, as `import_modules` returns them.
 
     Raises:
         InputError: If its task folder does not exist any more, or a file cannot be read.

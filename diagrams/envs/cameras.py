@@ -29,7 +29,7 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from guiderail.models.common.errors import InputError
 
-_OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_for_people"
+_OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
 PUBLISH_PERIOD = 1 / 50  # period of a browser view [s]
 
 

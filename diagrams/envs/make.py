@@ -87,8 +87,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     config = _config(task, options)
     if not config.station_kind.is_simulated:
         raise InputError(
-            f"station={config.station!r} is a real robot, which no reset can put anywhere: train and evaluate "
-            "in a simulation, and run what was learned by guiderail run"
+            f"station={config.station!r} is a real robot, which a reset cannot move: train and evaluate in a "
+            "simulation, and execute the policy by guiderail deploy"
         )
     threadpool_limits(1)
     exported = render_mode if render_mode == "rgb_array" else None

@@ -24,11 +24,9 @@ class ResidualDescent(Guidance):
     """
 
     def __init__(self, prior: PriorKnowledge):
-        """Construct the guidance.
+        """Construct the guidance from an approach and the active constraints of a template.
 
-        Args:
-            prior: Prior knowledge with an approach and with a template, for its active constraints. The template's only
-                object is the frame in which poses are given.
+        The template's only object is the frame in which poses are given.
         """
         super().__init__()
         assert prior.template is not None
@@ -67,9 +65,7 @@ class ResidualGuidance(PrimitiveGuidance):
     def __init__(self, prior: PriorKnowledge, *, safe: bool = False):
         """Construct the guidance.
 
-        Args:
-            prior: Prior knowledge with demonstrations, and with walls to keep out of if `safe`.
-            safe: Put a safety filter behind the sum; ``fallback`` is then 1 if it stopped at a wall.
+        If `safe`, a filter behind the sum stops at walls to keep out of; ``fallback`` is then 1 if it did.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()

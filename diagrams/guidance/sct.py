@@ -48,11 +48,8 @@ class ActiveConstraintFilter(Diagram):
     ):
         """Construct the diagram.
 
-        Args:
-            template: Shared control template.
-            frames: Poses X_WF of its objects by name; W is the frame of all poses.
-            period: Control period [s].
-            max_tracking_error: Distance between the robot and its command beyond which the command waits [m].
+        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. If the robot is
+        farther than `max_tracking_error` [m] from its command, the command waits.
         """
         super().__init__()
         builder = DiagramBuilder()

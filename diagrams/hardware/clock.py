@@ -108,11 +108,8 @@ class WallClock:
     def __init__(self, driver: Driver, period: float | None = None, rate: float = 1.0):
         """Construct the clock.
 
-        Args:
-            driver: Connection to the robot.
-            period: Period of a step [s]; the driver's by default.
-            rate: Rate of the robot's clock relative to the wall clock, positive, at most 1; lower for a simulated robot
-                that is slower than real time.
+        The period of a step [s] is the driver's by default. The rate of the robot's clock relative to the wall clock
+        is at most 1; it is lower for a simulated robot that is slower than real time.
 
         Raises:
             InputError: If the rate is out of range, or the driver cannot receive in this environment.

@@ -39,7 +39,7 @@ class SafetyMonitor:
             driver: The monitor's own connection to the robot.
             plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
             limits: Limits of the torques, and times of a stop.
-            max_silence: Largest accepted time between commands [s]; some consecutive commands may be lost by default.
+            max_silence: Largest accepted time between commands [s]; default: some consecutive commands may be lost.
         """
         driver.check_usable()
         self.state = MonitorState.IDLE

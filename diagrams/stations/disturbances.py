@@ -151,15 +151,14 @@ class DisturbedStation(Station):
             self._inner.set_contact(context, friction, modulus)
         if d.payload:
             self._inner.set_payload(context, d.payload)
-        own = {name: system.GetMyMutableContextFromRoot(context) for name, system in self._systems().items()}
-        self._wrench.set_error(own["wrench"], np.full(6, scale), bias, seed)
-        self._pose.set_error(own["pose"], np.ones(POSE_SIZE), pose_offset, 0)
+        wrench, pose, commands = (
+            system.GetMyMutableContextFromRoot(context) for system in (self._wrench, self._pose, self._commands)
+        )
+        self._wrench.set_error(wrench, np.full(6, scale), bias, seed)
+        self._pose.set_error(pose, np.ones(POSE_SIZE), pose_offset, 0)
         # A seed of its own: with the same seed both systems would use the same random numbers.
-        self._commands.set_seed(own["commands"], int(np.random.SeedSequence(seed).generate_state(1)[0]))
+        self._commands.set_seed(commands, int(np.random.SeedSequence(seed).generate_state(1)[0]))
         return {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
-
-    def _systems(self) -> dict[str, Any]:
-        return {"wrench": self._wrench, "pose": self._pose, "commands": self._commands}
 
 
 def disturbed(build: Callable[..., Station], disturbances: Disturbances, is_simulated: bool, name: str) -> Station:

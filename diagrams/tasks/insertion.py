@@ -73,7 +73,7 @@ class InsertionTask(Task):
             observable = self.observable_success()
             if observable is None:
                 return {}
-            estimate = builder.AddNamedSystem(f"{self.workpiece}_as_seen", affine(*observable))
+            estimate = builder.AddNamedSystem(f"{self.workpiece}_estimate", affine(*observable))
             builder.Connect(station.get_pose_output_port(), estimate.get_input_port())
             return {self.workpiece: estimate.get_output_port()}
         plant = station.plant

@@ -53,7 +53,7 @@ def reference_of_file(path: Path, components: int | None, floor: tuple[float, ..
         InputError: If there is no such file, or it holds no demonstrations of a pose.
     """
     if not path.is_file():
-        raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teach makes")
+        raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
     return _fitted(path, path.stat().st_mtime_ns, components, floor)
 
 

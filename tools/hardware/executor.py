@@ -273,13 +273,8 @@ def deploy(
 ) -> int:
     """Execute the policy of a run on a robot.
 
-    Args:
-        run: Run folder.
-        connection: Connection to the robot driver.
-        station: Name of a hardware station.
-        assume_yes: Do not ask to confirm the pre-flight checks.
-        out: Folder of the recording; `hardware` in the run folder by default.
-        log: Function that shows a message.
+    The recording is written to `out`, by default `hardware` in the run folder. With `assume_yes` the pre-flight checks
+    are not to be confirmed.
 
     Returns:
         The exit code: 0 if the skill was executed to its end, 1 if it was stopped.

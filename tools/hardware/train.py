@@ -42,7 +42,7 @@ def train_on_robot(
     assume_yes: bool = False,
     log: Log = print,
 ) -> dict[str, Any]:
-    """Train a policy on a robot, and leave a run folder.
+    """Train a policy on a robot, leave a run folder, and return statistics of the training.
 
     Args:
         task: Name of an insertion task with a success that a robot can observe.
@@ -53,9 +53,6 @@ def train_on_robot(
         settings: Settings of the learner.
         assume_yes: Do not ask to confirm the checks; with a simulated driver, nor to resume after a stop.
         log: Function that shows a message.
-
-    Returns:
-        Statistics of the training.
 
     Raises:
         InputError: If the task cannot be trained on hardware, or a check fails or is not confirmed.

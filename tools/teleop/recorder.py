@@ -183,13 +183,9 @@ class DemonstrationRecorder:
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any], out: Path, meshcat: Any = None):
-        """Build the simulation and open the page.
+        """Build the simulation and open the page, a new one on this machine by default.
 
-        Args:
-            task: Name of the task, or a task folder.
-            environment: Environment options.
-            out: File of the demonstrations, .npz or .csv, which must not exist.
-            meshcat: The page; a new one on this machine by default.
+        The task is a name or a task folder. The file `out` of the demonstrations, .npz or .csv, must not exist.
 
         Raises:
             InputError: If the task's station has no pose of six numbers, or the file exists or cannot be written.

@@ -31,17 +31,10 @@ def teleoperate(
     record: Path | None = None,
     log: Callable[[str], None] = print,
 ) -> dict[str, Any] | None:
-    """Let the operator act in place of the policy until Ctrl-C, or record demonstrations.
+    """Let the operator act in place of the policy until Ctrl-C, or record demonstrations and return their statistics.
 
-    Args:
-        task: Name of the task, or a task folder.
-        environment: Environment options.
-        record: File of the demonstrations, .npz or .csv, which must not exist. If it is given, the operator moves the
-            desired pose; otherwise the operator gives the action of the task's guidance.
-        log: Function that shows a message.
-
-    Returns:
-        Statistics of the recorded demonstrations.
+    The operator gives the action of the task's guidance. With `record`, a file .npz or .csv which must not exist, the
+    operator moves the desired pose instead.
 
     Raises:
         InputError: If the task cannot be teleoperated, or the demonstrations cannot be written.

@@ -115,11 +115,8 @@ class LockstepClock:
     def __init__(self, driver: LcmDriver, command_timeout: float, period: float | None = None):
         """Construct the clock.
 
-        Args:
-            driver: Connection to the simulated driver.
-            command_timeout: Longest wall clock time to wait for a status [s]; then steps are made without one, and the
-                station's watchdog notices.
-            period: Period of a step [s]; the driver's by default.
+        A status is awaited for at most `command_timeout` [s of wall clock time]; then steps are made without one, and
+        the station's watchdog notices. The period of a step [s] is the driver's by default.
 
         Raises:
             InputError: If the driver cannot receive in this environment.

@@ -59,10 +59,6 @@ def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.n
     Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components about the axis
     stay.
 
-    Args:
-        observation: One of `OBSERVATIONS`.
-        action_dims: Indices of the outputs that actions move.
-
     Returns:
         Matrices of observations (7, n, n) and of actions (7, A, A); None if actions move x and not y, or one tilt.
     """

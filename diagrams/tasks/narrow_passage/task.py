@@ -91,14 +91,9 @@ class NarrowPassageOptions(Options):
 
 
 def avoids_obstacle_from(rows: Any, cost: float = 1.0, streak: int = 5) -> int | None:
-    """Return the first episode, from 1, that begins a streak with obstacle costs below `cost`, or None.
+    """Return the first episode, from 1, of a table that begins a streak with obstacle costs below `cost`, or None.
 
     A path through the obstacle's middle costs about a hundred; a policy that explores touches its margin now and then.
-
-    Args:
-        rows: Table of episodes.
-        cost: Largest cost of an episode.
-        streak: Length of the streak.
     """
     index = find_streak(rows["reward_obstacle_cost"] > -cost, streak)
     return None if index is None else index + 1

@@ -46,7 +46,7 @@ def test_both_contracts_hold_in_every_tasks_diagram(task):
         if STATIONS.get(name).is_simulated:
             diagram = make_env(task, station=name).task.diagram
         else:
-            with pytest.raises(InputError, match="guiderail run"):
+            with pytest.raises(InputError, match="guiderail deploy"):
                 make_env(task, station=name)
             diagram = make_skill(task, lambda observation: observation, station=name, lcm_url="memq://").diagram
         station, guidance = (diagram.GetSubsystemByName(part) for part in ("station", "guidance"))
