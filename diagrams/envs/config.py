@@ -77,23 +77,6 @@ class EnvConfig:
             _RESOLVED[key] = _RESOLVED[_cache_key(task_class, config.options)] = entry
         return config
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> EnvConfig:
-        """Return the configuration of plain values, as `to_dict` returns and a YAML file holds them.
-
-        Raises:
-            InputError: As `resolve`, or if the task's name is missing.
-        """
-        options = dict(values)
-        if "task" not in options:
-            raise InputError("the configuration of an environment names no task: add one, such as task: NarrowPassage")
-        return cls.resolve(options.pop("task"), options)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the task's name and all options as plain values: lists instead of tuples."""
-        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in self.options.items()}
-        return {"task": self.task, **plain}
-
     @property
     def options(self) -> dict[str, Any]:
         """All options by name, as `gymnasium.make` takes them."""

@@ -245,7 +245,7 @@ class TestUncertainty:
         {"guidance": "sct"},
         {"reward": "dense"},
         {"observation": "image"},
-        {"fixture_offset": "none"},
+        {"fixture_offset": "known"},
         {"station": "hardware"},
         {"action_dims": (0, 6)},
     ],

@@ -75,7 +75,7 @@ def test_recomputed_commands_are_inside_the_constraints(env):
     stepwise = make_env("Pouring", difficulty="hard", action_repeat=1)
     diagram, context = stepwise.task.diagram, stepwise.simulator.get_context()
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)
-    corners.begin()
+    corners.on_episode_start()
     task = stepwise.task.declaration
     template = make_aimed_template(task.workcell(), 1.0, 1.0, 0.3)
     _, drawn = stepwise.reset(seed=3)
