@@ -184,7 +184,11 @@ def build_task_diagram(
 ) -> TaskDiagram:
     """Wire a task: its loop, reward and episode monitor. The policy's `action` is an input.
 
-    With `render_mode="rgb_array"` the image of the task's camera is exported; a browser view is not in the diagram.
+    Args:
+        task: Task.
+        station: Station.
+        guidance: Diagram with the ports of `Guidance`.
+        render_mode: "rgb_array" exports the image of the task's camera; a browser view is not part of the diagram.
 
     Raises:
         InputError: If a signal that the task names does not exist, a port has the wrong size, or the name of a reward
@@ -286,9 +290,13 @@ def build_skill_diagram(
 ) -> SkillDiagram:
     """Wire a learned skill, without reward and episode monitor.
 
-    The policy is a function from an observation to an action, which a `PolicySystem` calls every `action_repeat`
-    control periods, or a system with an input `observation` and an output `action`. `render_mode="human"` adds a
-    browser view.
+    Args:
+        task: Task that the skill was learned on.
+        station: Station.
+        guidance: Diagram with the ports of `Guidance`.
+        policy: Function from an observation to an action, which a `PolicySystem` calls every `action_repeat` control
+            periods; or system with an input `observation` and an output `action`.
+        render_mode: None, or "human" for a browser view.
 
     Raises:
         InputError: As `build_task_diagram`, or if the sizes of the policy's ports do not match.

@@ -79,7 +79,14 @@ def register_guidance(
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
     """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
 
-    The arguments are those of `GuidanceKind`; the label is the name by default.
+    Args:
+        name: Value of the option `guidance`.
+        needs: See `GuidanceKind`.
+        label: Label in figures; default: its name.
+        colour: Colour in figures, "#rrggbb".
+        demonstrates: See `GuidanceKind`.
+        displaces: See `GuidanceKind`.
+        options: Model of further options of the environment.
     """
 
     def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
@@ -112,7 +119,12 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
 
 
 def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") -> Diagram:
-    """Build the guidance of a name from prior knowledge; a message names the task.
+    """Build the guidance of a name from prior knowledge.
+
+    Args:
+        name: Name of the kind.
+        known: Prior knowledge.
+        task: Name of the task, for the message.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing.

@@ -47,7 +47,11 @@ def register_station(
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
     """Return a decorator that registers a class or function, which builds a station from a world and options.
 
-    The arguments are those of `StationKind`; the description is the first line of the docstring.
+    Args:
+        name: Name for `station=`.
+        world: Kind of world that it works on.
+        options: Model of its environment options.
+        is_simulated: True for a simulation.
     """
 
     def add(build: Any) -> Any:

@@ -29,7 +29,8 @@ TASKS: Registry[type[Task]] = Registry(
 def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
     """Return a decorator that registers a task, and its environment with Gymnasium.
 
-    The name may have a namespace of its own, as in "lab/Peg".
+    Args:
+        name: Name of the task; it may have a namespace of its own, as in "lab/Peg".
 
     Raises:
         InputError: When it decorates, if another task has that name, a required method is missing, or a declaration has
