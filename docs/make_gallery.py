@@ -311,9 +311,19 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "parts": (
         lambda: [
-            Panel("bayonet", partial(_created_task, "bayonet"), _with_offset(0.0), zero_policy),
-            Panel("the same, 1.5 mm off", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy),
-            Panel("snap-fit", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
+            Panel(
+                "a bayonet: demonstration",
+                partial(_created_task, "a bayonet: demonstration"),
+                _with_offset(0.0),
+                zero_policy,
+            ),
+            Panel(
+                "the same, socket 1.5 mm beside",
+                partial(_created_task, "a bayonet: demonstration"),
+                _with_offset(0.0015),
+                zero_policy,
+            ),
+            Panel("a snap-fit: demonstration", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
         ],
         SQUARE,
         8,
@@ -321,7 +331,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "clamp": (
         lambda: [
             Panel("straight down", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "straight_descent")),
-            Panel("scripted search", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
+            Panel("a rule that searches", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
         ],
         SQUARE,
         3,
@@ -329,7 +339,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "pouring": (
         lambda: [
             Panel("random inputs", "Pouring", {"time_limit": 6.0}, _random(1)),
-            Panel("scripted inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
+            Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
         ],
         SQUARE,
         6,
