@@ -1,4 +1,4 @@
-"""Command line with delay and random loss."""
+"""Communication channel that delays commands and loses some at random."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
@@ -23,13 +23,13 @@ class CommandDisturbance(LeafSystem):
         output_ports:
         - delivered_command
 
-    All are (n,). ``pose`` is the measured pose, read at initialization only.
+    All ports have size n. ``pose`` is the measured pose, read at initialization only.
 
     Args:
         size: Size n of a command, at least 1.
         period: Period of the commands [s], positive.
-        loss_probability: p, from 0 to less than 1.
-        delay: k periods, at least 0.
+        loss_probability: Probability p that a command is lost, from 0 to less than 1.
+        delay: Delay k of a command, in periods, at least 0.
 
     Raises:
         InputError: If an argument is out of range.

@@ -8,13 +8,13 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 
 
 class HistoryBuffer(LeafSystem):
-    """Store the last P outputs, through which the movement primitive of sKGRL passes.
+    """Buffer of the last P outputs, the via-points of sKGRL's movement primitive.
 
         history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
-    At every control step the newest output replaces the oldest. An initialization fills the history with
-    ``initial_output`` if it is connected (the measured pose, for a commanded history), otherwise with ``output``, as if
-    the robot had always been at its start.
+    At every control step the newest output replaces the oldest. Initialization fills all P entries with
+    ``initial_output`` if it is connected, otherwise with ``output``. Where ``output`` is a command,
+    ``initial_output`` is the measured pose.
 
     .. pydrake_system::
 
@@ -26,11 +26,12 @@ class HistoryBuffer(LeafSystem):
         - history
 
     ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
-    ``output``. ``history`` is state without direct feedthrough, so that the primitive can close a loop around it.
+    ``output``. ``history`` is discrete state without direct feedthrough, so a feedback loop with the primitive is not
+    algebraic.
 
     Args:
-        num_outputs: O, at least 1.
-        length: P, at least 1.
+        num_outputs: Number O of outputs, at least 1.
+        length: Number P of stored outputs, at least 1.
         period: Control period [s], positive.
 
     Raises:
@@ -60,7 +61,7 @@ class HistoryBuffer(LeafSystem):
         discrete_state.set_value(np.tile(initial.Eval(context), self._shape[0]))
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # Nothing has been executed at time zero. An event offset of one period would not do: period + k * period
+        # No output has been executed at time zero. An event offset of one period cannot be used: period + k * period
         # differs from (k + 1) * period in the last bit for every third k.
         if context.get_time() > 0:
             remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]

@@ -12,13 +12,13 @@ from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class SctStateMachine(LeafSystem):
-    """Run the finite state machine of a shared control template.
+    """Finite state machine of a shared control template.
 
         q → q' if d_q < threshold of the transition to q',  q' → q if d_q > threshold + hysteresis
 
-    (`SharedControlTemplate.next_state`), evaluated at every control instant for the pose just before it, with at most
-    one transition. A transition waits until one period leads from that pose into the next state's active constraints,
-    so that every command can satisfy them. An episode begins in the state of the initial pose.
+    The conditions are evaluated at every control step with the pose just before it; at most one transition is taken
+    (see `SharedControlTemplate.next_state`). A transition is postponed until a command can satisfy the active
+    constraints of the next state within one period. An episode begins in the state of the initial pose.
 
     .. pydrake_system::
 
@@ -31,10 +31,11 @@ class SctStateMachine(LeafSystem):
         - transition_distance
         - progress
 
-    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians. ``initial_pose`` is measured and
-    only read at initialization, when a commanded ``pose`` may not be initialized yet. ``state`` is (1,), the number of
-    the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_t of the current state in metres or
-    radians. ``progress`` is (1,), on one scale for all states: its increase is d_{t−1} − d_t of equation 3.2.
+    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians. ``initial_pose`` is the
+    measured pose. It is read only at initialization, because a commanded ``pose`` may not be initialized by then.
+    ``state`` is (1,), the number of the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_t of
+    the current state in metres or radians. ``progress`` is (1,), the progress in the whole task: it accumulates over
+    the states, and its increase in a step is d_{t−1} − d_t of equation 3.2.
 
     Args:
         template: The template.
@@ -88,7 +89,7 @@ class SctStateMachine(LeafSystem):
         discrete_state.set_value([float(self._template.state_at(X_WE, self.frames.eval(context)))])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No step has ended at time zero. An event offset of one period would not fall on k * period exactly.
+        # No step has ended at time zero. With an event offset of one period, rounding would miss k * period.
         if context.get_time() > 0:
             state = self._template.next_state(*self._state_pose_frames(context), self._period)
             discrete_state.set_value([float(state)])

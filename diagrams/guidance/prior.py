@@ -23,7 +23,7 @@ class PlacedTemplate:
         template: Shared control template.
         frames: Poses X_TF of the template's objects by name, in the frame of the station's poses.
         active_constraints: True if the active constraints are enforced; None: the guidance's default.
-        max_tracking_error: Distance between the robot and its command beyond which the command waits [m].
+        max_tracking_error: Distance between robot and command [m] beyond which the command waits for the robot.
     """
 
     template: SharedControlTemplate
@@ -38,12 +38,12 @@ class PlacedTemplate:
 
 @dataclass(frozen=True)
 class ScriptedApproach:
-    """Straight motion along z, without demonstrations, and the range of a policy around it.
+    """Straight motion along z, for guidance without demonstrations, and the range of a policy's action around it.
 
     Attributes:
         heights: First and last height [m].
         speed: Speed [m/s].
-        reach: Displacement of the command along each axis by a full action [m].
+        reach: Displacement of the command along each axis at an action of 1 [m].
     """
 
     heights: tuple[float, float]
@@ -53,16 +53,16 @@ class ScriptedApproach:
 
 @dataclass(frozen=True)
 class PriorKnowledge:
-    """Prior knowledge about a task; None for what the task does not provide.
+    """Prior knowledge about a task; an attribute is None if the task does not provide it.
 
     Attributes:
         period: Control period [s].
-        demonstrations: Demonstrations, constraints, walls to keep out of, and the range of a policy around them.
+        demonstrations: Demonstrations with constraints, keep-out walls, and the range of a policy's action.
         template: Shared control template and the poses of its objects.
         approach: Scripted approach.
-        options: Options of the kind of guidance by name, if it declares any.
-        pose_size: O of the station.
-        wrench_size: W of the station.
+        options: Options of the guidance by name; empty if it declares none.
+        pose_size: Size O of the station's pose.
+        wrench_size: Size W of the station's wrench.
     """
 
     period: float

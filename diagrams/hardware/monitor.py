@@ -25,8 +25,9 @@ class SafetyMonitor:
     """Watch the statuses and commands of a robot, and damp the arm to rest when commands stop.
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
-    lost. The monitor therefore runs on the driver's machine, in a process of its own. Its only clock is the robot's. It
-    sends a heartbeat with every status, so that a commanding program stops if the monitor stops the arm or is gone.
+    lost. The monitor therefore runs on the driver's machine, in a process of its own. All its times are
+    timestamps of the robot's statuses. It sends a heartbeat with every status, so that a commanding program stops if
+    the monitor stops the arm or has exited.
 
     Attributes:
         state: Current state.
@@ -38,15 +39,15 @@ class SafetyMonitor:
         Args:
             driver: The monitor's own connection to the robot.
             plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
-            limits: Limits of the torques, and times of a stop.
-            max_silence: Largest accepted time between commands [s]; default: some consecutive commands may be lost.
+            limits: Torque limits, and durations of the phases of a stop.
+            max_silence: Largest accepted time between commands [s]; default: `MAX_MISSED_MESSAGES` driver periods.
         """
         driver.check_usable()
         self.state = MonitorState.IDLE
         self._driver, self._plant, self._limits = driver, plant, limits
         self._max_silence = MAX_MISSED_MESSAGES * driver.period if max_silence is None else max_silence
         self._context = plant.CreateDefaultContext()
-        # Times by the robot's clock [s]: of the last status, of the last command, and of the state's begin.
+        # Times by the robot's clock [s]: last status, last command, last change of state.
         self._now = self._commanded_at = self._entered_at = -np.inf
         self._has_torque = False  # the last command was not zero
         self._num_heartbeats = 0
@@ -68,7 +69,7 @@ class SafetyMonitor:
             # The robot's clock was set back, or this is its first status.
             self._commanded_at = status.time
             if self._now - status.time > self._max_silence and self._has_torque:
-                # A torque meant for the robot before its restart may still be on its way.
+                # A torque command sent before the restart of the robot may still arrive.
                 self.state, self._entered_at = MonitorState.DAMPING, status.time
         self._now = status.time
         self._update_state()

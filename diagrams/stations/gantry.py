@@ -1,4 +1,4 @@
-"""Gantry station: the tool center on six joints with an impedance, faster than real time because there is no arm."""
+"""Gantry station: tool center on six impedance-controlled joints; faster than real time because it has no arm."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ GANTRY_JOINTS = (
     ("Ry", RevoluteJoint, [0.0, 1.0, 0.0]),
     ("Rx", RevoluteJoint, [1.0, 0.0, 0.0]),
 )
-# Mass [kg] and moment of inertia [kg m²] of all that moves: those at the tool of an arm with inertia shaping.
+# Mass [kg] and moment of inertia [kg m²] of the moving tool, as an arm with inertia shaping has at its tool.
 CARRIAGE_MASS, CARRIAGE_INERTIA = 1.5, 2e-3
-# Of a link between two joints [kg], [m]; without inertia the plant's mass matrix would be singular.
+# Mass [kg] and radius [m] of a link between two joints; massless links would make the plant's mass matrix singular.
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
 ImpedanceControl = Literal["joint", "cartesian"]
-# Time step of the plant with a Cartesian controller [s]. The controller's forces are constant within a step, those of
-# the joints' springs are not. At this step it is as accurate as the springs at `PLANT_PERIOD`: see
+# Time step of the plant with a Cartesian controller [s]. The controller's forces are constant within a step; forces of
+# the joint springs are not. With this step, Cartesian control is as accurate as joint springs with `PLANT_PERIOD`: see
 # `python -m research.benchmarks impedance`.
 CARTESIAN_PLANT_PERIOD = PLANT_PERIOD / 2
 
@@ -79,10 +79,11 @@ class GantryOptions(ContactOptions):
 class GantryStation(Station):
     """Gantry with joints x, y, z, Rz, Ry, Rx from the target frame to the tool center.
 
-    Each joint has a spring, a damper and a limit; the joint positions are the pose. Springs and dampers are the plant's
-    actuator gains, solved implicitly with the contact: stable at any stiffness and time step. Or they are those of a
-    `CartesianImpedanceController`. Its forces are computed explicitly at each step of the plant, as on a real robot,
-    which needs shorter steps. There is no gravity, as on a robot with gravity compensation.
+    The joint positions are the pose, and joint efforts are limited. There are two kinds of impedance control. "joint":
+    the springs and dampers are PD gains of the plant's actuators, solved implicitly with the contact, which is stable
+    at any stiffness and time step. "cartesian": a `CartesianImpedanceController` computes the forces explicitly at each
+    time step of the plant, as on a real robot, and therefore needs shorter steps. There is no gravity, as on a robot
+    with gravity compensation.
     """
 
     def __init__(
@@ -98,12 +99,12 @@ class GantryStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of the plant [s]; half a control period by default, a quarter with a controller.
+            time_step: Time step of the plant [s]; default: half a control period, a quarter for "cartesian".
             wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             impedance_control: "joint" or "cartesian", see above.
 
         Raises:
-            InputError: If the time step is too long for a controller with this impedance.
+            InputError: If the time step is too long for a Cartesian controller with this impedance.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -154,8 +155,8 @@ class GantryStation(Station):
 def max_stable_time_step(impedance: Impedance) -> float:
     """Return the time step [s] above which a Cartesian controller with an impedance is unstable.
 
-    With a force K e − D v that is constant within a step h, and x' = v' at its end, a mode with frequency ω and damping
-    ratio ζ is stable if h ω < 2 (√(1 + ζ²) − ζ).
+    For a force K e − D v that is constant within a time step h and semi-implicit Euler integration, a mode with natural
+    frequency ω and damping ratio ζ is stable if h ω < 2 (√(1 + ζ²) − ζ).
     """
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
     fastest = float(np.sqrt(np.max(np.array(impedance.stiffness) / masses)))  # [rad/s]
@@ -207,9 +208,9 @@ def _add_gantry(
 def _add_wrench(
     builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort, time_constant: float
 ) -> OutputPort:
-    """Add the low-pass filtered wrench of the contact, one plant step old, as that of a sensor.
+    """Add the low-pass filtered contact wrench, delayed by one plant step like that of a sensor.
 
-    At every plant step only systems of Drake run; the wrench is computed when it is read.
+    Only C++ systems of Drake run at every plant step; the Python system `PoseWrench` runs when its output is read.
     """
     period = plant.time_step()
     decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0

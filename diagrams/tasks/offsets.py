@@ -17,7 +17,7 @@ from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import MM
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 
-LARGEST_OFFSET = 4.0 * MM  # beyond it a plug does not stand on the rim of its socket
+LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 
 
 class FixtureOffsetOptions(Options):
@@ -42,15 +42,15 @@ class FixtureOffsetOptions(Options):
 
 
 def reference_of_file(path: Path, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
-    """Return the reference trajectory of a file's demonstrations, with their mean duration.
+    """Fit a reference trajectory to a file's demonstrations; its duration is their mean duration.
 
     Args:
         path: File .npz or .csv with poses (N, 6) in the target frame.
-        components: Components of their mixture; None: by information criterion.
-        floor: Standard deviation of a hand, (6,), added to theirs.
+        components: Number of components of the Gaussian mixture; None: chosen by the Bayesian information criterion.
+        floor: Standard deviation (6,) of a hand's repeatability; its square is added to the fitted variances.
 
     Raises:
-        InputError: If there is no such file, or it holds no demonstrations of a pose.
+        InputError: If there is no such file, or its demonstrations are not poses.
     """
     if not path.is_file():
         raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
@@ -59,7 +59,7 @@ def reference_of_file(path: Path, components: int | None, floor: tuple[float, ..
 
 @cache
 def _fitted(path: Path, changed: int, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
-    """Fit the file's demonstrations, once for each time that it `changed` in this process."""
+    """Fit the file's demonstrations; cached by path and modification time `changed` [ns]."""
     demonstrations = Demonstrations.load(path)
     if demonstrations.num_outputs != POSE_SIZE:
         raise InputError(
@@ -77,8 +77,9 @@ def _fitted(path: Path, changed: int, components: int | None, floor: tuple[float
 class HiddenOffsets(ABC):
     """Sampler of the actual offsets of fixture and workpiece at every reset, (2,) [m] in the target frame's xy.
 
-    A run begins with the first reset and with every reset with the option `new_run`. The option `held_out` samples from
-    a stream that training never uses, with the run's hidden offset; the option `offset` (x, y) [m] replaces the sample.
+    A run begins at the first reset, and at every reset with the option `new_run`. The option `held_out` samples the
+    episode from a random stream that training never uses; the run's hidden offset stays the same. The option `offset`
+    (x, y) [m] replaces the sample.
     """
 
     def __init__(self) -> None:
@@ -86,7 +87,7 @@ class HiddenOffsets(ABC):
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the offsets (2,) [m] of fixture and workpiece; `options` are an instance of `InsertionReset`."""
-        # Every reset samples the same numbers, used or not, so that a seed has the same meaning at any reset.
+        # Every reset takes the same samples, used or not, so that the samples of an episode depend only on its seed.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)
         if self._run is None or options.new_run:
@@ -97,7 +98,7 @@ class HiddenOffsets(ABC):
 
     @abstractmethod
     def _draw_run(self, rng: np.random.Generator) -> Any:
-        """Sample what stays hidden for a run."""
+        """Sample the hidden parameters of a run."""
 
     @abstractmethod
     def _draw_episode(self, rng: np.random.Generator, run: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -108,19 +109,19 @@ class HiddenOffsets(ABC):
         """Return the offsets for the option `offset`."""
 
 
-_HELD_OUT_STREAM = 0x8E1D  # stream that no training seed leads to
+_HELD_OUT_STREAM = 0x8E1D  # last seed word of the held-out stream; that of training is 0
 
 
 def episode_stream(rng: np.random.Generator, held_out: bool) -> np.random.Generator:
     """Return the generator of an episode's conditions, of the training or the held-out stream.
 
-    Both take one number from `rng`, so that a seed has the same meaning at any reset.
+    Both streams take one number from `rng`, so that later samples from `rng` do not depend on `held_out`.
     """
     return np.random.default_rng([int(rng.integers(2**62)), _HELD_OUT_STREAM if held_out else 0])
 
 
 def in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray:
-    """Return a point (2,) of uniform density between two circles around the origin."""
+    """Sample a point (2,) uniformly from the annulus around the origin with radii `inner` and `outer`."""
     radius = np.sqrt(rng.uniform(inner**2, outer**2))
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return radius * np.array([np.cos(angle), np.sin(angle)])

@@ -1,22 +1,23 @@
 """Bounds on the commands of a primitive for all sequences of actions in [−1, 1].
 
-Without active constraints the loop history → next command is affine and its reachable set is a zonotope. The generators
-are the impulse responses, and the largest value along a direction is the sum of their absolute values. Three regimes
-are certified:
+Without active constraints the loop history → next command is affine and its reachable set is a zonotope. Its generators
+are the impulse responses. Its half-width along a direction is the sum of the absolute values of the generators along
+that direction. Three regimes are certified:
 
 - *free*: all sequences, until a constraint becomes active. Exact.
-- *always*: all sequences. Up to the first step whose window a constraint can touch, the bounds are those of *free*.
-  After it, a constrained output is bounded by the constraints themselves. Without a history (KGRL), a command depends
-  on one action only, and the actions are divided into cells. The mean v̄ of the corrections v_i at a cell's corners is
-  feasible for every action in it, and the least correction v is no farther from it than ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², where
-  the multipliers at a corner bound ‖v‖ from below (weak duality). So a command is within this radius, times the size of
-  the output, of the commands at the corners. With a history, corrections feed back: an output that no constraint
-  bounds, and that is coupled to a constrained one, has no bound in this regime.
-- *budgeted*, with a history: all sequences whose corrections satisfy a budget. A correction moves the executed point as
-  another action would, plus a residue in the outputs that no action moves. The budget limits the amount by which such
-  actions exceed ±1, and the residue, at one step and in total. Both are small, because a correction undoes what an
-  action demanded. The worst corrections are where the response to them is largest. That a sequence satisfies the budget
-  is assumed and not proven.
+- *always*: all sequences. Before the first step at which a constraint can be active in the window (history and
+  horizon), the bounds are those of *free*. From then on, a constrained output is bounded by the constraints themselves.
+  Without a history (KGRL), a command depends on one action only, and the actions are divided into cells. An action in
+  a cell is a convex combination of the corners, with weights λ_i. The same combination v̄ = Σ λ_i v_i of the corners'
+  corrections v_i is feasible for it. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², where the
+  multipliers at a corner bound ‖v‖ from below (weak duality). So an output is within this radius, times the output's
+  largest displacement per unit of correction, of the range of the outputs at the corners. With a history, corrections
+  feed back: an output that no constraint bounds, and that is coupled to a constrained one, has no bound in this regime.
+- *budgeted*, with a history: all sequences whose corrections satisfy a budget. A corrected command equals the command
+  of another action, possibly outside ±1, plus a residue in the outputs that no action moves. The budget limits the
+  excess of these actions over ±1, and the residue, at one step and summed over the sequence. Both are small, because a
+  correction counteracts the action that violates a constraint. The worst case puts the corrections at the steps with
+  the largest response. The budget is an assumption about the sequence; it is not proven.
 """
 
 import itertools
@@ -29,8 +30,8 @@ from guiderail.models.certificate.loop import Bounds, CertifiedLoop, reach, sing
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
-CELLS = {1: 16, 2: 24, 3: 3}  # cells along each action by the number of actions; 1 for more actions
-MAX_ACTIONS = 6  # number of actions whose corners are enumerated
+CELLS = {1: 16, 2: 24, 3: 3}  # number of actions → number of cells along each; 1 for more actions
+MAX_ACTIONS = 6  # largest number of actions whose corners are enumerated
 ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
 
 
@@ -41,9 +42,9 @@ class CertifiedBounds:
     Attributes:
         free: Bounds until a constraint becomes active.
         always: Bounds for all sequences.
-        can_be_active: Mask (N,) of the steps in whose window a constraint can be active for some actions.
-        multipliers: Multipliers that prove `always`: at these T steps, for every corner of the cells of the actions,
-            (T, (K+1)^A, H+1, F); empty with a history.
+        can_be_active: Mask (N,) of the steps at which some actions make a constraint of the window active.
+        multipliers: Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F), at the T steps of `can_be_active`
+            and every corner of the action cells; empty with a history.
         budgeted: Bounds for corrections within a budget, or None.
     """
 
@@ -58,8 +59,8 @@ def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBound
     """Compute the bounds of a loop.
 
     Args:
-        loop: Primitive in its loop.
-        budget: Budget of the third regime, which exists with a history only; without one it is left out.
+        loop: Primitive in its feedback loop.
+        budget: Budget of the regime *budgeted*; None: skip this regime. Ignored without a history.
 
     Raises:
         InputError: If a primitive without a history has more than `MAX_ACTIONS` actions.
@@ -175,7 +176,7 @@ def _min_norms(
 
 
 def _squared_radius(corrections: np.ndarray, min_norms: np.ndarray) -> float:
-    """Return the largest squared distance of any correction in a cell from the mean of those at its corners."""
+    """Return a bound on the squared distance of a correction in a cell from the interpolation v̄ of the corners'."""
     squared = np.sum(corrections**2, axis=1)
     distances = np.sum((corrections[:, None] - corrections) ** 2, axis=2)
     between = 0.5 * max(float(np.max((min_norms[:, None] - min_norms) ** 2 - distances)), 0.0)

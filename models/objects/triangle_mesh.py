@@ -14,13 +14,13 @@ def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: n
 
 
 def equal_area_radius(radius: float, num_sides: int) -> float:
-    """Return the radius [m] of the corners of the regular polygon with the area of a circle of `radius` [m]."""
+    """Return the circumradius [m] of the regular polygon that has the area of a circle of `radius` [m]."""
     turn = 2.0 * np.pi / num_sides
     return radius * float(np.sqrt(turn / np.sin(turn)))
 
 
 def strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return quads between two polylines (N, 3), counter-clockwise as seen with `second` to the right of `first`."""
+    """Return quads (N-1, 4, 3) between two polylines (N, 3), counter-clockwise if `second` is right of `first`."""
     return np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
 
 
@@ -33,7 +33,7 @@ class TriangleMesh:
 
     @staticmethod
     def from_quads(quads: np.ndarray) -> "TriangleMesh":
-        """Return the mesh of counter-clockwise quads (Q, 4, 3), each cut in two; equal corners become one vertex."""
+        """Split counter-clockwise quads (Q, 4, 3) into triangles; merge equal corners and drop degenerate triangles."""
         corners = np.round(np.asarray(quads, dtype=float), 9).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
         vertices, numbers = np.unique(corners, axis=0, return_inverse=True)
         a, b, c, d = numbers.reshape(-1, 4).T
@@ -48,7 +48,7 @@ class TriangleMesh:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def to_obj(self) -> str:
-        """Return an OBJ file with vertices in nanometre resolution and one normal a triangle, as renderers require."""
+        """Return an OBJ file's text: vertices rounded to 1 nm, and one normal per triangle, as renderers require."""
         lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in self.vertices]
         lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(self.normals(), 4) + 0.0]
         for number, corners in enumerate(self.triangles + 1, start=1):
@@ -57,11 +57,13 @@ class TriangleMesh:
 
 
 def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMesh:
-    """Return a surface of revolution about z with regular polygons for circles, first corner half a side from x.
+    """Return a surface of revolution about z with regular polygons for circles.
+
+    The middle of a side lies on the x axis.
 
     Args:
-        profile: (radius, height) [m] of each circle. The outside is to the left of the profile, with the radius to the
-            right and the height up: a wall that goes up is that of a bore, one that goes down that of a shaft.
+        profile: (radius, height) [m] of each circle. Along the profile, with the radius plotted to the right and the
+            height up, the outside is on the left: the wall of a bore is listed upwards, that of a shaft downwards.
         num_sides: Number of sides of the polygons.
     """
     angles = 2.0 * np.pi * (np.arange(num_sides + 1) + 0.5) / num_sides

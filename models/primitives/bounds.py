@@ -27,7 +27,7 @@ class DemonstratedBounds:
     max_rates: np.ndarray
 
     def contains(self, outputs: np.ndarray) -> np.ndarray:
-        """Return a mask (N,) of the samples (N, O) of a whole motion that are within the bounds."""
+        """Return a mask (N,), true where a sample is within the bounds; `outputs` (N, O) cover the whole motion."""
         phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, len(outputs)), side="right") - 1
         return np.all((outputs >= self.lower[phase]) & (outputs <= self.upper[phase]), axis=1)
 
@@ -45,7 +45,7 @@ def compute_bounds(
 
     Args:
         demonstrations: At least one demonstration.
-        phases: Number of phases K, parts of the motion of equal length.
+        phases: Number K of phases; they divide the motion into parts of equal duration.
         margin: Margin on each side, relative to the range of the phase, not negative.
         min_margin: Smallest margin on each side [unit of the output], not negative.
         bounded: Indices of the bounded outputs; all by default.
@@ -65,7 +65,7 @@ def compute_bounds(
         raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {indices}")
     starts = np.arange(phases) / phases
     lower, upper = (np.full((phases, outputs.shape[2]), inf) for inf in (-np.inf, np.inf))
-    # Between the instants of the common clock, an original sample may lie further out.
+    # Resampling to common times can miss extreme values, so the original samples are included.
     samples = list(zip(demonstrations.times, demonstrations.outputs, strict=True))
     curves = [(np.linspace(0.0, 1.0, steps), y) for y in outputs]
     curves += [((t - t[0]) / (t[-1] - t[0]), y) for t, y in samples]

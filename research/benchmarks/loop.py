@@ -1,7 +1,8 @@
 """Timing of the control loop of a robot: `python -m research.benchmarks loop`.
 
-Durations of each part and its period, and the jitter of messages over LCM on localhost, once with the machine as it is
-and once with a busy process on every core. Durations are wall-clock times, including the worst case.
+Measures the duration of each part of the loop, to compare with its period, and the jitter of LCM messages on localhost.
+Both are measured without added load and with a busy process on every core. Durations are wall-clock times, including
+the worst case.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ Row = dict[str, Any]
 
 
 def measure() -> dict[str, list[Row]]:
-    """Measure with the machine as it is, and with a busy one."""
+    """Measure durations and jitter without added load ("as it is") and with a busy process on every core ("busy")."""
     results = {}
     for load in with_progress(("as it is", "busy"), "load"):
         with _busy(load == "busy"):
@@ -47,7 +48,7 @@ def measure() -> dict[str, list[Row]]:
 
 
 def _row(part: str, period: float, seconds: np.ndarray) -> Row:
-    # A missing answer counts as infinite, and quantiles are not interpolated towards infinity.
+    # The latency of a missing answer is infinite; method="higher" does not interpolate between it and finite ones.
     median, p99, worst = 1000.0 * np.quantile(seconds, (0.5, 0.99, 1.0), method="higher")
     return {
         "part": part,
@@ -66,7 +67,7 @@ def _timed(call: Callable[[int], object], number: int) -> np.ndarray:
         started = time.perf_counter()
         call(index)
         seconds[index] = time.perf_counter() - started
-    return seconds[number // 20 :]  # without the first calls, which happen before a robot moves
+    return seconds[number // 20 :]  # without the first calls: on hardware, a warm-up makes them before motion
 
 
 def _policy(observations: int, actions: int) -> Policy:
@@ -99,7 +100,7 @@ def _parts() -> list[Row]:
 
 
 def _stepped(lcm: DrakeLcm, station: HardwareStation, number: int) -> np.ndarray:
-    """Time a station's step for each status of a robot in the same process [s]."""
+    """Measure the duration [s] of a station's step per status message of a simulated robot in the same process."""
     robot = SimulatedIiwa(BncWorkcell(), lcm)
     simulator, other = Simulator(station), robot.simulator()
     robot.set_pose(other.get_mutable_context(), START)
@@ -118,7 +119,10 @@ def _stepped(lcm: DrakeLcm, station: HardwareStation, number: int) -> np.ndarray
 
 
 def _transport() -> list[Row]:
-    """Time messages between a process that sends at a robot's rate and this one, which answers at once."""
+    """Measure the interval between received messages and the round trip over LCM.
+
+    A second process sends at the rate of a robot; this process answers immediately.
+    """
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     os.environ.setdefault("DRAKE_ALLOW_NETWORK", "lcm")
     context = multiprocessing.get_context("spawn")
@@ -168,7 +172,7 @@ class _Answers:
 
 
 def _send_statuses(pipe: Connection, url: str) -> None:
-    """Send messages from the other process and return the durations until their answers."""
+    """Send status messages from the second process, and put the round-trip durations [s] into the pipe."""
     lcm, answers = DrakeLcm(url), _Answers()
     lcm.Subscribe("ANSWER", lambda message: answers.receive(message, time.perf_counter()))
     with _realtime_priority():

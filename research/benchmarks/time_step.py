@@ -1,8 +1,9 @@
-"""Error and duration of a plant's time step: `python -m research.benchmarks time_step`.
+"""Simulation error and CPU time for different time steps of the plant: `python -m research.benchmarks time_step`.
 
-Scripted motions on the gantry are compared with the finest time step: a connector that locks, one that starts 1.2 mm
-off the jack's axis and slips off its rim, and a clamp that is dragged into its holes. Plants are of first order:
-errors are proportional to the time step, except that a coarse step overstates the peak force of an impact.
+Three scripted motions on the gantry are compared with the same motions at the finest time step: a connector that locks,
+a connector that starts 1.2 mm off the jack's axis and slips off its rim, and a clamp that is dragged into its holes.
+The integration is of first order: errors are proportional to the time step, except that a coarse step overstates the
+peak force of an impact.
 """
 
 from __future__ import annotations

@@ -46,12 +46,12 @@ class SignalPorts:
         return self._ports[name]
 
     def eval(self, context: Context) -> dict[str, np.ndarray]:
-        """Return the values of all signals by name; `context` is the system's."""
+        """Return the values of all signals by name; `context` is the context of the system."""
         return {name: port.Eval(context) for name, port in self._ports.items()}
 
 
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
-    """Raise an `InputError` if a function does not accept signals of these names; `what` names it in the message."""
+    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` is its description."""
     try:
         takes = signature(function)
     except (ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""Import of demonstrations from LeRobot datasets, ROS 2 bags and CSV files, and export to the first two."""
+"""Import of demonstrations from LeRobot datasets, ROS 2 bags and CSV files; export to LeRobot and MCAP."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def import_recording(
     Args:
         source: File or folder.
         out: File to write, .npz or .csv; it must not exist.
-        signal: Topic or feature; the only candidate by default. A CSV file has none.
+        signal: ROS topic or LeRobot feature; by default the only one with suitable data. Not for CSV files.
         target: Pose of the task's target in the recording's frame, [x y z] in metres and [rx ry rz] in degrees.
         rate: Sampling rate of the result [1/s]; that of the recording by default.
         csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
 
     Raises:
-        InputError: If the source cannot be read, does not state a unit or a signal that has to be given, or `out`
-            cannot be written.
+        InputError: If the source cannot be read, a unit or signal that it does not state is not given, or `out` cannot
+            be written.
     """
     if out.suffix not in ENDINGS:
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")

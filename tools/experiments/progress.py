@@ -23,7 +23,7 @@ class StudyProgress:
     """Table of running jobs on a terminal; one line per minute in a log file or a pipe.
 
     Both get a line for each finished job. Everything is read from the folders of the runs, so workers and engines need
-    not report anything. Use it as a context.
+    not report anything. It is a context manager.
     """
 
     def __init__(self, jobs: Mapping[int, Any], total: int, console: Console | None = None):
@@ -61,7 +61,7 @@ class StudyProgress:
     def end(self, key: int, job: Any, outcome: Outcome) -> None:
         """Print the outcome of a job."""
         attempts = count_attempts(job.log, self._open[key][2]) if key in self._open else 0
-        self._open = {other: one for other, one in self._open.items() if other != key}  # the other thread may iterate
+        self._open = {other: one for other, one in self._open.items() if other != key}  # _watch may be iterating
         self._num_ended += 1
         self._num_failed += bool(outcome.failure)
         text = f": failed: {outcome.failure}" if outcome.failure else ""

@@ -27,8 +27,8 @@ from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, with_defaults
 
-EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # of episodes that are not learned from
-NICENESS = 5  # of the process of the gradient steps, so that the control loop meets its deadlines
+EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are excluded from training
+NICENESS = 5  # niceness of the training process, so that the control loop meets its deadlines
 
 
 def train_on_robot(
@@ -42,16 +42,16 @@ def train_on_robot(
     assume_yes: bool = False,
     log: Log = print,
 ) -> dict[str, Any]:
-    """Train a policy on a robot, leave a run folder, and return statistics of the training.
+    """Train a policy on a robot, write a run folder, and return statistics of the training.
 
     Args:
-        task: Name of an insertion task with a success that a robot can observe.
+        task: Name of an insertion task that defines `observable_success`, success estimated from the measured pose.
         out: Run folder.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
         given: Arguments of `configure`: algorithm, preset, episodes, seed.
         settings: Settings of the learner.
-        assume_yes: Do not ask to confirm the checks; with a simulated driver, nor to resume after a stop.
+        assume_yes: Skip the confirmation of the checks, and with a simulated driver also that of resuming after a stop.
         log: Function that shows a message.
 
     Raises:
@@ -136,8 +136,8 @@ def _train(
             try:
                 env.rest()
             finally:
-                # Each on its own: the disk or the learning process may have failed. The present policy is saved before
-                # the process is waited for, and again when it has learned from all episodes.
+                # An error in one step must not skip the others: the disk or the training process may have failed. The
+                # current policy is saved before the training process finishes, and again after it.
                 for save in (*due, save_learned, learner.finish, save_learned):
                     with suppress(Exception):
                         save()

@@ -69,12 +69,12 @@ def write_report(
 
     Args:
         paths: Folders of `guiderail train` or `guiderail study`.
-        out: Page, .html.
-        episodes: Held-out episodes to evaluate runs on that no study evaluated.
+        out: HTML file to write.
+        episodes: Number of held-out episodes on which to evaluate each run that no study evaluated; 0: none.
         describe_differences: Returns sentences on how a configuration differs from a reference.
 
     Raises:
-        InputError: If there is nothing to report on, or `out` is not a page.
+        InputError: If there is nothing to report on, or `out` is not an HTML file.
     """
     if episodes < 0:
         raise InputError(f"runs are evaluated on a number of episodes from 0, not {episodes}")
@@ -217,7 +217,7 @@ def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def _differences(methods: dict[str, list[Run]], describe_differences: DescribeDifferences) -> list[dict[str, Any]]:
-    """Return the differences of all methods from the reference, then those of single methods."""
+    """Return the differences from the reference: first those of every method, then those of individual methods."""
     of_methods = {
         name: list(dict.fromkeys(text for run in runs for text in describe_differences(run.config)))
         for name, runs in methods.items()
@@ -232,7 +232,7 @@ def _differences(methods: dict[str, list[Run]], describe_differences: DescribeDi
 
 
 def _configuration(methods: dict[str, list[Run]]) -> tuple[Table | None, Table]:
-    """Return the settings in which methods differ, None if there are none, and the common ones."""
+    """Return a table of settings that differ between methods (None if all agree) and a table of common settings."""
     settings = {name: _settings(runs) for name, runs in methods.items()}
     keys = list(dict.fromkeys(key for one in settings.values() for key in one))
     values = {key: [one.get(key, "–") for one in settings.values()] for key in keys}
@@ -264,7 +264,7 @@ def _versions(runs: Sequence[Run]) -> Table | None:
 
 
 def _commands(gathered: Gathered) -> tuple[list[str], list[str]]:
-    """Return the commands that reproduce everything, and those of the single runs of a study."""
+    """Return the commands that reproduce the report and, for a study, also those of its individual runs."""
     of_runs = [
         command(run.config, f"runs/{name}") for run, name in zip(gathered.runs, gathered.folder_names, strict=True)
     ]
@@ -274,7 +274,7 @@ def _commands(gathered: Gathered) -> tuple[list[str], list[str]]:
 def _study_commands(counts: pd.DataFrame) -> list[str]:
     """Return the commands that reproduce the studies of a table.
 
-    The table of a part of a study has the study's name with a dash and the part's methods and seeds.
+    The table of a partial study is named after the study, then its methods, its seeds or both, joined by dashes.
     """
     commands = []
     names = [str(name) for name in dict.fromkeys(counts["study"])] if len(counts) else []

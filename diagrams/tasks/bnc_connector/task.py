@@ -65,21 +65,21 @@ def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
 # Indices into the observation [time, pose, wrench, center of pressure, command].
 TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y, CENTER_OF_PRESSURE, COMMAND = 0, 3, 9, 10, 11, slice(13, 15), slice(15, 17)
 
-# Against the contact torque, while the demonstrations "insert" press on the rim.
+# Parameters of `scripted_torque_search`, for the demonstrations "insert".
 GAIN = 1.5  # action per scaled contact torque
-PRESSING = (60, 185)  # control steps
-SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTRE[2]) / POSE_SCALE[2]  # scaled height above which the plug is not in yet
+PRESSING = (60, 185)  # control steps between which the demonstrations press on the rim
+SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTRE[2]) / POSE_SCALE[2]  # scaled height above which the plug is not inserted
 CONTACT_FORCE = 0.2  # scaled force along z above which the plug is in contact
 
-# Along the center of pressure, while the demonstrations "search" do.
-STEP = 0.5 * MM  # per action
-REACH = 3.1 * MM  # displacement that an action of one leads to
-ON_RIM = RIM - 0.5 * MM  # height above which the plug is not in yet
+# Parameters of `scripted_center_of_pressure`, for the demonstrations "search".
+STEP = 0.5 * MM  # displacement of the command per action [m]
+REACH = 3.1 * MM  # displacement of the command at an action of 1 [m]
+ON_RIM = RIM - 0.5 * MM  # height above which the plug is not inserted [m]
 MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the rim [s]
 
 
 def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
-    """Return an action in x and y against the contact torque, which tells on which side the plug stands, (2,)."""
+    """Return an action (2,) in x and y that opposes the contact torque of the rim, to move towards the jack."""
     step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
     is_on_rim = observation[Z] > SCALED_RIM and observation[FORCE_Z] > CONTACT_FORCE
     if not (PRESSING[0] < step < PRESSING[1] and is_on_rim):
@@ -88,9 +88,9 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
-    """Return an action that moves the command a step towards the center of pressure, where the jack is, (2,).
+    """Return an action (2,) that moves the command one step towards the center of pressure, and so towards the jack.
 
-    After the plug has dropped in, the command stays. The policy has no memory: the last command is observed.
+    Once the plug has dropped into the jack, the command is constant. The last command is part of the observation.
 
     Raises:
         InputError: If the observation has no center of pressure.

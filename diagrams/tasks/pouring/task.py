@@ -96,21 +96,21 @@ START_HEIGHT = (0.08, 0.19)  # [m]
 MAX_START_SAMPLES = 20  # samples of an unreachable start before the reset fails
 
 
-# Indices into the observation [tip in mug, error of the believed mug, template's state].
+# Indices into the observation [tip in the mug's frame, error of the estimated mug pose, template's state].
 ERROR, STATE = slice(6, 8), 8
 
-OVER_THE_RIM = (0.045, 0.055)  # [m] goal of the tip before the mug's axis and above its rim
-POURING_DISTANCE = 0.078  # [m] nearer than this to the middle of the mug's opening it only pushes on
-SOFTNESS = 0.03  # [m] distance below which the inputs decrease
+OVER_THE_RIM = (0.045, 0.055)  # [m] goal of the tip: distance from the mug's axis, height above its rim
+POURING_DISTANCE = 0.078  # [m] distance from the mug's opening below which the inputs are only horizontal
+SOFTNESS = 0.03  # [m] distance from the goal below which the inputs are proportional to it
 
-AIM_OVER_THE_RIM = (0.03, 0.045)  # [m] the same goal for the believed mug: pushing there leads to Pour
-AIM_SOFTNESS = 0.02  # [m] distance below which the inputs decrease while aiming
-AIM_TOLERANCE = 0.008  # [m] distance from the aim below which it tilts
-POURING_TILT = 95.0  # [degrees] tilt above which it continues whatever the aim, because the balls roll
+AIM_OVER_THE_RIM = (0.03, 0.045)  # [m] the same for the estimated mug pose; reached, state Pour begins
+AIM_SOFTNESS = 0.02  # [m] distance from the aim below which the inputs are proportional to it
+AIM_TOLERANCE = 0.008  # [m] distance from the aim below which the policy tilts the thermos
+POURING_TILT = 95.0  # [degrees] tilt above which the policy always continues, because the balls roll
 
 
 def scripted_pour(observation: np.ndarray) -> np.ndarray:
-    """Return inputs that push the thermos's tip towards the mug until it is poured, (3,)."""
+    """Return inputs (3,) that move the thermos's tip over the mug's rim and on towards its axis."""
     p_MP = observation[:3] / POSITION_SCALE
     horizontal = np.hypot(p_MP[0], p_MP[1])
     towards = -p_MP[:2] / max(horizontal, 1e-9)
@@ -121,7 +121,7 @@ def scripted_pour(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
-    """Return inputs that push to where Pour begins, aim at the actual mug, and tilt the thermos, (3,)."""
+    """Return inputs (3,) that move to where state Pour begins, then aim at the actual mug, then tilt the thermos."""
     p_MP = observation[:3] / POSITION_SCALE
     if observation[STATE] < 0.5:
         p_BP = p_MP - np.array([*(MAX_MUG_ERROR * observation[ERROR]), 0.0])
@@ -134,7 +134,7 @@ def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_pour_blind(observation: np.ndarray) -> np.ndarray:
-    """Return the inputs of `scripted_pour_aimed` for the believed mug instead of the actual one, (3,)."""
+    """Return the inputs (3,) of `scripted_pour_aimed` for the estimated mug pose instead of the actual one."""
     believed = np.array(observation, dtype=float)
     believed[:2] -= POSITION_SCALE * MAX_MUG_ERROR * believed[ERROR]
     believed[ERROR] = 0.0

@@ -1,4 +1,4 @@
-"""Collision geometry of the grid clamp and its table as convex solids: rings of prisms, and a sprung bead."""
+"""Collision geometry of the grid clamp and its table as convex solids: rings of prisms, and a spring-mounted bead."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDim
 from guiderail.models.objects.grid_clamp.sdf import BEAD, FRICTION
 from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_hulls
 
-# Each side of the bead is sprung by itself, with the stiffness of a side of Drake's soft bead in the lip.
+# Each side of the bead has its own spring, as stiff as one side of Drake's compliant bead in the lip.
 BEAD_STIFFNESS = 7e3  # [N/m]
-BEAD_CORE = 2.0 * MM  # radius at which its sides begin
-BEAD_GAP = 0.4 * MM  # gap between a side and the corner, so that each side meets only its own side of the lip
-# Height of the crest in the middle of a side: for contact along an edge a collider would choose an arbitrary normal.
+BEAD_CORE = 2.0 * MM  # inner radius of the bead's sides
+BEAD_GAP = 0.4 * MM  # gap between a side and the corner, so that a side touches only the lip side that it faces
+# Extra radius in the middle of a side's crest. Along a straight crest, contact is an edge and its normal is arbitrary.
 BEAD_CROWN = 0.01 * MM
-LIP_BACK = 2.0 * MM  # thickness of the lip into the table
+LIP_BACK = 2.0 * MM  # radial thickness of the lip
 
 
 def clamp_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) -> list[Surface]:
@@ -46,7 +46,7 @@ def table_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) 
 
 
 def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
-    """Return the pieces of a hole's wall, chamfer and face, the same polygon as `hole_mesh`."""
+    """Return the convex pieces of a hole's wall, chamfer and face, with the polygonal surface of `hole_mesh`."""
     d = dimensions
     profile = [
         [d.hole_radius + d.hole_chamfer, 0.0],
@@ -59,7 +59,7 @@ def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
 
 
 def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
-    """Return the pieces of the lip, the same polygon as `lip_mesh`."""
+    """Return the convex pieces of the lip, with the polygonal surface of `lip_mesh`."""
     d = dimensions
     top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
     profile = [
@@ -74,7 +74,10 @@ def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
 
 
 def bead_hulls(dimensions: GridClampDimensions) -> list[tuple[np.ndarray, tuple[float, float, float]]]:
-    """Return the sides of the bead (V, 3) about its crest and their outward directions; same polygon as `bead_mesh`."""
+    """Return the vertices (V, 3) [m] of each side of the bead and its outward direction (3,).
+
+    Heights are relative to the crest. The sides have the polygonal surface of `bead_mesh`.
+    """
     d = dimensions
     radius, height = np.array(
         [
