@@ -141,7 +141,7 @@ def real_problem(history, seed) -> Problem:
     if history:
         past = reference.means[np.maximum(np.arange(step - history, step), 0)]
         past = past + 1e-4 * rng.standard_normal(past.shape)
-    return Problem(primitive, step, rng.standard_normal(6) * 100, past, 20.0)
+    return Problem(primitive, step, rng.standard_normal(6) * 100, past, np.sqrt(0.025))
 
 
 @pytest.mark.skipif(not REAL_DATA.exists(), reason="the recordings are not part of the repository")
