@@ -149,11 +149,11 @@ def test_points_replace_a_range_by_each_value():
     assert {point.axis.name: point.trained for point in found} == {"friction": None, "stiffness": None, "lost": 0.0}
 
 
-@pytest.mark.parametrize(("fixture_offset", "anew"), [("per_run", True), ("per_episode", False)])
-def test_only_the_offset_axis_resamples_hidden_offsets(fixture_offset, anew):
+@pytest.mark.parametrize(("fixture_offset", "is_resampled"), [("per_run", True), ("per_episode", False)])
+def test_only_the_offset_axis_resamples_hidden_offsets(fixture_offset, is_resampled):
     found, _ = points("BncConnector", {"fixture_offset": fixture_offset}, AXES)
     for point in found:
-        assert point.options == ({"new_run": True} if anew and point.axis.name == "offsets" else {})
+        assert point.options == ({"new_run": True} if is_resampled and point.axis.name == "offsets" else {})
 
 
 def test_all_policies_get_the_same_resampled_offsets(bead_config, tmp_path, monkeypatch):
