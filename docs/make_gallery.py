@@ -55,7 +55,7 @@ class Panel:
     environment: dict[str, Any]
     act: Callable[[Any], PolicyFn]
     seed: int = 1_000_000
-    colour: tuple[int, int, int] = GREEN
+    color: tuple[int, int, int] = GREEN
     describe: Callable[[dict[str, Any]], str] | None = None
     row: dict[str, Any] = field(default_factory=dict)
     times: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -131,7 +131,7 @@ def compose(panels: Sequence[Panel], size: tuple[int, int], times: np.ndarray) -
             image = panel.images[max(n for n in panel.images if n <= step)].copy()
             path, ink = panel.path[:step], ImageDraw.Draw(image)
             if len(path) > 1:
-                ink.line([tuple(p) for p in path], fill=panel.colour, width=SCALE * 2, joint="curve")
+                ink.line([tuple(p) for p in path], fill=panel.color, width=SCALE * 2, joint="curve")
             if len(path) and len(panel.images) == 1:
                 (x, y), r = path[-1], SCALE * 4
                 ink.ellipse((x - r, y - r, x + r, y + r), fill=(25, 90, 200))

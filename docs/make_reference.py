@@ -426,10 +426,10 @@ TEMPLATE_WORDS = {
 STATE_WORDS = {
     "input_mapping": "list of mappings from inputs to motion, which are added",
     "active_constraints": "list of constraints onto which the requested pose is projected, in this order",
-    "transition_distance": "distance to the end of the state, in metres or degrees; `…` below is the unit",
+    "transition_distance": "distance to the end of the state, in meters or degrees; `…` below is the unit",
     "starts_at_…": "distance at which the state's progress is 0",
     "ends_at_…": "distance at which the state ends; that of the first transition by default",
-    "weight_per_…": "weight of a metre or a degree in the reward's progress; 1 by default",
+    "weight_per_…": "weight of a meter or a degree in the reward's progress; 1 by default",
     "transitions": "list of `to`, `below_…` and optionally `hysteresis_…`: the state changes to `to` when its "
     "distance falls below `below_…`, and back when that distance exceeds `below_…` + `hysteresis_…`; without "
     "`hysteresis_…` it never returns",

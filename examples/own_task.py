@@ -31,7 +31,7 @@ class WideGap(gr.Task):
         return gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
 
     def observation_terms(self) -> Sequence[gr.ObservationTerm]:
-        return (gr.ObservationTerm("phase"), gr.ObservationTerm("pose", centre=0.5, scale=0.5))
+        return (gr.ObservationTerm("phase"), gr.ObservationTerm("pose", center=0.5, scale=0.5))
 
     def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
         return [

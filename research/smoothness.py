@@ -28,7 +28,7 @@ from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.metrics import jerk, summary
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import colour, new_figure, save_figure
+from guiderail.tools.visualization.style import color, new_figure, save_figure
 from research.command import Parser, print_result, run_program
 from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, uniform
 
@@ -310,15 +310,15 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> Path:
     free = [row for row in rows if row["place"] == "free"][::-1]
     contact = [row for row in rows if row["place"] == "connector"][::-1]
     height = np.arange(len(free))
-    kinds = {ALONE: "0.6", "residual": colour("residual"), "sKGRL": colour("skgrl"), "KGRL": colour("kgrl")}
-    colours = [next(colour for name, colour in kinds.items() if row["method"].startswith(name)) for row in free]
+    kinds = {ALONE: "0.6", "residual": color("residual"), "sKGRL": color("skgrl"), "KGRL": color("kgrl")}
+    colors = [next(color for name, color in kinds.items() if row["method"].startswith(name)) for row in free]
     for axis, part, unit in zip(axes[0], ("linear", "angular"), ("m/s³", "rad/s³"), strict=False):
-        axis.barh(height + 0.2, [row[f"jerk_commanded_{part}"] for row in free], 0.4, color=colours)
-        axis.barh(height - 0.2, [row[f"jerk_measured_{part}"] for row in free], 0.4, color=colours, alpha=0.4)
+        axis.barh(height + 0.2, [row[f"jerk_commanded_{part}"] for row in free], 0.4, color=colors)
+        axis.barh(height - 0.2, [row[f"jerk_measured_{part}"] for row in free], 0.4, color=colors, alpha=0.4)
         axis.set(xscale="log", xlabel=f"{part} jerk in free space [{unit}]", title="commanded, measured (pale)")
-    axes[0, 2].barh(height, [row["success_rate"] for row in contact], 0.7, color=colours)
+    axes[0, 2].barh(height, [row["success_rate"] for row in contact], 0.7, color=colors)
     axes[0, 2].set(xlabel="success on the connector, exploring")
-    axes[0, 3].barh(height, [row["peak_force"] for row in contact], 0.7, color=colours)
+    axes[0, 3].barh(height, [row["peak_force"] for row in contact], 0.7, color=colors)
     axes[0, 3].set(xlabel="peak force on the connector [N]")
     for index, axis in enumerate(axes[0]):
         axis.set_yticks(height, [row["method"] for row in free] if index == 0 else [""] * len(free))

@@ -19,12 +19,13 @@ class ActiveConstraintProjector(LeafSystem):
 
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    (`SharedControlTemplate.command`). The last command is state, initialized with the measured pose, as far inside
-    the constraints as one period leads. Between control instants the output is a pure function of it and the request.
+    (`SharedControlTemplate.command`). The last command is state, initialized with the measured pose, moved towards the
+    constraints as far as one period allows. Between control instants the output is a pure function of it and the
+    request.
 
     The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite, or if the
-    tracking error exceeds its bound and the request would not reduce it, as when the robot is blocked. If a transition
-    or a moved object leaves the repeated command outside the constraints, it is led inside.
+    tracking error exceeds its bound and the request would not reduce it, for example if the robot is blocked. If a
+    transition or a moved object leaves the repeated command outside the constraints, the command moves inside.
 
     .. pydrake_system::
 
@@ -40,14 +41,15 @@ class ActiveConstraintProjector(LeafSystem):
         - commanded_violation
         - measured_violation
 
-    All poses are (6,), [x y z Rz Ry Rx] in metres and radians; the other ports are (1,). ``state`` is the number of the
-    template's state. A violation is the distance from the projection, the larger of metres and radians, 0 inside.
+    All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
+    template's state. A violation is the distance from the projection, the larger of meters and radians, 0 inside.
 
     Args:
         template: The template.
         frames: Poses of the template's objects by name, in the frame of the poses at the ports.
         period: Control period [s], positive.
-        max_tracking_error: Distance between the robot and its command beyond which the command waits [m], positive.
+        max_tracking_error: Distance between the robot and its command beyond which the last command is
+            repeated [m], positive.
 
     Raises:
         InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the

@@ -75,7 +75,7 @@ class CartesianImpedanceController(LeafSystem):
         - saturation
         - command_timed_out
 
-    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``estimated_state`` is (2n,),
+    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
     is not connected, commands never time out. ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench``
     is (6,), force first, in the axes of T. ``saturation`` (1,) is 1 while the wrench or a motor is at its limit.

@@ -64,7 +64,7 @@ class CartesianPositionController(LeafSystem):
         - stuck
         - command_timed_out
 
-    ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``positions`` is (n,), measured joint
+    ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``positions`` is (n,), measured joint
     positions [rad], read at initialization as the first joint command. ``command_time`` is (1,), the time stamp of
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
     (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 while the

@@ -22,7 +22,7 @@ class MeasuredPose(LeafSystem):
         output_ports:
         - pose
 
-    ``body_poses`` is the plant's output. ``pose`` is (6,), [x y z Rz Ry Rx] in metres and radians.
+    ``body_poses`` is the plant's output. ``pose`` is (6,), [x y z Rz Ry Rx] in meters and radians.
 
     Args:
         plant: Finalized plant.

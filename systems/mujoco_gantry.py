@@ -64,7 +64,7 @@ class MujocoGantry(LeafSystem):
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 
-    with the contact forces f of the engine; w is their wrench on the tool at its centre, in the axes of T. A static
+    with the contact forces f of the engine; w is their wrench on the tool at its center, in the axes of T. A static
     plant defines the pose of the fixture and the pose of the workpiece in the tool, offsets included. The bodies of the
     model are placed accordingly before every update.
 
@@ -81,7 +81,7 @@ class MujocoGantry(LeafSystem):
         - body_poses
         - geometry_poses
 
-    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``nominal_body_poses`` is the
+    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
     output of the static plant; ``body_poses`` contains the same poses with the simulated ones of tool and workpiece.
     ``geometry_poses`` contains the poses of all frames with geometry. ``wrench`` is the filtered wrench y, (6,), force
     first, in N and Nm. ``impedance_wrench`` is (6,), the forces and torques of the six motors in the order of the pose.

@@ -25,7 +25,7 @@ class PoseRateLimiter(LeafSystem):
         output_ports:
         - limited_pose
 
-    ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians.
+    ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians.
     ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`.
 
     Args:

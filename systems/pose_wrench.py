@@ -23,7 +23,7 @@ class PoseWrench(LeafSystem):
         output_ports:
         - wrench
 
-    ``pose`` is X_TP as (6,) [x y z a b c] in metres and radians. ``generalized_force`` is (6,), along and about these
+    ``pose`` is X_TP as (6,) [x y z a b c] in meters and radians. ``generalized_force`` is (6,), along and about these
     coordinates [N, Nm]. ``wrench`` is (6,), [fx fy fz tx ty tz] at P in the axes of T.
     """
 

@@ -24,7 +24,7 @@ class RelativePoses(LeafSystem):
         output_ports:
         - relative_poses
 
-    ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,): for each body its position in metres and its
+    ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,): for each body its position in meters and its
     orientation as a rotation vector of at most π radians.
 
     Args:

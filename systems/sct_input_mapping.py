@@ -30,7 +30,7 @@ class SctInputMapping(LeafSystem):
         output_ports:
         - requested_pose
 
-    ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians;
+    ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians;
     ``state`` is (1,), the number of the template's state.
 
     Args:

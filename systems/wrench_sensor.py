@@ -14,12 +14,12 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 
 
 class WrenchSensor(LeafSystem):
-    """Measure the wrench of the environment on a tool at its centre of compliance, low-pass filtered.
+    """Measure the wrench of the environment on a tool at its center of compliance, low-pass filtered.
 
         F = M A + bias(V) − M [0, g] − F_wrist,  τ y' = F − y
 
     See `external_wrench`. The wrist is a joint; the tool is rigid and welded to the child of the wrist. F is
-    transformed to the centre of compliance P and expressed in axes that are fixed in the world.
+    transformed to the center of compliance P and expressed in axes that are fixed in the world.
 
     .. pydrake_system::
 
@@ -39,7 +39,7 @@ class WrenchSensor(LeafSystem):
         plant: Finalized plant, connected to this system.
         wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
         tool: Bodies behind the wrist, welded together.
-        centre: Centre of compliance P, fixed to the first body of `tool`.
+        center: Center of compliance P, fixed to the first body of `tool`.
         R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
         period: Sampling period [s], positive; ideally the plant's time step.
         time_constant: τ of the filter [s]; 0 disables it.
@@ -53,7 +53,7 @@ class WrenchSensor(LeafSystem):
         plant: MultibodyPlant,
         wrist: Joint,
         tool: list[RigidBody],
-        centre: Frame,
+        center: Frame,
         R_WAxes: RotationMatrix,
         period: float,
         time_constant: float,
@@ -68,13 +68,13 @@ class WrenchSensor(LeafSystem):
         self._wrist = int(wrist.index())
         self._tool = int(tool[0].index())
         X_ToolWrist = wrist.frame_on_child().CalcPose(nominal, tool[0].body_frame())
-        X_ToolP = centre.CalcPose(nominal, tool[0].body_frame())
+        X_ToolP = center.CalcPose(nominal, tool[0].body_frame())
         # The inertia and the two wrench transforms are constant in the frame of the tool.
         self._M_Tool = plant.CalcSpatialInertia(
             nominal, tool[0].body_frame(), [body.index() for body in tool]
         ).CopyToFullMatrix6()
         self._wrist_to_tool = _wrench_transform(X_ToolWrist.rotation().matrix(), X_ToolWrist.translation())
-        self._tool_to_centre = _wrench_transform(np.eye(3), -X_ToolP.translation())
+        self._tool_to_center = _wrench_transform(np.eye(3), -X_ToolP.translation())
         self._R_AxesW = R_WAxes.inverse().matrix()
         has_weight = plant.is_gravity_enabled(tool[0].model_instance())
         self._gravity_W = plant.gravity_field().gravity_vector() if has_weight else np.zeros(3)
@@ -124,8 +124,8 @@ class WrenchSensor(LeafSystem):
             (A_W.reshape(2, 3) @ R_WTool).ravel(),
             self._gravity_W @ R_WTool,
         )
-        at_centre = (self._tool_to_centre @ torque_force).reshape(2, 3)
-        return (at_centre[::-1] @ (self._R_AxesW @ R_WTool).T).ravel()
+        at_center = (self._tool_to_center @ torque_force).reshape(2, 3)
+        return (at_center[::-1] @ (self._R_AxesW @ R_WTool).T).ravel()
 
 
 def _wrench_transform(R: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -88,7 +88,7 @@ def add_camera(
     *,
     is_picture: bool = False,
 ) -> OutputPort:
-    """Add a camera and return the port of its colour image, an `ImageRgba8U`.
+    """Add a camera and return the port of its color image, an `ImageRgba8U`.
 
     With `is_picture` the scene is lit for a picture instead of an observation.
 

@@ -1,4 +1,4 @@
-"""Observation of a policy as a diagram: signals one after the other, each centred, scaled and clipped."""
+"""Observation of a policy as a diagram: signals one after the other, each centered, scaled and clipped."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ CLOCKS = ("time", "phase")
 
 @dataclass(frozen=True)
 class ObservationTerm:
-    """Signal in an observation, as (value − centre) / scale.
+    """Signal in an observation, as (value − center) / scale.
 
     Attributes:
         signal: Name of a port of station, guidance or task, or one of `CLOCKS`.
-        centre: Finite number, or one per entry (n,), in the signal's unit.
+        center: Finite number, or one per entry (n,), in the signal's unit.
         scale: Finite number, or one per entry (n,), in the signal's unit; not 0.
         entries: Indices of the signal's numbers; default: all.
     """
 
     signal: str
-    centre: Sequence[float] | np.ndarray | float = 0.0
+    center: Sequence[float] | np.ndarray | float = 0.0
     scale: Sequence[float] | np.ndarray | float = 1.0
     entries: tuple[int, ...] | None = None
 
@@ -62,7 +62,7 @@ class Observation(Diagram):
             of: Name of the task, for messages.
 
         Raises:
-            InputError: If there is no entry, an index is out of range, or a centre or a scale would not map finite
+            InputError: If there is no entry, an index is out of range, or a center or a scale would not map finite
                 signals to finite numbers.
         """
         super().__init__()
@@ -86,9 +86,9 @@ class Observation(Diagram):
                 builder.ExportInput(signal.get_input_port(), one.signal)
             builder.Connect(builder.GetSubsystemByName(one.signal).get_output_port(0), together.get_input_port(index))
         scale = np.concatenate([scale for _, _, scale in rows])
-        centre = np.concatenate([centre for _, centre, _ in rows])
+        center = np.concatenate([center for _, center, _ in rows])
         D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]
-        scaled = builder.AddNamedSystem("scaled", affine(D, -centre / scale))
+        scaled = builder.AddNamedSystem("scaled", affine(D, -center / scale))
         clipped = builder.AddNamedSystem("clipped", Saturation(np.full(self.size, -clip), np.full(self.size, clip)))
         builder.Connect(together.get_output_port(), scaled.get_input_port())
         builder.Connect(scaled.get_output_port(), clipped.get_input_port())
@@ -121,7 +121,7 @@ def _add_clock(builder: DiagramBuilder, name: str, duration: float) -> OutputPor
 
 
 def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the selection of entries (n, size), their centres (n,) and scales (n,)."""
+    """Return the selection of entries (n, size), their centers (n,) and scales (n,)."""
     try:
         selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
         if selection.ndim != 2:
@@ -131,18 +131,18 @@ def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndar
             f"the entries of the observed signal {one.signal!r}{of} are whole numbers from 0 to {size - 1}, "
             f"not {brief(one.entries)}"
         ) from None
-    centre, scale = (_numbers(one, name, len(selection), of) for name in ("centre", "scale"))
+    center, scale = (_numbers(one, name, len(selection), of) for name in ("center", "scale"))
     with np.errstate(all="ignore"):
-        is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(centre / scale).all()
+        is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(center / scale).all()
     if not is_usable:
         raise InputError(
             f"the scale of the observed signal {one.signal!r}{of} divides it, so it cannot be {brief(one.scale)}"
         )
-    return selection, centre, scale
+    return selection, center, scale
 
 
 def _numbers(one: ObservationTerm, name: str, number: int, of: str) -> np.ndarray:
-    """Return the centre or the scale of each entry, (n,)."""
+    """Return the center or the scale of each entry, (n,)."""
     given = getattr(one, name)
     try:
         numbers = np.broadcast_to(given, number).astype(float)

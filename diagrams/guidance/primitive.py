@@ -76,7 +76,7 @@ def add_demonstration(builder: DiagramBuilder, config: PrimitiveConfig, action: 
     "kmp",
     needs=(("demonstrations",),),
     label="demonstration alone",
-    colour="#333333",
+    color="#333333",
     demonstrates=True,
     displaces=True,
 )
@@ -95,7 +95,7 @@ class KmpGuidance(PrimitiveGuidance):
     "kgrl",
     needs=(("demonstrations",),),
     label="KGRL",
-    colour="#1f77b4",
+    color="#1f77b4",
     demonstrates=True,
     displaces=True,
 )
@@ -117,7 +117,7 @@ class KgrlGuidance(PrimitiveGuidance):
     "skgrl",
     needs=(("demonstrations",),),
     label="sKGRL",
-    colour="#2ca02c",
+    color="#2ca02c",
     demonstrates=True,
     displaces=True,
 )

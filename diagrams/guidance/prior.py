@@ -23,7 +23,7 @@ class PlacedTemplate:
         template: Shared control template.
         frames: Poses X_TF of the template's objects by name, in the frame of the station's poses.
         active_constraints: True if the active constraints are enforced; None: the guidance's default.
-        max_tracking_error: Distance between robot and command [m] beyond which the command waits for the robot.
+        max_tracking_error: Distance between robot and command [m] beyond which the last command is repeated.
     """
 
     template: SharedControlTemplate

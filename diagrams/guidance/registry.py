@@ -1,4 +1,4 @@
-"""Registry of the kinds of guidance: builder, requirements, and label and colour in figures."""
+"""Registry of the kinds of guidance: builder, requirements, and label and color in figures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class GuidanceKind:
         build: Function from prior knowledge to a diagram with the ports of `Guidance`.
         needs: Alternative tuples of names in `REQUIREMENTS`; the task must provide all names of one alternative.
         label: Label in figures.
-        colour: Colour in figures, "#rrggbb".
+        color: Color in figures, "#rrggbb".
         demonstrates: True if an action of zero reproduces the demonstrations or the script, so that their success
             before learning can be stated.
         displaces: True if an action displaces the explored outputs, one number for each. A task's symmetry is used
@@ -45,7 +45,7 @@ class GuidanceKind:
     build: Callable[[PriorKnowledge], Diagram]
     needs: tuple[tuple[str, ...], ...]
     label: str
-    colour: str
+    color: str
     demonstrates: bool = False
     displaces: bool = False
     options: type[Options] | None = None
@@ -72,7 +72,7 @@ def register_guidance(
     *,
     needs: tuple[tuple[str, ...], ...] = (),
     label: str | None = None,
-    colour: str = "#17becf",
+    color: str = "#17becf",
     demonstrates: bool = False,
     displaces: bool = False,
     options: type[Options] | None = None,
@@ -83,14 +83,14 @@ def register_guidance(
         name: Value of the option `guidance`.
         needs: See `GuidanceKind`.
         label: Label in figures; default: its name.
-        colour: Colour in figures, "#rrggbb".
+        color: Color in figures, "#rrggbb".
         demonstrates: See `GuidanceKind`.
         displaces: See `GuidanceKind`.
         options: Model of further options of the environment.
     """
 
     def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
-        kind = GuidanceKind(name, build, needs, label or name, colour, demonstrates, displaces, options)
+        kind = GuidanceKind(name, build, needs, label or name, color, demonstrates, displaces, options)
         GUIDANCE.register(name, kind)
         return build
 

@@ -88,7 +88,7 @@ class ResidualGuidance(PrimitiveGuidance):
     "residual",
     needs=(("demonstrations",), ("approach", "template")),
     label="residual RL",
-    colour="#d62728",
+    color="#d62728",
     demonstrates=True,
     displaces=True,
 )
@@ -101,7 +101,7 @@ def residual(prior: PriorKnowledge) -> Diagram:
     "safe_residual",
     needs=(("demonstrations", "keep_out"),),
     label="safe residual RL",
-    colour="#ff7f0e",
+    color="#ff7f0e",
     demonstrates=True,
     displaces=True,
 )

@@ -48,8 +48,8 @@ class ActiveConstraintFilter(Diagram):
     ):
         """Construct the diagram.
 
-        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. If the robot is
-        farther than `max_tracking_error` [m] from its command, the command waits.
+        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. While the robot is
+        farther than `max_tracking_error` [m] from its command, the last command is repeated.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -89,7 +89,7 @@ class ActiveConstraintFilter(Diagram):
 class SctGuidance(Guidance):
     """Shared control: input mapping, then active constraints, both of the state machine's state.
 
-    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the larger of metres and
+    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the larger of meters and
     radians from the projection, 0 inside. In addition to the ports of all guidance it exports ``state``,
     ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
@@ -113,7 +113,7 @@ class SctGuidance(Guidance):
             input_mapping: Second template that maps the inputs, in its initial state, instead of `template`. The active
                 constraints are then a safety filter, for example for a plain end-effector velocity.
             active_constraints: False commands the requested pose without constraints.
-            max_tracking_error: Distance between the robot and its command beyond which the command waits [m].
+            max_tracking_error: Distance between robot and command beyond which the last command is repeated [m].
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -166,13 +166,13 @@ def _build_sct(
     )
 
 
-@register_guidance("sct", needs=(("template",),), label="RL-SCT", colour="#9467bd")
+@register_guidance("sct", needs=(("template",),), label="RL-SCT", color="#9467bd")
 def sct(prior: PriorKnowledge) -> SctGuidance:
     """Build RL-SCT: a few inputs through the template, followed by its active constraints."""
     return _build_sct(prior, None, is_constrained_by_default=True)
 
 
-@register_guidance("none", needs=(("template",),), label="RL", colour="#7f7f7f")
+@register_guidance("none", needs=(("template",),), label="RL", color="#7f7f7f")
 def unguided(prior: PriorKnowledge) -> SctGuidance:
     """Build unguided RL: six inputs are the end effector's velocity, and the template only provides its state."""
     return _build_sct(prior, load_template("end_effector_velocity"), is_constrained_by_default=False)

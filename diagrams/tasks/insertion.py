@@ -24,7 +24,7 @@ from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
 
-MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimetres
+MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimeters
 
 
 class InsertionReset(ResetOptions):
@@ -42,7 +42,7 @@ class InsertionReset(ResetOptions):
     @classmethod
     def _is_near(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if value is not None and max(map(abs, value)) > MAX_GIVEN_OFFSET:
-            raise ValueError(f"give x and y in metres, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}")
+            raise ValueError(f"give x and y in meters, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}")
         return value
 
 

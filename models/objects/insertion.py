@@ -9,7 +9,7 @@ MIN_CONTACT_FORCE = 0.5  # smallest force of a plug in contact [N]
 # effect of an action, which the measured pose of a plug on a rim does not.
 LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
-# ρ [m², rad²]; the thesis's 1e-8, (0.1 mm)², is large for demonstrations that vary by a millimetre.
+# ρ [m², rad²]; the thesis's 1e-8, (0.1 mm)², is large for demonstrations that vary by a millimeter.
 HISTORY_VARIANCE = 1e-11
 
 # Standard deviation of a hand's repeatability [x y z Rz Ry Rx], added to the demonstrations' covariance.

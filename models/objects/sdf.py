@@ -109,7 +109,7 @@ def visual(name: str, pose: str, geometry: str, color: str) -> str:
 def model(
     name: str,
     mass: float,
-    centre: Sequence[float],
+    center: Sequence[float],
     radius_of_gyration: float,
     contents: str,
     source: str = "guiderail.models.objects",
@@ -119,7 +119,7 @@ def model(
     Args:
         name: Name of the model and the link.
         mass: Mass [kg].
-        centre: Centre of mass (3,) [m].
+        center: Center of mass (3,) [m].
         radius_of_gyration: Radius of gyration [m].
         contents: Collision and visual elements.
         source: Module or file that the dimensions come from, named in a comment.
@@ -131,7 +131,7 @@ def model(
   <model name="{name}">
     <link name="{name}">
       <inertial>
-        <pose>{at(*centre)}</pose>
+        <pose>{at(*center)}</pose>
         <mass>{mass:g}</mass>
         <inertia><ixx>{inertia:.4g}</ixx><iyy>{inertia:.4g}</iyy><izz>{inertia:.4g}</izz>
           <ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia>

@@ -76,8 +76,8 @@ def measure_overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float,
     return thickest, where
 
 
-def compute_centre_of_mass(part: Part) -> np.ndarray:
-    """Return the centre of mass (3,) [m] of a part with uniform density."""
+def compute_center_of_mass(part: Part) -> np.ndarray:
+    """Return the center of mass (3,) [m] of a part with uniform density."""
     trimesh = require_module("trimesh")
     meshes = [trimesh.Trimesh(vertices, triangles, process=False) for vertices, triangles in part.bodies]
     volumes = np.array([mesh.volume for mesh in meshes])

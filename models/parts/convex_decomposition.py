@@ -1,7 +1,7 @@
 """Exact decomposition of a solid into convex pieces.
 
 Contact of a compliant mesh needs tetrahedra, of which a convex piece has few. An approximate decomposition would lose
-clearances of a tenth of a millimetre. The solid is therefore cut along its own faces at concave edges, and no surface
+clearances of a tenth of a millimeter. The solid is therefore cut along its own faces at concave edges, and no surface
 moves.
 """
 
@@ -18,12 +18,12 @@ _CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its
 _FLAT = 1e-2  # angle below which an edge does not count as concave [rad]
 _MAX_PLANES = 6  # planes tried at each cut
 _SMALLEST_FACE = 2e-4  # [mm²] Drake computes the plane of each face, and fails at 5e-5
-_DIGITS = 9  # digits of metres in an OBJ file; a face may only be flat before it is rounded
-_SCALE = 1e3  # from metres to millimetres, for which the tolerances of manifold3d are meant
+_DIGITS = 9  # digits of meters in an OBJ file; a face may only be flat before it is rounded
+_SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
 
 def to_manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
-    """Return a `manifold3d.Manifold` in millimetres from vertices (V, 3) [m] and triangles (T, 3)."""
+    """Return a `manifold3d.Manifold` in millimeters from vertices (V, 3) [m] and triangles (T, 3)."""
     manifold3d = require_module("manifold3d")
     mesh = manifold3d.Mesh64(np.ascontiguousarray(vertices * _SCALE), np.ascontiguousarray(triangles, dtype=np.uint64))
     mesh.merge()

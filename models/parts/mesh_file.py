@@ -1,4 +1,4 @@
-"""Mesh files of parts: read in metres and checked to be solids, and written with their SDF models."""
+"""Mesh files of parts: read in meters and checked to be solids, and written with their SDF models."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def find_unit(path: Path, given: str | None) -> str | None:
         raise InputError(f"there is no unit {given!r}: choose one of {', '.join(UNITS)}")
     known = _KNOWN.get(path.suffix.lower())
     if known and given not in (None, known):
-        raise InputError(f"{path.name} is read in metres, as its format defines: remove --unit {given}")
+        raise InputError(f"{path.name} is read in meters, as its format defines: remove --unit {given}")
     return known or given
 
 
@@ -171,9 +171,9 @@ def part_sdf(
     surfaces: Sequence[Surface],
     *,
     mass: float,
-    centre: Sequence[float],
+    center: Sequence[float],
     gyration: float,
-    colour: str,
+    color: str,
 ) -> str:
     """Return an SDF model of one link `name` with collision geometry `piece_0`, ….
 
@@ -182,13 +182,13 @@ def part_sdf(
         visual_file: OBJ file of the visual geometry.
         surfaces: Collision geometry; a compliant mesh is convex, a rigid one may be any mesh.
         mass: Mass [kg].
-        centre: Centre of mass (3,) [m].
+        center: Center of mass (3,) [m].
         gyration: Radius of gyration [m].
-        colour: Colour as "r g b a".
+        color: Color as "r g b a".
     """
-    contents = visual("visual", at(), mesh(visual_file), colour)
+    contents = visual("visual", at(), mesh(visual_file), color)
     for number, surface in enumerate(surfaces):
         geometry = mesh(surface.file) if surface.modulus is None else convex_mesh(surface.file)
         material = ContactMaterial(surface.friction, surface.modulus, dissipation=surface.dissipation)
         contents += collision(f"piece_{number}", at(), geometry, material)
-    return model(name, mass, centre, gyration, contents, source="guiderail from task.yaml")
+    return model(name, mass, center, gyration, contents, source="guiderail from task.yaml")

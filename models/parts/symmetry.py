@@ -53,13 +53,13 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
 
 
 def _outline(bodies: Sequence[Any], height: float) -> Any:
-    """Return the section of a part at a height [m], in millimetres."""
+    """Return the section of a part at a height [m], in millimeters."""
     sections = [body.slice(1e3 * height) for body in bodies]
     return require_module("manifold3d").CrossSection.batch_boolean(sections, require_module("manifold3d").OpType.Add)
 
 
 def _hole(bodies: Sequence[Any], height: float, radius: float) -> Any:
-    """Return the opening of a part around the axis at a height [m], in millimetres."""
+    """Return the opening of a part around the axis at a height [m], in millimeters."""
     return require_module("manifold3d").CrossSection.circle(radius, 64) - _outline(bodies, height)
 
 

@@ -8,7 +8,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 TOLERANCE = 1e-9
-"""Largest accepted violation of a command, in the unit of a constraint's c (1 nm if that is metres)."""
+"""Largest accepted violation of a command, in the unit of a constraint's c (1 nm if that is meters)."""
 
 
 class LinearConstraints:

@@ -1,7 +1,7 @@
 """Gains from a policy's action in [−1, 1] to null-space units, per output.
 
 The null-space projector is about the size of the posterior's variance: a raw action of size one barely moves a
-demonstration in millimetres. Without active constraints the loop history → next point is linear, and two numbers that
+demonstration in millimeters. Without active constraints the loop history → next point is linear, and two numbers that
 describe a gain follow from it exactly, for the action repeat that is used:
 
 - authority: displacement by a constant action of ±1, in demonstration standard deviations;

@@ -1,7 +1,7 @@
 """Quadratic program of a constrained primitive in least-norm form, and its solvers.
 
 In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = ḠᵀSḠ, the Hessian is rank-deficient and badly scaled
-(largest eigenvalue 6e-6 for a connector): a first-order solver misses the bound by up to millimetres. With S = L Lᵀ the
+(largest eigenvalue 6e-6 for a connector): a first-order solver misses the bound by up to millimeters. With S = L Lᵀ the
 same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
 length, so that a solver's tolerance is a tolerance on the output itself.
 

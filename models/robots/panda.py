@@ -17,7 +17,7 @@ PANDA = register_robot(
         # It has joint torque feedback like the iiwa, but the resulting rotor inertia is not published: a guess.
         apparent_rotor_inertia=0.25,
         source=(
-            "Franka's interface specifications: kinematics, limits; Gaz et al., IEEE RA-L 4(4), 2019: masses, centres "
+            "Franka's interface specifications: kinematics, limits; Gaz et al., IEEE RA-L 4(4), 2019: masses, centers "
             "of mass, inertias; Franka's reflected rotor inertias of the FR3, its successor; joint damping is a guess"
         ),
     )

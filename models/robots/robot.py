@@ -108,7 +108,7 @@ class EndEffector:
         title: Name for users.
         model: URDF or SDF file.
         mount_frame: Frame that is mounted to the flange.
-        tool_center: Name of the frame P that a station commands: the centre of compliance, z towards the flange, fixed
+        tool_center: Name of the frame P that a station commands: the center of compliance, z towards the flange, fixed
             to the mount.
         bodies: Names of all bodies, that of the mount first.
         X_FlangeMount: Pose of the mount on the flange turned by the robot's `tool_turn`.

@@ -26,7 +26,7 @@ UR5E = register_robot(
         # Elbow up.
         level_posture=(-0.24, -1.11, 1.54, -0.43, 1.33, 2.34),
         source=(
-            "Universal Robots' Denavit-Hartenberg parameters, masses, centres of mass, inertias and limits; rotor "
+            "Universal Robots' Denavit-Hartenberg parameters, masses, centers of mass, inertias and limits; rotor "
             "inertias and joint damping are guesses"
         ),
     )

@@ -261,7 +261,7 @@ class Funnel(PositionConstraint):
     frame: str  # F: frame of an object, or `world`
     radius_m: float  # radius within which the ceiling is flat
     height_m: float  # ceiling within radius_m
-    slope: float  # rise of the ceiling per metre of radius
+    slope: float  # rise of the ceiling per meter of radius
 
     def __post_init__(self) -> None:
         require(self.radius_m >= 0 and self.slope >= 0, "radius_m and slope must not be negative.")
@@ -339,9 +339,9 @@ def axes(frame: str, frames: Frames) -> RotationMatrix:
     return RotationMatrix() if frame == WORLD else frames[frame].rotation()
 
 
-def nearest_turn(angle: float, centre: float) -> float:
-    """Return the equivalent angle within half a turn of `centre` [rad]; NaN if an argument is not finite."""
-    turns = (angle - centre) / math.tau
+def nearest_turn(angle: float, center: float) -> float:
+    """Return the equivalent angle within half a turn of `center` [rad]; NaN if an argument is not finite."""
+    turns = (angle - center) / math.tau
     return angle - math.tau * round(turns) if math.isfinite(turns) else math.nan
 
 

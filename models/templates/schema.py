@@ -40,7 +40,7 @@ from guiderail.models.templates.transitions import TransitionDistance
 MAX_STATES = 30
 MAX_PARTS = 30  # mappings, constraints or transitions of one state
 MAX_EXPRESSION = 200  # characters
-MAX_NUMBER = 1e6  # in any unit of a template: metres, degrees, radians, seconds
+MAX_NUMBER = 1e6  # in any unit of a template: meters, degrees, radians, seconds
 
 _OPERATORS: dict[type, Callable[..., float]] = {
     ast.Add: operator.add,

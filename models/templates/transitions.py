@@ -18,7 +18,7 @@ class TransitionDistance(ABC):
     """Transition distance d_t, which decreases as the task progresses.
 
     Attributes:
-        unit: "m" or "deg", the unit of thresholds in a file; values are in metres or radians.
+        unit: "m" or "deg", the unit of thresholds in a file; values are in meters or radians.
     """
 
     unit: str = "m"

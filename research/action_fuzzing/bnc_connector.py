@@ -27,7 +27,7 @@ def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) 
     Args:
         dimensions: Dimensions of the connector.
         R_JP: Orientation of the plug in the jack's frame, (3, 3).
-        p_JP: Centre of the plug's mouth in the jack's frame, (3,) [m].
+        p_JP: Center of the plug's mouth in the jack's frame, (3,) [m].
 
     Returns:
         Both depths, 0 without penetration.

@@ -94,7 +94,7 @@ def campaign() -> Campaign:
     return Campaign(
         "Pouring",
         [
-            # Random inputs bring the arm to a joint limit when the mug is far off; the command waits there.
+            # Random inputs bring the arm to a joint limit when the mug is far off; the last command is repeated there.
             Case("sct", {"guidance": "sct", "mug_offset": MAX_MUG_OFFSET}, constrained=True, may_wait=True),
             Case("none", {"guidance": "none", "mug_offset": MAX_MUG_OFFSET}, constrained=False, limits={}),
         ],

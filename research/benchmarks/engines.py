@@ -25,7 +25,7 @@ from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 
 ENGINES = {"Drake": "gantry", "MuJoCo": "mujoco"}
-COLOURS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
+COLORS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
 TASKS = ("BncConnector", "GridClamp")
 OFFSETS = (0.8, 1.25, 2.0, 3.0)  # offsets of a plug on the rim [mm]
 MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
@@ -176,7 +176,7 @@ def draw(results: dict[str, Any], path: Path) -> Path:
         for engine in ENGINES:
             profile = results["profiles"][f"{task} {engine}"]
             for axis, key in zip(axes[row], ("height_mm", "push_n", "torque_nm"), strict=True):
-                axis.plot(profile["time"], profile[key], color=COLOURS[engine], label=engine)
+                axis.plot(profile["time"], profile[key], color=COLORS[engine], label=engine)
         for axis, label in zip(axes[row], ("height [mm]", "normal force [N]", "torque about z [Nm]"), strict=True):
             axis.set_ylabel(label)
             axis.set_xlabel(f"{task}: time [s]")
@@ -185,8 +185,8 @@ def draw(results: dict[str, Any], path: Path) -> Path:
     lever.clear()
     for name, levers in results["levers_mm"].items():
         nominal = name in ("MuJoCo", "Drake, modulus × 1")
-        colour = COLOURS.get(name.split(",")[0], "0.6")
-        lever.plot(results["offsets_mm"], levers, ".-", color=colour, alpha=1.0 if nominal else 0.5)
+        color = COLORS.get(name.split(",")[0], "0.6")
+        lever.plot(results["offsets_mm"], levers, ".-", color=color, alpha=1.0 if nominal else 0.5)
         lever.annotate(name, (results["offsets_mm"][-1], levers[-1]), fontsize=6)
     lever.set_xlabel("plug on the rim: offset [mm]")
     lever.set_ylabel("center of pressure [mm]")

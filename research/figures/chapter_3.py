@@ -64,8 +64,8 @@ def figure_3_4(out: Path) -> dict[str, Any]:
     for name, X_WF in frames.items():
         tips = [X_WF.translation() + 0.06 * X_WF.rotation().col(i) for i in range(3)]
         (u, v), *ends = task.camera().project(np.stack([X_WF.translation(), *tips]))
-        for (x, y), colour in zip(ends, ("red", "green", "blue"), strict=True):
-            axis.annotate("", (x, y), (u, v), arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6})
+        for (x, y), color in zip(ends, ("red", "green", "blue"), strict=True):
+            axis.annotate("", (x, y), (u, v), arrowprops={"arrowstyle": "->", "color": color, "linewidth": 1.6})
         axis.annotate(name, (u, v), xytext=(8, 10), textcoords="offset points", color="black", fontsize=9)
         rows.append({"frame": name} | dict(zip("xyz", X_WF.translation().tolist(), strict=True)))
     axis.set_axis_off()
@@ -80,7 +80,7 @@ def figure_3_7(out: Path, seeds: int = 5, episodes: int | None = None) -> dict[s
     values = {"success rate": [run["termination"] == "success" for run in runs]}
     values |= {"spill rate": [run["termination"] == "spill" for run in runs], "return": [run["return"] for run in runs]}
     for axis, (quantity, series) in zip(axes, values.items(), strict=True):
-        draw_runs(axis, series, colour=shade, label=f"{name} ({len(runs)} runs)")
+        draw_runs(axis, series, color=shade, label=f"{name} ({len(runs)} runs)")
         axis.set(xlabel="episode", ylabel=f"{quantity} (mean of 10)")
         if quantity.endswith("rate"):
             axis.set_ylim(-0.04, 1.04)
@@ -135,9 +135,9 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
     """Compare prior knowledge about pouring as a reward function and as a template, with the endings in training."""
     template = make_template(PouringConfig())
     collision = f"collision {TERMINAL['collision']:g}"
-    far = f"{APPROACH:g} per metre gained; turning about any axis -0.25 per radian; {collision}"
+    far = f"{APPROACH:g} per meter gained; turning about any axis -0.25 per radian; {collision}"
     near = (
-        f"{APPROACH:g} per metre gained; {NEAR_BONUS:g} per action within {1e3 * NEAR:g} mm; "
+        f"{APPROACH:g} per meter gained; {NEAR_BONUS:g} per action within {1e3 * NEAR:g} mm; "
         f"tilting towards the mug {TILT / 4:g} per radian, turning otherwise -0.25; {collision}"
     )
     found = _pouring(out, "sac", seeds, episodes, ("rl_shaped", "rl_sct_shaped"))
@@ -187,7 +187,7 @@ def _endings(out: Path, number: str, algorithm: str, seeds: int, episodes: int |
         runs = episodes_of(rows, method)
         label = f"{name} ({len(runs)} {'run' if len(runs) == 1 else 'runs'})"
         for axis, ending in zip(axes, ENDINGS, strict=True):
-            draw_runs(axis, [run["termination"] == ending for run in runs], colour=shade, label=label)
+            draw_runs(axis, [run["termination"] == ending for run in runs], color=shade, label=label)
     for axis, ending in zip(axes, ENDINGS, strict=True):
         axis.set(xlabel="episode", ylabel=f"{ending} rate (mean of 10)", xscale="log", ylim=(-0.04, 1.04))
         axis.xaxis.set_major_formatter("{x:g}")

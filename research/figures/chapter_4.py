@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.experiments.study import run_study
 from guiderail.tools.visualization.curves import draw_passage
-from guiderail.tools.visualization.style import colour, label, new_figure
+from guiderail.tools.visualization.style import color, label, new_figure
 from research.figures.runs import figure_study, learning_curves, numbers_of_seeds, save_results, settings_table
 from research.figures.thesis import TABLE_4_1
 
@@ -29,7 +29,7 @@ TASK, ACTION_REPEAT = "NarrowPassage", 5  # default control steps of an action
 METHODS = ("residual", "safe_residual", "kgrl")
 CONNECTOR = (
     "in simulation, on the gantry; a hidden offset of 1.0 to 1.5 mm per run and a few tenths per episode; the "
-    "preset tqc_contact, actions in x and y for ten control steps; the thesis's reward and 5 per millimetre of depth"
+    "preset tqc_contact, actions in x and y for ten control steps; the thesis's reward and 5 per millimeter of depth"
 )
 
 
@@ -114,8 +114,8 @@ def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
         values, vectors = np.linalg.eigh(covariance[1:, 1:] * scale[:, None] * scale)
         width, height = 4 * np.sqrt(values)
         angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
-        centre = mean[1:] * scale + mixture.center[1:]
-        axis.add_patch(Ellipse(tuple(centre), width, height, angle=angle, color="tab:blue", alpha=0.25, linewidth=0))
+        center = mean[1:] * scale + mixture.center[1:]
+        axis.add_patch(Ellipse(tuple(center), width, height, angle=angle, color="tab:blue", alpha=0.25, linewidth=0))
 
 
 def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
@@ -130,7 +130,7 @@ def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
     }.items():
         axis.annotate(text, point, xytext=(4, 0), textcoords="offset points", fontsize=8, va="center")
     fields = ("start", "goal", "goal_radius", "gap_x", "obstacle", "obstacle_radius", "zone_x")
-    rows = [{"quantity": field.replace("_", " "), "metres": str(getattr(geometry, field))} for field in fields]
+    rows = [{"quantity": field.replace("_", " "), "meters": str(getattr(geometry, field))} for field in fields]
     return save_results(out, name, figure, rows)
 
 
@@ -173,7 +173,7 @@ def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
             counted = summary(pd.DataFrame(episode_rows), COUNTED)
             rows.append({"method": label(kind), "action_repeat": action_repeat, **counted})
             for row in episode_rows if action_repeat == ACTION_REPEAT else ():
-                axis.plot(*row["measured"].T, ".", markersize=1.5, color=colour(kind), alpha=0.35)
+                axis.plot(*row["measured"].T, ".", markersize=1.5, color=color(kind), alpha=0.35)
     return {
         **save_results(out, "figure_4_4", figure, rows),
         **{

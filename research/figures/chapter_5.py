@@ -26,7 +26,7 @@ from guiderail.tools.experiments.study import each, run_study
 from guiderail.tools.visualization.camera import draw_frames, record_frames
 from guiderail.tools.visualization.curves import draw_passage
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
-from guiderail.tools.visualization.style import colour, label, new_figure
+from guiderail.tools.visualization.style import color, label, new_figure
 from research.figures.chapter_4 import ACTION_REPEAT, CONNECTOR, FORCE, LEARNED, TASK, figure_4_3, random_episodes
 from research.figures.runs import (
     episodes_of,
@@ -141,12 +141,12 @@ def figure_5_4(out: Path) -> dict[str, Any]:
     for index, (height, push) in enumerate(PUSHES):
         step = int(np.argmax(nominal[:, 1] > height))
         path, commanded, row = _run(env, (step, np.array([push, 0.0])))
-        colour = f"C{index}"
+        color = f"C{index}"
         pushed = nominal[step - 1] + [push, 0.0]
-        plane.plot(*np.vstack([pushed, path[step:]]).T, color=colour, linewidth=1.1)
+        plane.plot(*np.vstack([pushed, path[step:]]).T, color=color, linewidth=1.1)
         plane.plot(*np.vstack([nominal[step - 1], pushed]).T, "--", color="firebrick", linewidth=1.2)
         time.plot(
-            period * np.arange(step, len(path)), path[step:, 0], color=colour, label=f"{push:+.2f} m at y {height}"
+            period * np.arange(step, len(path)), path[step:, 0], color=color, label=f"{push:+.2f} m at y {height}"
         )
         rows.append(_recovery(height, push, step, nominal, path, commanded, row))
     env.close()
@@ -239,7 +239,7 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
     for axis, kind, count, words in ((axes[0], "kgrl", 1, "one motion"), (axes[1], "skgrl", 5, "five motions")):
         draw_passage(axis)
         for row in _explore_in_simulation(kind, THESIS_VARIANCE, ACTION_REPEATS[0], range(1), count):
-            axis.plot(*row["commanded"].T, linewidth=1, color=colour(kind) if count == 1 else None)
+            axis.plot(*row["commanded"].T, linewidth=1, color=color(kind) if count == 1 else None)
         axis.set_title(f"{label(kind)}, {words}")
     for action_repeat, shade in zip(ACTION_REPEATS, ("tab:blue", "tab:orange"), strict=True):
         for column, style in (("commanded", "o-"), ("measured", "x--")):
@@ -390,13 +390,13 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
                 time = env.unwrapped.trace.period * np.arange(1, len(row["commanded"]) + 1)
                 for output, name in enumerate("xy"):
                     axis = axes[output, index]
-                    axis.plot(time, 1e3 * row["commanded"][:, output], color=colour(kind), linewidth=0.8)
+                    axis.plot(time, 1e3 * row["commanded"][:, output], color=color(kind), linewidth=0.8)
                     axis.plot(time, 1e3 * row["measured"][:, output], color="0.5", linewidth=0.8)
                     axis.set(ylabel=f"{name} [mm]", xlabel="time [s]")
                 numbers = {key: row[key] for key in row if key.startswith(("jerk", "worst", "peak"))}
                 rows.append({"method": kind, **numbers})
         env.close()
-        axes[0, index].set_title(f"{label(kind)}: commanded, and measured in grey")
+        axes[0, index].set_title(f"{label(kind)}: commanded, and measured in gray")
     for axis in axes.flat:
         for bound in (-1e3 * ALIGNMENT, 1e3 * ALIGNMENT):
             axis.axhline(bound, color="firebrick", linewidth=0.8)

@@ -13,7 +13,7 @@ from guiderail.tools.experiments.study import each
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import colour, draw_runs, label, legend, new_figure, save_figure
+from guiderail.tools.visualization.style import color, draw_runs, label, legend, new_figure, save_figure
 from research.studies import study_path
 
 
@@ -72,15 +72,15 @@ def learning_curves(
         columns: Label of each column.
         shape: Rows and columns of panels.
         size: Size of the figure [inches].
-        lines: Label and colour of each method; those of its guidance by default.
+        lines: Label and color of each method; those of its guidance by default.
         window: Number of episodes that a point averages.
     """
-    lines = lines or {method: (label(method), colour(method)) for method in dict.fromkeys(rows["method"])}
+    lines = lines or {method: (label(method), color(method)) for method in dict.fromkeys(rows["method"])}
     figure, axes = new_figure(*shape, size)
     runs = {method: episodes_of(rows, method) for method in lines}
     for axis, (column, axis_label) in zip(axes.flat, columns.items(), strict=True):
         for method, (name, shade) in lines.items():
-            draw_runs(axis, [run[column] for run in runs[method]], colour=shade, label=name, window=window)
+            draw_runs(axis, [run[column] for run in runs[method]], color=shade, label=name, window=window)
         axis.set(xlabel="episode", ylabel=axis_label)
     if len(lines) > 1:
         legend(figure, axes.flat[0])

@@ -68,7 +68,7 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
         "times": recordings[0].times,
         "outputs": stacked("desired_pose"),
         "names": np.array(NAMES),
-        # Measured values are stored in single precision, a nanometre.
+        # Measured values are stored in single precision, a nanometer.
         "measured": stacked("pose").astype(np.float32),
         "wrench": stacked("wrench").astype(np.float32),
         "contact_force": stacked("contact_force")[..., 0].astype(np.float32),

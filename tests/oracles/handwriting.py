@@ -24,10 +24,10 @@ def path(letter: str, points: int = 2000) -> np.ndarray:
         if kind == "line":
             corners.append(np.array([x, y], dtype=float))
         else:
-            centre, start = np.array([x, y]), corners[-1]
+            center, start = np.array([x, y]), corners[-1]
             angles = np.radians(np.linspace(0, turn[0], 60)[1:])
-            arm = start - centre
-            corners += [centre + arm @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) for a in angles]
+            arm = start - center
+            corners += [center + arm @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) for a in angles]
     corners = np.array(corners)
     lengths = np.r_[0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))]
     at = np.linspace(0, lengths[-1], points)

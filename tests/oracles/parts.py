@@ -1,4 +1,4 @@
-"""Six plugs and sockets as STL files in millimetres, for which nothing is tuned.
+"""Six plugs and sockets as STL files in millimeters, for which nothing is tuned.
 
 Each pair is drawn assembled, with insertion along z from above. A plug that turns is drawn locked.
 """

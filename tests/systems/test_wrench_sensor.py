@@ -18,7 +18,7 @@ R_WAXES = RotationMatrix(RollPitchYaw(0.3, -0.2, 0.9))
 
 
 class SwingingTool:
-    """Pendulum with a bob welded to its rod at the wrist; the centre of compliance is off the centre of mass."""
+    """Pendulum with a bob welded to its rod at the wrist; the center of compliance is off the center of mass."""
 
     def __init__(self, time_constant=0.0):
         builder = DiagramBuilder()
@@ -33,14 +33,14 @@ class SwingingTool:
             rod.body_frame(), self.tool.body_frame(), RigidTransform(RollPitchYaw(0.4, 0.1, -0.3), [0.0, 0.1, -0.4])
         )
         self.X_ToolP = RigidTransform(RollPitchYaw(0.2, 0.5, 0.1), [0.01, -0.03, -0.12])
-        centre = plant.AddFrame(FixedOffsetFrame("P", self.tool.body_frame(), self.X_ToolP))
+        center = plant.AddFrame(FixedOffsetFrame("P", self.tool.body_frame(), self.X_ToolP))
         plant.Finalize()
-        self.sensor = builder.AddSystem(WrenchSensor(plant, wrist, [self.tool], centre, R_WAXES, PERIOD, time_constant))
+        self.sensor = builder.AddSystem(WrenchSensor(plant, wrist, [self.tool], center, R_WAXES, PERIOD, time_constant))
         self.sensor.connect(builder, plant)
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
         self.plant_context = plant.GetMyMutableContextFromRoot(self.context)
-        self.centre = centre
+        self.center = center
 
     def push(self, force, torque):
         applied = ExternallyAppliedSpatialForce()
@@ -64,7 +64,7 @@ def test_wrench_is_zero_when_the_tool_swings_freely():
         np.testing.assert_allclose(swinging.wrench, np.zeros(6), atol=1e-9)
 
 
-def test_wrench_is_the_push_at_the_centre_of_a_swinging_tool():
+def test_wrench_is_the_push_at_the_center_of_a_swinging_tool():
     swinging = SwingingTool()
     swinging.joint.set_angle(swinging.plant_context, 0.5)
     force, torque = np.array([1.0, -2.0, 3.0]), np.array([0.1, 0.2, -0.3])
@@ -100,7 +100,7 @@ def test_constructor_refuses_arguments_out_of_range(period, time_constant):
     swinging = SwingingTool()
     wrist = swinging.plant.GetJointByName("rod_welds_to_tool")
     with pytest.raises(InputError):
-        WrenchSensor(swinging.plant, wrist, [swinging.tool], swinging.centre, R_WAXES, period, time_constant)
+        WrenchSensor(swinging.plant, wrist, [swinging.tool], swinging.center, R_WAXES, period, time_constant)
 
 
 def test_constructor_refuses_a_tool_at_another_joint():
@@ -108,4 +108,4 @@ def test_constructor_refuses_a_tool_at_another_joint():
     rod = swinging.plant.GetBodyByName("rod")
     wrist = swinging.plant.GetJointByName("rod_welds_to_tool")
     with pytest.raises(InputError, match="child of"):
-        WrenchSensor(swinging.plant, wrist, [rod], swinging.centre, R_WAXES, PERIOD, 0.0)
+        WrenchSensor(swinging.plant, wrist, [rod], swinging.center, R_WAXES, PERIOD, 0.0)

@@ -165,7 +165,7 @@ def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
         ),
         ((ObservationTerm("pose", scale=[1.0, 2.0, 3.0]),), "the scale .* is a finite number, or 2 of them, not"),
         ((ObservationTerm("pose", scale="a"),), "the scale .* is a finite number, or 2 of them, not 'a'"),
-        ((ObservationTerm("pose", centre=np.inf),), "the centre .* is a finite number, or 2 of them, not inf"),
+        ((ObservationTerm("pose", center=np.inf),), "the center .* is a finite number, or 2 of them, not inf"),
         (
             (ObservationTerm("pose", entries=(0, 5)),),
             "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not",
@@ -180,7 +180,7 @@ def test_invalid_observation_term_is_refused(observed, says):
         make_env("lab/Own", guidance="kmp")
 
 
-def test_observation_is_centred_and_scaled_by_entry():
+def test_observation_is_centered_and_scaled_by_entry():
     declare(observation_terms=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
     env = make_env("lab/Own", guidance="kmp")
     seen, _ = env.reset(seed=0)

@@ -123,7 +123,7 @@ def create_task(
         str, option(f"{POSE}: motion of the plug's mesh to the assembled pose [unit of the meshes, degrees].")
     ] = "0,0,0,0,0,0",
     axis: Annotated[str, option("Direction in which the plug is removed: +x, -x, +y, -y, +z or -z.")] = "+z",
-    centre: Annotated[str | None, option("x,y,z of a point on the axis.  [default: the plug's center of mass]")] = None,
+    center: Annotated[str | None, option("x,y,z of a point on the axis.  [default: the plug's center of mass]")] = None,
     turn: Annotated[
         float, option("Rotation of the plug at the bottom [degrees]; its mesh is drawn in the turned pose.")
     ] = 0.0,
@@ -148,7 +148,7 @@ def create_task(
         unit=ask_unit((plug, socket), unit),
         plug_pose=cli.parse_floats(plug_pose, 6, "--plug-pose"),
         axis=axis,
-        centre=None if centre is None else cli.parse_floats(centre, 3, "--centre"),
+        center=None if center is None else cli.parse_floats(center, 3, "--center"),
         turn=turn,
         force_limit=force_limit,
         friction=friction,

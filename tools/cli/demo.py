@@ -19,7 +19,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume
 from guiderail.tools.visualization.curves import draw_passage
-from guiderail.tools.visualization.style import colour, new_figure, save_figure
+from guiderail.tools.visualization.style import color, new_figure, save_figure
 
 HELD_OUT = 10  # number of held-out episodes
 SEED = 1_000_000  # seed of the first of them
@@ -119,12 +119,12 @@ def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
     figure, ((plane, curve),) = new_figure(1, 2, (11, 5.2))
     draw_passage(plane, named=True)
     for index, path in enumerate(after["measured"]):
-        plane.plot(*path.T, color=colour("skgrl"), linewidth=1.2, label="" if index else "after learning")
+        plane.plot(*path.T, color=color("skgrl"), linewidth=1.2, label="" if index else "after learning")
     plane.plot(*before["measured"][0].T, color="black", linewidth=1.2, label="before learning")
     plane.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
     rows = RunFolder(out).episodes()
     episodes = np.arange(1, len(rows) + 1)
-    curve.plot(episodes, rows["return"], "o-", markersize=3, color=colour("skgrl"), label="return")
+    curve.plot(episodes, rows["return"], "o-", markersize=3, color=color("skgrl"), label="return")
     curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="of it from the obstacle")
     curve.axhline(before["return"].mean(), color="black", linewidth=0.8, linestyle=":", label="return before learning")
     curve.set(xlabel="training episode")

@@ -37,7 +37,7 @@ def import_recording(
         source: File or folder.
         out: File to write, .npz or .csv; it must not exist.
         signal: ROS topic or LeRobot feature; by default the only one with suitable data. Not for CSV files.
-        target: Pose of the task's target in the recording's frame, [x y z] in metres and [rx ry rz] in degrees.
+        target: Pose of the task's target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees.
         rate: Sampling rate of the result [1/s]; that of the recording by default.
         csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
 

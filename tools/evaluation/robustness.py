@@ -187,7 +187,7 @@ def _is_default(axis: Axis, resolved: Environment) -> bool:
 
 COLUMNS = 4
 SPACING = 0.06  # distance between the markers of two policies, as a fraction of that between two values
-COLOURS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3aa6a6")
+COLORS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3aa6a6")
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
@@ -202,8 +202,8 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     bands = -(-len(axes) // columns)
     size = (max(3.2 * columns, 6.4, 1.6 * table["policy"].nunique()), 3.6 * bands + 0.5)
     figure, panels = new_figure(2 * bands, columns, size)
-    colours = dict(zip(dict.fromkeys(table["policy"]), COLOURS * 9, strict=False))
-    order = {name: position for position, name in enumerate(colours)}
+    colors = dict(zip(dict.fromkeys(table["policy"]), COLORS * 9, strict=False))
+    order = {name: position for position, name in enumerate(colors)}
     for number, name in enumerate(axes):
         success, force = (panels[2 * (number // columns) + part, number % columns] for part in (0, 1))
         of_axis = table[table["axis"] == name]
@@ -212,12 +212,12 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
             # Shifted sideways, because lines of equal success rates would cover each other.
             shift = SPACING * (order[policy] - (len(order) - 1) / 2)
             x = [positions[value] + shift for value in of_policy["value"]]
-            rate, colour = of_policy["success_rate"], colours[policy]
+            rate, color = of_policy["success_rate"], colors[policy]
             bars = [rate - of_policy["success_low"], of_policy["success_high"] - rate]
             text = policy.replace("$", r"\$")
-            success.errorbar(x, rate, yerr=bars, color=colour, marker="o", markersize=3, capsize=2, label=text)
-            force.plot(x, of_policy["peak_force_mean"], color=colour)
-            force.plot(x, of_policy["peak_force"], ".", color=colour)
+            success.errorbar(x, rate, yerr=bars, color=color, marker="o", markersize=3, capsize=2, label=text)
+            force.plot(x, of_policy["peak_force_mean"], color=color)
+            force.plot(x, of_policy["peak_force"], ".", color=color)
         for panel in (success, force):
             panel.set_xticks(list(positions.values()), [f"{value:.3g}" for value in positions])
             trained = of_axis["trained"].iloc[0]

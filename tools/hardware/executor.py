@@ -235,7 +235,7 @@ class SkillExecutor:
         }
         if outcome.steps:
             distance, angle = pose_distance(self.trace.measured[-1], np.zeros(6))
-            metadata |= {"millimetres_from_target": distance / MM, "degrees_from_target": angle / DEGREE}
+            metadata |= {"millimeters_from_target": distance / MM, "degrees_from_target": angle / DEGREE}
             metadata["peak_force"] = float(self.trace.force.max())
             log(f"ended {distance / MM:.1f} mm and {angle / DEGREE:.1f} degrees from the nominal target")
         log(f"{outcome.description}, after {outcome.steps} control steps: {self.write(folder, metadata)}")

@@ -19,7 +19,7 @@ from guiderail.models.parts.assembly_check import (
     MAX_RESTING_OVERLAP,
     InsertionMotion,
     check_target,
-    compute_centre_of_mass,
+    compute_center_of_mass,
     find_obstructions,
     make_solids,
     measure_side_clearance,
@@ -79,7 +79,7 @@ class Contact:
 
 
 def read_parts(
-    plug: Path, socket: Path, unit: str | None, plug_pose: Sequence[float], axis: str, centre: Sequence[float] | None
+    plug: Path, socket: Path, unit: str | None, plug_pose: Sequence[float], axis: str, center: Sequence[float] | None
 ) -> tuple[Part, Part]:
     """Return both parts in the target frame: z points out of the socket, the origin is at the plug's lower end.
 
@@ -89,7 +89,7 @@ def read_parts(
         unit: Unit of both files; None if their formats state it.
         plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the files' unit, [rx ry rz] in degrees.
         axis: Direction in which the plug is removed, in the socket's file.
-        centre: Point on the axis, in the socket's file; the plug's center of mass by default.
+        center: Point on the axis, in the socket's file; the plug's center of mass by default.
 
     Raises:
         InputError: If a file cannot be used, or an argument is invalid.
@@ -110,9 +110,9 @@ def read_parts(
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
     first, second = (part.transform(to_target, np.zeros(3)) for part in (first, second))
-    origin = np.array([*compute_centre_of_mass(first)[:2], first.bounds[0, 2]])
-    if centre is not None:
-        origin[:2] = (to_target @ (np.asarray(centre, dtype=float) * scale))[:2]
+    origin = np.array([*compute_center_of_mass(first)[:2], first.bounds[0, 2]])
+    if center is not None:
+        origin[:2] = (to_target @ (np.asarray(center, dtype=float) * scale))[:2]
     return first.transform(np.eye(3), -origin), second.transform(np.eye(3), -origin)
 
 
@@ -130,7 +130,7 @@ def create_task(
     unit: str | None = None,
     plug_pose: Sequence[float] = (0.0,) * 6,
     axis: str = "+z",
-    centre: Sequence[float] | None = None,
+    center: Sequence[float] | None = None,
     turn: float = 0.0,
     force_limit: float = COLLISION_FORCE,
     friction: float = 0.2,
@@ -145,7 +145,7 @@ def create_task(
         unit: See `read_parts`.
         plug_pose: See `read_parts`.
         axis: See `read_parts`.
-        centre: See `read_parts`.
+        center: See `read_parts`.
         out: Folder; it must not exist.
         turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; drawn turned.
         force_limit: Contact force that ends an episode as a collision [N].
@@ -160,7 +160,7 @@ def create_task(
         raise InputError(f"{out} already exists: name another folder with --out, or remove it")
     check_writable(out)
     _check_arguments(friction, scenario)
-    parts = read_parts(plug, socket, unit, plug_pose, axis, centre)
+    parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     check_target(*parts)
     path = plan_motion(*parts, turn * DEGREE, CLEAR)
     clearance = measure_side_clearance(*parts)
@@ -200,7 +200,7 @@ def _snapping(plug: Part, socket: Part, path: InsertionMotion) -> frozenset[int]
         depth, height = max(ways)
         raise InputError(
             f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
-            f"{1e3 * depth:.2g} mm; give its rotation with --turn and --centre, or draw the part that deflects as a "
+            f"{1e3 * depth:.2g} mm; give its rotation with --turn and --center, or draw the part that deflects as a "
             "separate body"
         )
     return blocked
@@ -367,7 +367,7 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
             source=part.path.name,
             visual=f"{name}.obj",
             mass=round(max(1e-3, DENSITY * sum(solid.volume() for solid in make_solids(part)) * 1e-9), 6),
-            centre=tuple(np.round(middle, 6).tolist()),
+            center=tuple(np.round(middle, 6).tolist()),
             gyration=round(float(np.sqrt(((vertices - middle) ** 2).sum(axis=1).mean())), 6),
             pieces=tuple(pieces),
         )

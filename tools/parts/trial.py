@@ -208,8 +208,8 @@ def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) ->
     for name, part in (("plug", file.plug), ("socket", file.socket)):
         _show(meshcat, f"/{name}/seen", folder / part.visual, _SOLID[name])
         for piece in part.pieces:
-            colour = Rgba(*rng.uniform(0.25, 0.95, 3), 1.0)
-            _show(meshcat, f"/{name}/contact/{Path(piece.file).stem}", folder / piece.file, colour)
+            color = Rgba(*rng.uniform(0.25, 0.95, 3), 1.0)
+            _show(meshcat, f"/{name}/contact/{Path(piece.file).stem}", folder / piece.file, color)
         meshcat.SetProperty(f"/{name}/contact", "visible", False)
     animation = MeshcatAnimation(frames_per_second=1.0 / CONTROL_PERIOD)
     poses: Any = trial.recording["pose"]
@@ -222,10 +222,10 @@ def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) ->
     page.write_text(meshcat.StaticHtml(), encoding="utf-8")
 
 
-def _show(meshcat: Any, path: str, file: Path, colour: Any) -> None:
+def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
     corners = _SCALE * triangles_of(file).reshape(-1, 3)
     triangles = [SurfaceTriangle(3 * i, 3 * i + 1, 3 * i + 2) for i in range(len(corners) // 3)]
-    meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), colour)
+    meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), color)
 
 
 MAX_SESSIONS = 3  # sessions of five attempts, until five attempts have seated the plug

@@ -11,7 +11,7 @@ from guiderail.models.objects.narrow_passage import demonstrations as narrow_pas
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.tools.evaluation.metrics import VIOLATION, WORDS, episodes_to_convergence
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.visualization.style import colour, legend_above, new_figure, rolling, save_figure
+from guiderail.tools.visualization.style import color, legend_above, new_figure, rolling, save_figure
 
 
 def draw_passage(axis: Axes, demonstrations: bool = True, *, named: bool = False) -> None:
@@ -63,7 +63,7 @@ def plot_run(run: Path) -> Path:
         raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train again")
     episodes = np.arange(1, len(rows) + 1)
     guidance = config.environment.get("guidance", "")
-    line = colour(guidance)
+    line = color(guidance)
 
     figure, axes = new_figure(2, 3, (13, 6.4))
     success, returns, terms, *pairs = axes.flat

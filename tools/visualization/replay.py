@@ -48,7 +48,7 @@ class Side:
 
     name: str
     label: str
-    colour: tuple[float, ...]
+    color: tuple[float, ...]
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
@@ -102,14 +102,14 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
             unit, scale = violation_unit(constraints, base.trace.measured.shape[1])
             of_side.append(motion.data() | {"outcome": outcome(row), "numbers": _format_numbers(row, unit, scale)})
             path = scene.to_world(base.trace.measured.copy())
-            _draw(meshcat, f"/guiderail/{side.name}/{index}", path, 2.0 * scene.line_radius, side.colour)
-        recorded.append({"name": side.name, "colour": _css(side.colour), "rgba": side.colour, "episodes": of_side})
-    for name, lines, radius, colour in (
+            _draw(meshcat, f"/guiderail/{side.name}/{index}", path, 2.0 * scene.line_radius, side.color)
+        recorded.append({"name": side.name, "color": _css(side.color), "rgba": side.color, "episodes": of_side})
+    for name, lines, radius, color in (
         ("demonstrations", [scene.to_world(d) for d in scene.demonstrations], scene.line_radius, GREY),
         ("constraint", scene.constraint, 2.0 * scene.line_radius, RED),
     ):
         for index, points in enumerate(lines):
-            _draw(meshcat, f"/guiderail/{name}/{index}", points, radius, colour)
+            _draw(meshcat, f"/guiderail/{name}/{index}", points, radius, color)
     for item in ("/Grid", "/Axes"):
         meshcat.SetProperty(item, "visible", False)
     views = dict(scene.arm_views) if episode.environment.get("station") == "arm" else {}
@@ -160,16 +160,16 @@ def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:
     return f"return {row['return']:.1f}; largest constraint violation: {', '.join(violations)}"
 
 
-def _css(colour: tuple[float, ...]) -> str:
-    return f"rgb({','.join(str(round(255 * c)) for c in colour[:3])})"
+def _css(color: tuple[float, ...]) -> str:
+    return f"rgb({','.join(str(round(255 * c)) for c in color[:3])})"
 
 
-def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, colour: tuple[float, ...]) -> None:
+def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, color: tuple[float, ...]) -> None:
     """Draw a path as a tube, because browsers draw all lines one pixel wide; a single point is not drawn."""
     if len(points) < 2:
         return
     vertices, faces = tube(points, radius)
-    meshcat.SetTriangleMesh(name, vertices.T, faces.T, Rgba(*colour))
+    meshcat.SetTriangleMesh(name, vertices.T, faces.T, Rgba(*color))
 
 
 def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray, np.ndarray]:

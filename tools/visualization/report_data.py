@@ -22,7 +22,7 @@ from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_table
-from guiderail.tools.visualization.style import colour, is_demonstrated, label
+from guiderail.tools.visualization.style import color, is_demonstrated, label
 
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # evaluated together with a run's policy
@@ -130,11 +130,11 @@ class Gathered:
                 found.setdefault(run.method, []).append(run)
         return found
 
-    def colours(self, task: str) -> dict[str, str]:
-        """A colour for each method: its guidance's own where no two methods have the same."""
+    def colors(self, task: str) -> dict[str, str]:
+        """A color for each method: its guidance's own where no two methods have the same."""
         kinds = {name: str(runs[0].config.environment.get("guidance", "")) for name, runs in self.methods(task).items()}
         if len(set(kinds.values())) == len(kinds):
-            return {name: colour(kind) for name, kind in kinds.items()}
+            return {name: color(kind) for name, kind in kinds.items()}
         return {name: PALETTE[index % len(PALETTE)] for index, name in enumerate(kinds)}
 
 

@@ -23,11 +23,11 @@ def curve(gathered: Gathered, task: str, column: str, label: str) -> str:
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
-        colours = gathered.colours(task)
+        colors = gathered.colors(task)
         for (name, runs), dash in zip(gathered.methods(task).items(), cycle(DASHES), strict=False):
             values = [run.episodes[column].to_numpy(float) for run in runs]
-            shade, text = colours[name], _label(name, runs)
-            draw_runs(axis, values, colour=shade, label=text, band=bootstrap_band, linestyle=dash)
+            shade, text = colors[name], _label(name, runs)
+            draw_runs(axis, values, color=shade, label=text, band=bootstrap_band, linestyle=dash)
         axis.set(xlabel="training episode", ylabel=f"{label}, mean of {WINDOW}")
         if column == "success":
             axis.set_ylim(-0.04, 1.04)
@@ -40,7 +40,7 @@ def survival_curve(gathered: Gathered, task: str) -> str:
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
-        colours = gathered.colours(task)
+        colors = gathered.colors(task)
         for (name, runs), dash in zip(gathered.methods(task).items(), cycle(DASHES), strict=False):
             after, lengths = (
                 [episodes_to_convergence(run.episodes) for run in runs],
@@ -48,9 +48,9 @@ def survival_curve(gathered: Gathered, task: str) -> str:
             )
             steps, left = survival(after, lengths)
             steps, left = np.append(steps, max(lengths)), np.append(left, left[-1])
-            axis.step(steps, left, where="post", color=colours[name], linestyle=dash, label=_label(name, runs))
+            axis.step(steps, left, where="post", color=colors[name], linestyle=dash, label=_label(name, runs))
             if None in after:
-                axis.plot(steps[-1], left[-1], "|", color=colours[name], markersize=9)
+                axis.plot(steps[-1], left[-1], "|", color=colors[name], markersize=9)
         axis.set(xlabel="training episodes", ylabel="fraction not converged", ylim=(-0.04, 1.04))
         axis.set_xlim(left=0)
         legend_above(axis, columns=2)

@@ -26,9 +26,9 @@ def label(guidance: str) -> str:
     return GUIDANCE.get(guidance).label if guidance in GUIDANCE.names() else guidance
 
 
-def colour(guidance: str) -> str:
+def color(guidance: str) -> str:
     """Return the color of a guidance."""
-    return GUIDANCE.get(guidance).colour if guidance in GUIDANCE.names() else "#8c564b"
+    return GUIDANCE.get(guidance).color if guidance in GUIDANCE.names() else "#8c564b"
 
 
 LAYOUT: str | None = "constrained"  # layout engine of Matplotlib that makes room for labels
@@ -69,7 +69,7 @@ def draw_runs(
     axis: Axes,
     runs: Sequence[Sequence[float] | np.ndarray],
     *,
-    colour: str,
+    color: str,
     label: str,
     window: int = WINDOW,
     band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = range_band,
@@ -80,7 +80,7 @@ def draw_runs(
     Args:
         axis: Axes.
         runs: Values over the episodes of each run; longer runs are cut to the shortest.
-        colour: Color of line and band.
+        color: Color of line and band.
         label: Label for a legend.
         window: Episodes of the moving mean.
         band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each.
@@ -90,8 +90,8 @@ def draw_runs(
     smooth = np.stack([rolling(run, window)[:length] for run in runs])
     episodes = np.arange(1, length + 1)
     if len(runs) > 1:
-        axis.fill_between(episodes, *band(smooth), color=colour, alpha=0.15, linewidth=0)
-    axis.plot(episodes, smooth.mean(axis=0), color=colour, label=label, **line)
+        axis.fill_between(episodes, *band(smooth), color=color, alpha=0.15, linewidth=0)
+    axis.plot(episodes, smooth.mean(axis=0), color=color, label=label, **line)
 
 
 def legend(figure: Figure, axis: Axes) -> None:

@@ -19,7 +19,7 @@ from guiderail.systems.reward_system import RewardTerm
 OBSERVATIONS = ("state", "center_of_pressure")
 
 # The torques are small, and they indicate on which side of the rim the plug stands: 0.02 Nm at 4 N.
-POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
+POSE_CENTER = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
@@ -27,7 +27,7 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 def observation_terms(
     observation: str,
     num_steps: int = NUM_STEPS,
-    centre: np.ndarray = POSE_CENTRE,
+    center: np.ndarray = POSE_CENTER,
     scale: np.ndarray = POSE_SCALE,
     wrench_scale: np.ndarray = WRENCH_SCALE,
 ) -> tuple[ObservationTerm, ...]:
@@ -35,7 +35,7 @@ def observation_terms(
     half = 0.5 * num_steps * CONTROL_PERIOD
     state = (
         ObservationTerm("time", half, half),
-        ObservationTerm("pose", centre, scale),
+        ObservationTerm("pose", center, scale),
         ObservationTerm("wrench", 0.0, wrench_scale),
     )
     if observation == "state":

@@ -18,7 +18,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import (
     OBSERVATIONS,
-    POSE_CENTRE,
+    POSE_CENTER,
     POSE_SCALE,
     REWARDS,
     half_turn,
@@ -68,7 +68,7 @@ TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y, CENTER_OF_PRESSURE, COMMAND = 0, 3, 9, 10,
 # Parameters of `scripted_torque_search`, for the demonstrations "insert".
 GAIN = 1.5  # action per scaled contact torque
 PRESSING = (60, 185)  # control steps between which the demonstrations press on the rim
-SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTRE[2]) / POSE_SCALE[2]  # scaled height above which the plug is not inserted
+SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTER[2]) / POSE_SCALE[2]  # scaled height above which the plug is not inserted
 CONTACT_FORCE = 0.2  # scaled force along z above which the plug is in contact
 
 # Parameters of `scripted_center_of_pressure`, for the demonstrations "search".
@@ -101,7 +101,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     if not MAY_PRESS < time < HOLD_UNTIL:
         return np.zeros(2)
     command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
-    height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTRE[2], float(np.linalg.norm(lever))
+    height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTER[2], float(np.linalg.norm(lever))
     if height > ON_RIM and length > 0.0:
         command = command + STEP * lever / max(length, MM)
     return np.clip(command / REACH, -1.0, 1.0)

@@ -25,7 +25,7 @@ FILTERED_PAIRS = [
 ]
 
 # The task board has no collision geometry; the locked plug's mouth is a little below the jack's bottom.
-BOARD, BOARD_CLEARANCE, BOARD_COLOUR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]  # [m]
+BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]  # [m]
 LOCKED_HEIGHT = 0.6e-3  # [m]
 LOCKED_ANGLE = np.deg2rad(4.0)
 LOCKED_OFFSET = 1.0e-3  # [m] largest lateral offset of a locked plug
@@ -78,7 +78,7 @@ class BncWorkcell(MovableWorkcell):
         super().add_fixture(plant)
         depth, width, thickness = BOARD
         below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])
-        plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOUR)
+        plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOR)
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Allow contacts of barrel and bore, lugs and slots, and pad and seat only."""

@@ -86,7 +86,7 @@ it slides into them by itself; snapping in alone takes six of the ten newtons.""
 
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
-# Reward towards the holes' axis [1/m] and terminal reward of a collision. Steps are fractions of a millimetre, and a
+# Reward towards the holes' axis [1/m] and terminal reward of a collision. Steps are fractions of a millimeter, and a
 # policy that presses gently for long must not lose more than one that ends the episode at once.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
@@ -135,7 +135,7 @@ def _collision_cost(termination: np.ndarray) -> float:
 
 
 NUM_PLACES = 6  # pick-up places of clamps
-# Parallel jaws centre the clamp across the jaws, and not along them, which is x.
+# Parallel jaws center the clamp across the jaws, and not along them, which is x.
 ALONG_JAWS = 1.0 * MM  # half range of the six places' offsets
 ACROSS_JAWS = 0.2 * MM
 CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest offset of the table
@@ -191,8 +191,8 @@ def make_template() -> SharedControlTemplate:
     return load_template("grid_clamp")
 
 
-# Centre and scale of the observation [position, force].
-CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
+# Center and scale of the observation [position, force].
+CENTER = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 
 ON_TABLE = GridClampDimensions().peg_length  # height of the clamp while the pegs stand on the table [m]
@@ -217,7 +217,7 @@ def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> 
     lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in, with at
     most `snap_force` [N].
     """
-    position, force = observation[:3] * SCALE[:3] + CENTRE[:3], observation[3:] * SCALE[3:]
+    position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:] * SCALE[3:]
     command = position - force / STIFFNESS  # the impedance's spring separates it from the measured position
     if position[2] > ON_TABLE + NEAR:
         velocity = np.array([*(LANE_GAIN * (np.array([-LANE_ENDS, LANES[0]]) - position[:2])), -SPEED])
@@ -298,7 +298,7 @@ class GridClamp(InsertionTask):
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return the clamp's position in the hole's frame and the force."""
         first_three = (0, 1, 2)
-        return ObservationTerm("pose", CENTRE[:3], SCALE[:3], first_three), ObservationTerm(
+        return ObservationTerm("pose", CENTER[:3], SCALE[:3], first_three), ObservationTerm(
             "wrench", 0.0, SCALE[3:], first_three
         )
 

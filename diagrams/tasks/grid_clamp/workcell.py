@@ -43,7 +43,7 @@ class GridClampWorkcell(MovableWorkcell):
 
     Attributes:
         dimensions: Dimensions of clamp and table.
-        p_WG: Centre of the middle hole in the table's face, (3,) [m].
+        p_WG: Center of the middle hole in the table's face, (3,) [m].
         friction: Friction coefficient of pegs, holes and the table's face.
     """
 

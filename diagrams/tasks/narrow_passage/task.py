@@ -55,7 +55,7 @@ class NarrowPassageOptions(Options):
         round(DEFAULT_GEOMETRY.gap_x[1] - DEFAULT_GEOMETRY.gap_x[0], 9),
         ge=0.02,
         le=0.2,
-        description="width of the gap for the robot's centre [m]",
+        description="width of the gap for the robot's center [m]",
     )
     obstacle_radius: Number = Field(
         DEFAULT_GEOMETRY.obstacle_radius, ge=0.01, le=0.1, description="radius of the obstacles [m]"
@@ -147,7 +147,7 @@ BLOCKED_PROGRESS = 1e-4  # [m] along y
 def termination_terms(geometry: PassageGeometry, is_touching_collision: bool = False) -> list[TerminationTerm]:
     """Return the termination terms: success at the goal, and blocked at a wall without progress.
 
-    With `is_touching_collision` an episode also ends, with priority, when the robot's centre is in an obstacle of the
+    With `is_touching_collision` an episode also ends, with priority, when the robot's center is in an obstacle of the
     signal `obstacles`.
     """
 
@@ -205,7 +205,7 @@ def reference_trajectory() -> ReferenceTrajectory:
 class NarrowPassage(Task):
     """Pass the gap to the goal.
 
-    Rewards: "sparse" is the thesis's (4.22 to 4.25), "shaped" adds the distance gained towards the goal in centimetres.
+    Rewards: "sparse" is the thesis's (4.22 to 4.25), "shaped" adds the distance gained towards the goal in centimeters.
     Observations: "state" is the time in [−1, 1] (the thesis's policy state), "image" is 110 × 144 × 3.
     """
 

@@ -37,7 +37,7 @@ class Piece(Options):
         None, gt=0, description="hydroelastic modulus of a compliant convex mesh [Pa]; default: rigid"
     )
     friction: Number = Field(0.2, ge=0, le=2, description="friction coefficient of the surface, static and dynamic")
-    # A contact that is a micrometre too deep after a step would otherwise eject the plug: with 100 s/m nothing leaves a
+    # A contact that is a micrometer too deep after a step would otherwise eject the plug: with 100 s/m nothing leaves a
     # contact faster than 10 mm/s.
     dissipation: Number = Field(100.0, ge=0, description="Hunt-Crossley dissipation [s/m]")
 
@@ -48,7 +48,7 @@ class PartModel(Options):
     source: str = Field("", description="source file")
     visual: str = Field(description="OBJ file of the visual, in the target frame [m]")
     mass: Number = Field(gt=0, description="mass [kg]")
-    centre: Numbers = Field(min_length=3, max_length=3, description="centre of mass in the target frame [m]")
+    center: Numbers = Field(min_length=3, max_length=3, description="center of mass in the target frame [m]")
     gyration: Number = Field(gt=0, description="radius of gyration [m]")
     pieces: tuple[Piece, ...] = Field(min_length=1, description="collision meshes")
 

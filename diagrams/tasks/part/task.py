@@ -41,7 +41,7 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
+COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
@@ -108,9 +108,9 @@ class PartInsertion(DemonstratedInsertion):
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
-        centre = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
+        center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
-        return observation_terms(self.config.observation, self.num_steps, centre, scale, WRENCH_SCALE)
+        return observation_terms(self.config.observation, self.num_steps, center, scale, WRENCH_SCALE)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return the terms of `config.reward`."""
@@ -179,9 +179,9 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
             part.visual,
             part.pieces,
             mass=part.mass,
-            centre=part.centre,
+            center=part.center,
             gyration=part.gyration,
-            colour=COLOURS[name],
+            color=COLORS[name],
         )
         path = folder / f"{name}.sdf"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:

@@ -44,7 +44,7 @@ def _load(name: str, config: PouringConfig, input_speed: float, **others: float)
 
 
 def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
-    """The poses of a template's objects for a mug, or for where it is believed to be."""
+    """The poses of a template's objects for a mug at its actual or estimated position."""
     if "behind_mug" in template.frames:
         return {"behind_mug": X_TMug @ RigidTransform([0.0, template.parameters["behind_m"], 0.0])}
     return {"mug_tip": X_TMug}
@@ -52,7 +52,7 @@ def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[s
 
 MAX_MUG_OFFSET = 0.04  # [m] along x and y; beyond it the arm reaches few of the starts
 POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in the observation
-MAX_MUG_ERROR = 0.06  # [m] largest distance that an aimed Pour leads from the believed mug
+MAX_MUG_ERROR = 0.06  # [m] largest distance that an aimed Pour leads from the estimated mug position
 
 HARD: Mapping[str, Any] = {
     "aim": True,
@@ -87,10 +87,13 @@ class PouringOptions(Options):
         0.0, ge=0, le=MAX_MUG_OFFSET, description="largest sampled offset of the mug along x and y [m]"
     )
     mug_error_least: Number = Field(
-        0.0, ge=0, le=MAX_MUG_ERROR, description="least sampled distance between the mug and the believed mug [m]"
+        0.0, ge=0, le=MAX_MUG_ERROR, description="least sampled distance between actual and estimated mug position [m]"
     )
     mug_error_most: Number = Field(
-        0.0, ge=0, le=MAX_MUG_ERROR, description="largest sampled distance between the mug and the believed mug [m]"
+        0.0,
+        ge=0,
+        le=MAX_MUG_ERROR,
+        description="largest sampled distance between actual and estimated mug position [m]",
     )
     time_limit: Number = Field(15.0, ge=3.0, le=30.0, description="duration of an episode [s]")
     aim: bool = Field(False, description="allow to aim in Pour, and observe the error and the template's state")
@@ -139,14 +142,14 @@ class PouringReset(ResetOptions):
         None,
         min_length=3,
         max_length=3,
-        description="(x, y, z) of the upright thermos's tip in the frame of the believed mug [m]",
+        description="(x, y, z) of the upright thermos's tip in the frame of the estimated mug [m]",
     )
     mug_position: Numbers | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description="(x, y) of the believed mug from its nominal position [m]",
+        description="(x, y) of the estimated mug position from its nominal position [m]",
     )
     mug_error: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) from the mug to the believed mug [m]"
+        None, min_length=2, max_length=2, description="(x, y) from the actual to the estimated mug position [m]"
     )

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 def sample_mug_error(episode: np.random.Generator, options: PouringOptions, reset: PouringReset) -> np.ndarray:
-    """Sample (x, y) [m] from the mug to the believed mug, also if a reset's option replaces it.
+    """Sample (x, y) [m] from the mug to the estimated mug position, also if a reset's option replaces it.
 
     Raises:
         InputError: If the reset's option is farther than an aimed Pour leads.
@@ -135,10 +135,10 @@ def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
 
 def scripted_pour_blind(observation: np.ndarray) -> np.ndarray:
     """Return the inputs (3,) of `scripted_pour_aimed` for the estimated mug pose instead of the actual one."""
-    believed = np.array(observation, dtype=float)
-    believed[:2] -= POSITION_SCALE * MAX_MUG_ERROR * believed[ERROR]
-    believed[ERROR] = 0.0
-    return scripted_pour_aimed(believed)
+    estimated = np.array(observation, dtype=float)
+    estimated[:2] -= POSITION_SCALE * MAX_MUG_ERROR * estimated[ERROR]
+    estimated[ERROR] = 0.0
+    return scripted_pour_aimed(estimated)
 
 
 def _tilt(observation: np.ndarray) -> float:
@@ -196,7 +196,7 @@ class Pouring(Task):
         return self._scene_config
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Return the error of the believed mug, if Pour can be aimed."""
+        """Return the error of the estimated mug position, if Pour can be aimed."""
         if not self.options.aim:
             return {}
         self.episode_constants["mug_error"] = EpisodeConstant(builder, "mug_error", 2)
@@ -215,7 +215,7 @@ class Pouring(Task):
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return the tip's pose in the frame of the mug's tip, position in units of 0.2 m and a rotation vector.
 
-        If Pour can be aimed, the error of the believed mug and the template's state, from −1 to 1, follow.
+        If Pour can be aimed, the error of the estimated mug position and the template's state, from −1 to 1, follow.
         """
         tip = ObservationTerm("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3)
         return (
@@ -251,11 +251,11 @@ class Pouring(Task):
             if np.abs(p_TMug).max() > MAX_MUG_OFFSET:
                 raise InputError(f"the mug can be moved by {MAX_MUG_OFFSET} m along x and y: not more")
             error = sample_mug_error(episode, self.options, options)
-            # The believed mug stays within reach; the actual mug is moved.
-            believed, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
-            frames = frames_of(self._template, believed)
+            # The estimated mug position stays within reach; the actual mug is moved.
+            estimated, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
+            frames = frames_of(self._template, estimated)
             # Turned as in the template's first state, so that all kinds of guidance start from the same pose.
-            X_TP = self._template.project(self._template.initial_state, RigidTransform(believed @ p_MP), frames)
+            X_TP = self._template.project(self._template.initial_state, RigidTransform(estimated @ p_MP), frames)
             try:
                 station.set_pose(context, transform_to_pose(X_TP))
                 break
@@ -284,6 +284,6 @@ class Pouring(Task):
 
     def scene(self) -> Scene:
         """Return the drawing of the tip's paths."""
-        centre = self._scene_config.X_WT.translation()
+        center = self._scene_config.X_WT.translation()
         to_world = in_frame(self._scene_config.X_WT)
-        return Scene(to_world, viewpoint=viewpoint(centre + [0.25, -0.5, 0.25], centre), line_radius=0.001)
+        return Scene(to_world, viewpoint=viewpoint(center + [0.25, -0.5, 0.25], center), line_radius=0.001)

@@ -64,7 +64,7 @@ _TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and corre
 
 
 def poses(z: np.ndarray | float, yaw: np.ndarray | float) -> np.ndarray:
-    """Return upright poses (N, 6), [x y z Rz Ry Rx], on the centre line."""
+    """Return upright poses (N, 6), [x y z Rz Ry Rx], on the center line."""
     z, yaw = np.broadcast_arrays(np.atleast_1d(z), yaw)
     zero = np.zeros_like(z, dtype=float)
     return np.stack([zero, zero, z, yaw, zero, zero], axis=1)

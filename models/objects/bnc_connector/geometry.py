@@ -1,6 +1,6 @@
 """Geometry of a BNC bayonet connector at true scale: a jack with two lugs and a plug whose ring has two slots.
 
-Frames. The jack frame J lies at the bottom of the barrel's centre line, z along the barrel to its open end, x through
+Frames. The jack frame J lies at the bottom of the barrel's center line, z along the barrel to its open end, x through
 the lugs. The plug frame P lies in the plane of the ring's mouth, z from the mouth to the cable, x through the entries
 of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by minus `detent_angle`, and is locked at
 X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
@@ -30,12 +30,12 @@ BORE_SIDES = 24  # sides of the polygon that approximates the bore
 
 @dataclass(frozen=True)
 class BncDimensions:
-    """Dimensions in metres and radians; depths and heights of the slot are those of the lug's centre from the mouth."""
+    """Dimensions in meters and radians; depths and heights of the slot are those of the lug's center from the mouth."""
 
     barrel_radius: float = 4.825 * MM
     barrel_height: float = 10.0 * MM
     lug_radius: float = 0.975 * MM
-    lug_tip_radius: float = 5.5 * MM  # from the centre line to the end of a lug
+    lug_tip_radius: float = 5.5 * MM  # from the center line to the end of a lug
     lug_root_radius: float = 4.025 * MM  # a lug starts inside the barrel
     lug_depth: float = 5.5 * MM  # below the barrel's open end
 
@@ -74,7 +74,7 @@ class BncDimensions:
 
     @property
     def lug_height(self) -> float:
-        """Height of the lugs' centres in J."""
+        """Height of the lugs' centers in J."""
         return self.barrel_height - self.lug_depth
 
     @property

@@ -56,12 +56,12 @@ def jack_sdf(
     radius = equal_area_radius(d.barrel_radius, barrel_sides(d)) if equal_area else d.barrel_radius
     pad = (at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), cylinder(d.pad_radius, d.pad_thickness))
     lug_length = d.lug_tip_radius - d.lug_root_radius
-    lug_centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
+    lug_center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
     contents = collision("barrel", place, cylinder(radius, d.barrel_height), barrel_material)
     contents += visual("barrel_visual", place, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
-        lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
+        lug = (at(x=side * lug_center, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
         contents += collision(f"lug_{number}", *lug, lug_material) + visual(f"lug_{number}_visual", *lug, BRASS)
     return model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
 

@@ -2,7 +2,7 @@
 
 The demonstrator circles around the expected position of the jack with a light push, each of the five times a fifth of a
 turn further, and then inserts the plug. At every time of the search the five lie evenly on a circle: their mean is its
-centre, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
+center, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
 the same effect in every direction of the whole search.
 
 `python -m research.generate connector-search-demonstrations` records them again.

@@ -19,13 +19,13 @@ def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
     d = dimensions
     shape = Cylinder(d.barrel_radius, d.barrel_height)
     barrel = Surface("barrel", "bore", shape, friction, (0.0, 0.0, d.barrel_height / 2))
-    shape, centre = Cylinder(d.pad_radius, d.pad_thickness), d.barrel_height + d.pad_height - d.pad_thickness / 2
+    shape, center = Cylinder(d.pad_radius, d.pad_thickness), d.barrel_height + d.pad_height - d.pad_thickness / 2
     spring = Spring((0.0, 0.0, 1.0), PAD_STIFFNESS)
-    pad = Surface("pad", "pad", shape, PAD.friction, (0.0, 0.0, centre), spring=spring)
-    centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
+    pad = Surface("pad", "pad", shape, PAD.friction, (0.0, 0.0, center), spring=spring)
+    center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
     shape = Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius)
     lugs = [
-        Surface(f"lug_{number}", "slots", shape, friction, (side * centre, 0.0, d.lug_height), pitch=np.pi / 2)
+        Surface(f"lug_{number}", "slots", shape, friction, (side * center, 0.0, d.lug_height), pitch=np.pi / 2)
         for number, side in enumerate((1.0, -1.0))
     ]
     return [barrel, pad, *lugs]

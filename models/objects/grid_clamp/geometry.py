@@ -1,6 +1,6 @@
 """Geometry of a grid clamp with five pegs and of the part of a table with the holes.
 
-Frames. The table's frame G lies in its surface at the centre of the middle hole, z up. The clamp's frame C lies at the
+Frames. The table's frame G lies in its surface at the center of the middle hole, z up. The clamp's frame C lies at the
 tip of the middle peg, z up along the peg. The clamp has snapped in at X_GC = (0, 0, −`peg_length`), with its shoulder
 on the table.
 
@@ -30,7 +30,7 @@ NUM_VISUAL_SIDES = 12  # sides of a polygon in visual geometry
 
 @dataclass(frozen=True)
 class GridClampDimensions:
-    """Dimensions in metres; a radius is that of the circle inside the polygon, a depth is from the table's face."""
+    """Dimensions in meters; a radius is that of the circle inside the polygon, a depth is from the table's face."""
 
     peg_radius: float = 4.0 * MM
     peg_length: float = 12.0 * MM  # from the shoulder to the tip
@@ -68,7 +68,7 @@ class GridClampDimensions:
 
     @property
     def peg_positions(self) -> np.ndarray:
-        """Centres (5, 2) of the pegs in C and of the holes in G: the middle one, then the corners."""
+        """Centers (5, 2) of the pegs in C and of the holes in G: the middle one, then the corners."""
         corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
         return np.concatenate([np.zeros((1, 2)), self.spacing * corners])
 
@@ -88,7 +88,7 @@ def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
 
 
 def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """Return the collision mesh of a hole: wall, chamfer and face; the origin is the hole's centre in the face."""
+    """Return the collision mesh of a hole: wall, chamfer and face; the origin is the hole's center in the face."""
     d = dimensions
     return _lathe(
         [

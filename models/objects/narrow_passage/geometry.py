@@ -11,7 +11,7 @@ from guiderail.models.primitives import LinearConstraints
 
 @dataclass(frozen=True)
 class PassageGeometry:
-    """Positions and sizes in metres; the walls bound the position of the robot's centre.
+    """Positions and sizes in meters; the walls bound the position of the robot's center.
 
     Attributes:
         start, goal: Start and goal (x, y) of the robot.
@@ -25,7 +25,7 @@ class PassageGeometry:
         second_obstacle: Another such disc, or None.
         obstacles_move: True if the positions of the discs are sampled in every episode.
         obstacle_margin: Distance from a disc within which it has a cost.
-        robot_radius: Radius of the robot; its visible walls are smaller by it than those of the centre.
+        robot_radius: Radius of the robot; its visible walls are smaller by it than those of the center.
     """
 
     start: tuple[float, float] = (0.30, 0.05)
@@ -49,7 +49,7 @@ class PassageGeometry:
 
     @property
     def walls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners (2, 2) of the walls, for the robot's centre."""
+        """Lower and upper corners (2, 2) of the walls, for the robot's center."""
         (bottom, top), (left, right) = self.wall_y, self.gap_x
         lower = np.array([[left - self.wall_length, bottom], [right, bottom]])
         upper = np.array([[left, top], [right + self.wall_length, top]])
@@ -74,7 +74,7 @@ class PassageGeometry:
         return bool(self.wall_y[0] - 0.05 < pose[1] < self.wall_y[1] + 0.02)
 
     def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
-        """Return the distance d_t [m] of the robot's centre from an obstacle's edge, negative inside (equation 4.24).
+        """Return the distance d_t [m] of the robot's center from an obstacle's edge, negative inside (equation 4.24).
 
         Args:
             pose: Pose of the robot (2,) [m].

@@ -1,6 +1,6 @@
 """Objects of the pouring task: a thermos, a mug and table-tennis balls.
 
-A vessel's frame, the tip, is at the centre of its opening with z out of the opening. Its wall is a ring of boxes,
+A vessel's frame, the tip, is at the center of its opening with z out of the opening. Its wall is a ring of boxes,
 because point contact replaces a hollow mesh by its convex hull.
 """
 
@@ -46,9 +46,9 @@ class Vessel:
     @property
     def inertia(self) -> SpatialInertia:
         """Spatial inertia about the tip, that of a solid cylinder."""
-        centre = np.array([0.0, 0.0, -self.height / 2])
+        center = np.array([0.0, 0.0, -self.height / 2])
         solid = UnitInertia.SolidCylinder(self.outer_radius, self.height, np.array([0.0, 0.0, 1.0]))
-        return SpatialInertia(self.mass, centre, solid.ShiftFromCenterOfMass(-centre))
+        return SpatialInertia(self.mass, center, solid.ShiftFromCenterOfMass(-center))
 
     def boxes(self) -> list[tuple[RigidTransform, Box]]:
         """Return the boxes of the wall in the tip frame; their inner faces close the ring."""
@@ -57,8 +57,8 @@ class Vessel:
         boxes = []
         for angle in 2 * np.pi * np.arange(WALL_BOXES) / WALL_BOXES:
             R = RotationMatrix.MakeZRotation(angle)
-            centre = R @ np.array([radius + self.wall / 2, 0.0, -self.height / 2])
-            boxes.append((RigidTransform(R, centre), Box(self.wall, width, self.height)))
+            center = R @ np.array([radius + self.wall / 2, 0.0, -self.height / 2])
+            boxes.append((RigidTransform(R, center), Box(self.wall, width, self.height)))
         return boxes
 
     def contains(self, p_TP: np.ndarray, margin: float = 0.0) -> bool:

@@ -230,7 +230,7 @@ class TestUncertainty:
             {"offset": (1, 2, 3)},
             {"offset": "far"},
             {"offset": (0, np.nan)},
-            {"offset": (1.5, 0.0)},  # meant in millimetres
+            {"offset": (1.5, 0.0)},  # meant in millimeters
             {"offset": (0.0, -0.5)},
         ],
     )

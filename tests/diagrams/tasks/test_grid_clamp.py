@@ -9,7 +9,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.grid_clamp.task import (
-    CENTRE,
+    CENTER,
     COLLISION_FORCE,
     MAX_TRACKING_ERROR,
     SCALE,
@@ -70,12 +70,12 @@ def test_straight_descent_inserts_without_offsets(known, seed):
     assert known.trace.statistics()["peak_force"] <= 10.0
     assert total == pytest.approx(sum(terms.values()))
     assert terms["terminal_reward"] == 50.0
-    # What it came down is what it is paid for, 300 a metre, from 15 to 18 mm.
+    # What it came down is what it is paid for, 300 a meter, from 15 to 18 mm.
     assert 300.0 * 0.014 < terms["shaping"] < 300.0 * 0.0185
 
 
 def test_aligned_reward_pays_approach_and_costs_collisions():
-    """Two millimetres off, straight down onto the table, until it is too much."""
+    """Two millimeters off, straight down onto the table, until it is too much."""
     env = make_env("GridClamp", reward="aligned", difficulty="hard")
     info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
     assert info["termination"] == "collision"
@@ -147,7 +147,7 @@ def test_an_observation_is_position_and_force(env):
     env.reset(seed=0, options={"offset": (0.0025, 0.001)})
     for _ in range(8):
         observation, _, _, _, info = env.step(DOWN)
-    position, force = (SCALE * observation + CENTRE)[[2, 5]]
+    position, force = (SCALE * observation + CENTER)[[2, 5]]
     assert position == pytest.approx(12.0 * MM, abs=0.1 * MM)
     assert force == pytest.approx(info["contact_force"], rel=0.25)
     assert force > 5.0

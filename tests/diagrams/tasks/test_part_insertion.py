@@ -17,7 +17,7 @@ from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import import_modules
 
-PART = {"visual": "{}.obj", "mass": 0.1, "centre": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
+PART = {"visual": "{}.obj", "mass": 0.1, "center": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
 BY_PHASE = {
     "lower": [[-0.002, -0.002, None, None, None, None], [-0.001, -0.001, None, None, None, None]],
     "upper": [[0.002, 0.002, None, None, None, None], [0.001, 0.001, None, None, None, None]],
@@ -151,11 +151,11 @@ def test_models_are_written_once_and_failures_are_refused(tmp_path):
 
 
 def test_mass_of_a_part_is_that_of_its_file(tmp_path):
-    centre = [0.001, -0.002, 0.003]
-    folder = write(tmp_path / "centred", plug=part("plug", centre=centre))
+    center = [0.001, -0.002, 0.003]
+    folder = write(tmp_path / "centered", plug=part("plug", center=center))
     plant = MultibodyPlant(0.0)
     plug = EnvConfig.resolve(str(folder), {}).make_task().workcell().add_workpiece(plant, plant.world_frame())
-    np.testing.assert_allclose(plug.default_com(), centre)
+    np.testing.assert_allclose(plug.default_com(), center)
 
 
 def test_it_starts_inside_its_bounds(tmp_path):

@@ -180,7 +180,7 @@ def test_shaping_is_the_progress_of_the_template(env):
     # The last action's cost counts for as long as it lasted.
     cost = [float(a @ a) for a in np.clip(actions, -1.0, 1.0)]
     assert -sum(cost) - 1e-9 <= sums["action_cost"] <= -sum(cost[:-1]) + 1e-9
-    # From the start's distance to wherever the tilt ended, 5 a metre and 0.0175 a degree, times 200.
+    # From the start's distance to wherever the tilt ended, 5 a meter and 0.0175 a degree, times 200.
     assert 200.0 * 1.2 < sums["shaping"] < 200.0 * 2.8
 
 

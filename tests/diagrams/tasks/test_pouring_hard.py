@@ -14,7 +14,7 @@ from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
 PERIOD = 0.01  # [s] between control steps
 # Where seed 3 started before there were difficulties.
 START_OF_SEED_3 = [-0.05165154964949667, -0.27188929363368947, 0.12006535135237559]
-BESIDE = (0.045, 0.0)  # [m] where the mug is believed to be, from the mug
+ERROR = (0.045, 0.0)  # [m] estimated position of the mug, from the mug
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def run(env, inputs, limit=60, **options):
 
 def test_aimed_policy_pours_and_blind_policy_spills(env):
     for inputs, ending in ((scripted_pour_aimed, "success"), (scripted_pour_blind, "spill")):
-        drawn, info = run(env, inputs, mug_error=BESIDE)
-        np.testing.assert_array_equal(drawn["mug_error"], BESIDE)
+        drawn, info = run(env, inputs, mug_error=ERROR)
+        np.testing.assert_array_equal(drawn["mug_error"], ERROR)
         assert info["termination"] == ending
         assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
         assert env.trace.statistics()["collisions"] == 0.0

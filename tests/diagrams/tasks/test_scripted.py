@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.bnc_connector import task as connector
-from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTRE, POSE_SCALE
+from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTER, POSE_SCALE
 from guiderail.diagrams.tasks.bnc_connector.task import (
     REACH,
     STEP,
     scripted_center_of_pressure,
     scripted_torque_search,
 )
-from guiderail.diagrams.tasks.grid_clamp.task import CENTRE, LANE_ENDS, LANES, SCALE, scripted_search
+from guiderail.diagrams.tasks.grid_clamp.task import CENTER, LANE_ENDS, LANES, SCALE, scripted_search
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.demonstrations import RIM
@@ -32,7 +32,7 @@ def seen_plug(**values):
 
 
 def test_torque_search_moves_against_the_torque():
-    """Off by +x, the rim pushes up at −x of the centre: that turns the plug about +y."""
+    """Off by +x, the rim pushes up at −x of the center: that turns the plug about +y."""
     assert scripted_torque_search(seen_plug(torque_y=0.4))[0] < 0.0
     assert scripted_torque_search(seen_plug(torque_x=0.4))[1] > 0.0
 
@@ -50,7 +50,7 @@ def test_torque_search_stays_within_bounds():
 
 def seen_pressure(time=1.6, z=RIM, lever=(0.0, 0.0), command=(0.0, 0.0)):
     result = np.zeros(17)
-    result[0], result[3] = time / 4.0 - 1.0, (z - POSE_CENTRE[2]) / POSE_SCALE[2]
+    result[0], result[3] = time / 4.0 - 1.0, (z - POSE_CENTER[2]) / POSE_SCALE[2]
     result[13:15], result[15:17] = np.array(lever) / LEVER_SCALE, np.array(command) / COMMAND_SCALE
     return result
 
@@ -84,7 +84,7 @@ def test_center_of_pressure_policy_refuses_another_observation():
 
 def seen_clamp(x_mm=0.0, y_mm=0.0, z_mm=12.0, fx=0.0, fy=0.0, fz=4.0):
     seen = np.array([x_mm * MM, y_mm * MM, z_mm * MM, fx, fy, fz])
-    return (seen - CENTRE) / SCALE
+    return (seen - CENTER) / SCALE
 
 
 def test_search_goes_to_its_start_before_it_descends():

@@ -23,9 +23,9 @@ def scene(seed, dimensions=2, boxes=2, planes=0):
     """Draw disjoint boxes and a start outside all of them."""
     rng = np.random.default_rng(seed)
     while True:
-        centre, half = rng.uniform(-1, 1, (boxes, dimensions)), rng.uniform(0.05, 0.3, (boxes, dimensions))
-        lower, upper = centre - half, centre + half
-        apart = clearances(lower[None, 0], upper[None, 0], centre[1:]).min(initial=1.0) - half[1:].max(initial=0.0)
+        center, half = rng.uniform(-1, 1, (boxes, dimensions)), rng.uniform(0.05, 0.3, (boxes, dimensions))
+        lower, upper = center - half, center + half
+        apart = clearances(lower[None, 0], upper[None, 0], center[1:]).min(initial=1.0) - half[1:].max(initial=0.0)
         start = rng.uniform(-1.5, 1.5, dimensions)
         if apart > 3 * MARGIN and clearances(lower, upper, start).min() > MARGIN + 1e-3:
             break

@@ -16,7 +16,7 @@ def share_of_what_was_shown(demonstrations, motion):
     return float((np.abs(motion - outputs.mean(axis=0)) <= outputs.std(axis=0, ddof=1)).all(axis=1).mean())
 
 
-# In metres and near zero, or in millimetres and far from it: neither may matter.
+# In meters and near zero, or in millimeters and far from it: neither may matter.
 PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 

@@ -35,7 +35,7 @@ def test_wrist_wrench_at_rest_is_the_external_wrench():
 
 
 def test_wrist_wrench_is_zero_in_free_fall_with_spin(arm):
-    """A free body with an offset centre of mass, compared with Drake's dynamics."""
+    """A free body with an offset center of mass, compared with Drake's dynamics."""
     plant = MultibodyPlant(0.0)
     model = add_model(plant, CONNECTOR_TOOL.model)
     plant.Finalize()

@@ -244,11 +244,11 @@ def test_violation_is_the_larger_of_metres_and_radians():
     assert Tilted(0.0).frame_names == ()
 
 
-@pytest.mark.parametrize("centre", [-20.0, 0.0, 3.0, 100.0])
-def test_nearest_turn_is_within_half_a_turn(centre):
+@pytest.mark.parametrize("center", [-20.0, 0.0, 3.0, 100.0])
+def test_nearest_turn_is_within_half_a_turn(center):
     for angle in (-9.0, 0.0, 0.5, 7.0):
-        turned = ac.nearest_turn(angle, centre)
-        assert abs(turned - centre) <= math.pi + 1e-12
+        turned = ac.nearest_turn(angle, center)
+        assert abs(turned - center) <= math.pi + 1e-12
         assert (turned - angle) / math.tau == pytest.approx(round((turned - angle) / math.tau))
 
 

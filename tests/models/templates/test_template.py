@@ -240,7 +240,7 @@ def floor_and_ceiling(floor, ceiling):
     return one(ac.HalfSpace((0.0, 0.0, 1.0), floor), ac.HalfSpace((0.0, 0.0, -1.0), -ceiling))
 
 
-def test_violation_of_a_nanometre_counts_as_inside():
+def test_violation_of_a_nanometer_counts_as_inside():
     """With a floor above a ceiling, a pose at the ceiling violates the floor by their distance."""
     X = RigidTransform()
     for floor, fraction in ((1e-9, 1.0), (1.5e-9, 0.0)):

@@ -105,7 +105,7 @@ def test_pouring_figures_use_every_finished_seed(tmp_path):
         assert (tmp_path / f"{'table_3_3' if 'table' in figure else 'figure_' + figure.replace('.', '_')}.png").exists()
     assert reproduce("3.8", seeds=1, episodes=12, out=tmp_path)["tqc, RL-SCT-Sparse, episodes to convergence"] == "2"
     table = (tmp_path / "table_3_3.md").read_text()
-    assert all(word in table for word in ("translational", "tilt", "pour", "TiltTowards", "15 per metre"))
+    assert all(word in table for word in ("translational", "tilt", "pour", "TiltTowards", "15 per meter"))
 
 
 def test_grid_clamp_figure_has_the_force_of_each_seed(tmp_path):

@@ -104,7 +104,7 @@ def trained(bead_run):
         (["sim-driver", "--seconds", "nan"], "seconds must be a positive number, not nan"),
         (["sim-driver", "--seconds", "-1"], "seconds must be a positive number, not -1"),
         (["sim-driver", "--command-timeout", "0"], "must be a positive number, not 0"),
-        (["sim-driver", "--offset", "1.5,0"], "offset cannot be (1.5, 0.0): give x and y in metres"),
+        (["sim-driver", "--offset", "1.5,0"], "offset cannot be (1.5, 0.0): give x and y in meters"),
         (["sim-driver", "--offset", "1.5"], "--offset takes 2 numbers"),
         (["sim-driver", "--rate", "0"], "not 0"),
         (["deploy", "new", "--sim", "--lcm-url", "udpm://239.255.76.67:7667"], "a bus of its own"),

@@ -18,7 +18,7 @@ from guiderail.tools.experiments.job import Job, digest
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, start_or_resume
 
-PART = {"visual": "part.obj", "mass": 0.1, "centre": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
+PART = {"visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
 TASK = {
     "format": "guiderail task 1",
     "name": "parts/pin",

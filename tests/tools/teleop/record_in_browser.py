@@ -85,7 +85,7 @@ class Operator:
             await self.settle()
 
     async def wander(self, seconds):
-        """Search the rim in steps of half a millimetre, and return to the center."""
+        """Search the rim in steps of half a millimeter, and return to the center."""
         until = self.session.steps * PERIOD + seconds
         while self.session.steps * PERIOD < until:
             for output, steps in enumerate(self.random.integers(-3, 4, size=2)):

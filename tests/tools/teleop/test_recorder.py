@@ -55,7 +55,7 @@ class Page:
     def SetProperty(self, path, name, value):
         self.properties[path, name] = value
 
-    def SetObject(self, path, shape, colour):
+    def SetObject(self, path, shape, color):
         pass
 
     def SetTransform(self, path, pose):
@@ -64,7 +64,7 @@ class Page:
     def SetCameraPose(self, eye, target):
         self.lines["camera"] = np.array([eye, target])
 
-    def SetLine(self, path, vertices, width, colour):
+    def SetLine(self, path, vertices, width, color):
         self.lines[path] = vertices
 
 
@@ -108,14 +108,14 @@ def test_gauge_shows_the_force_on_the_robot(session):
     assert bar[2, 2] == pytest.approx(share * full)
 
 
-@pytest.mark.parametrize(("newtons", "share", "colour"), [(6.9, 0.69, BLUE), (7.1, 0.71, RED), (80.0, 1.0, RED)])
-def test_gauge_is_full_at_the_limit_and_red_below_it(newtons, share, colour):
+@pytest.mark.parametrize(("newtons", "share", "color"), [(6.9, 0.69, BLUE), (7.1, 0.71, RED), (80.0, 1.0, RED)])
+def test_gauge_is_full_at_the_limit_and_red_below_it(newtons, share, color):
     page = Page()
     gauge = ForceGauge(page, ((0.0, -2.0, 1.0), (0.0, 0.0, 1.0)), limit=10.0)
     gauge.show(np.array([newtons, 0.0, 0.0]))
     assert page.poses[f"{PATH}/bar"][2, 2] == pytest.approx(share * 2.0 * LENGTH)
     np.testing.assert_allclose(page.poses[f"{PATH}/shaft"][:3, 2], [share * 2.0 * LENGTH, 0, 0], atol=1e-12)
-    assert page.properties[f"{PATH}/bar/<object>", "color"] == list(colour)
+    assert page.properties[f"{PATH}/bar/<object>", "color"] == list(color)
     # The camera looks along y: the arrow is right of the part, the bar left of it.
     assert page.poses[f"{PATH}/shaft"][0, 3] > 0.1 > -0.1 > page.poses[f"{PATH}/bar"][0, 3]
     gauge.show(np.zeros(3))

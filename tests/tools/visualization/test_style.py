@@ -17,7 +17,7 @@ def test_legend_above_covers_no_data():
 def test_draw_runs_draws_the_mean_and_a_band_of_several_runs():
     _, axes = new_figure(1, 2, (4.0, 3.0))
     runs = [np.array([0.0, 2.0, 4.0]), np.array([2.0, 2.0])]
-    draw_runs(axes[0, 0], runs, colour="C0", label="two", window=1)
-    draw_runs(axes[0, 1], runs[:1], colour="C0", label="one", window=1)
+    draw_runs(axes[0, 0], runs, color="C0", label="two", window=1)
+    draw_runs(axes[0, 1], runs[:1], color="C0", label="one", window=1)
     np.testing.assert_array_equal(axes[0, 0].lines[0].get_ydata(), [1.0, 2.0])
     assert [len(axis.collections) for axis in axes.flat] == [1, 0]

@@ -65,7 +65,7 @@ def poses_in_target(
     Args:
         positions: Positions (N, 3) in the recording's frame [m].
         rotations: Rotations (N,) in the recording's frame.
-        target: Target in that frame, [x y z] in metres and [rx ry rz] in degrees; None keeps the recording's frame.
+        target: Target in that frame, [x y z] in meters and [rx ry rz] in degrees; None keeps the recording's frame.
         like: Poses of an earlier demonstration, (N', 6). Of all equivalent angles, those nearest to its angles are
             returned: a full turn between two demonstrations would be learned as their spread.
     """

@@ -131,7 +131,7 @@ def _read_bag(
     orientations = [getattr(pose, "orientation", None) or pose.rotation for pose in poses]
     rotations = rotations_of(np.array([(q.x, q.y, q.z, q.w) for q in orientations]), str(bag))
     frame = _frame(messages[0], POSES[kinds[chosen]])
-    assumptions.append("positions are in metres, and quaternions follow the names of their fields (REP 103)")
+    assumptions.append("positions are in meters, and quaternions follow the names of their fields (REP 103)")
     if target is None:
         assumptions.append(f"poses stay in the frame {frame!r}: --target gives the pose of the task's target in it")
     return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumptions

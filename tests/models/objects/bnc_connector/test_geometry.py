@@ -27,7 +27,7 @@ from guiderail.models.objects.triangle_mesh import TriangleMesh
 DIMENSIONS = BncDimensions()
 
 
-def centres(mesh):
+def centers(mesh):
     return mesh.vertices[mesh.triangles].mean(axis=1)
 
 
@@ -51,8 +51,8 @@ def test_files_change_with_the_dimensions():
 def test_bore_encloses_the_true_barrel():
     """The polygon encloses the circle and its faces point at the barrel."""
     mesh = bore_mesh(DIMENSIONS)
-    wall = centres(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
-    outward = centres(mesh)[wall] * [1, 1, 0]
+    wall = centers(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
+    outward = centers(mesh)[wall] * [1, 1, 0]
     distance_of_planes = np.abs(np.einsum("ij,ij->i", mesh.normals()[wall], mesh.vertices[mesh.triangles[wall, 0]]))
     assert distance_of_planes.min() >= DIMENSIONS.bore_radius - 1e-8
     assert (np.einsum("ij,ij->i", mesh.normals()[wall], outward) < 0).all()
@@ -96,7 +96,7 @@ def test_slot_has_clearance_along_the_lugs_path():
 
 def test_slot_walls_face_the_slot():
     mesh = slot_mesh(DIMENSIONS)
-    middle = centres(mesh)
+    middle = centers(mesh)
     angle = np.arctan2(middle[:, 1], middle[:, 0])
     on_ramp = (np.abs(np.rad2deg(angle) - 45) < 20) & (middle[:, 2] > 1.5 * MM)
     is_upper = middle[on_ramp, 2] > 4.5 * MM

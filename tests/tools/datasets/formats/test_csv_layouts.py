@@ -146,7 +146,7 @@ def test_unknown_unit_in_a_name_is_refused(header, given, refused, file):
     ("unit", "scale"), [("µs", 1e-6), ("\u03bcs", 1e-6), ("us", 1e-6), ("sec", 1), ("Seconds", 1), ("MS", 1e-3)]
 )
 def test_spellings_of_units_are_recognized(unit, scale, file):
-    write(file, f"t [{unit}],x [metres],y (M),Z [m] (raw)", 1, 2, 3)
+    write(file, f"t [{unit}],x [meters],y (M),Z [m] (raw)", 1, 2, 3)
     found = read_csv_files(file)
     np.testing.assert_allclose(found.times[0], CLOCK * scale)
     np.testing.assert_array_equal(found.outputs[0][0], [1, 2, 3])
