@@ -83,7 +83,9 @@ def certify_skill(
         worst = Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
         budget = Budget(BUDGET_MARGIN * worst.excess + np.array(MIN_EXCESS), BUDGET_MARGIN * worst.residue)
     certified = certify(loop, budget)
-    impedance = Impedance() if primitive.num_outputs == len(Impedance().stiffness) else None
+    impedance = EnvConfig.resolve(task, options).make_task().impedance()
+    if impedance is None and primitive.num_outputs == len(Impedance().stiffness):
+        impedance = Impedance()
     stiffness = None if impedance is None else options.get("stiffness_factor", 1.0) * np.array(impedance.stiffness)
     limits = None if impedance is None else np.array(impedance.limits)
     for name, content in certificate_files(loop, certified, stiffness, limits, about).items():

@@ -48,11 +48,9 @@ def make_station(task: Task) -> Station:
             f"workcell() of {task.name} returns nothing: let it return what station={kind.name!r} works on"
         )
     build, disturbances = partial(kind.build, workcell, **config.part("station")), config.parts["disturbances"]
-    return (
-        disturbed(build, disturbances, kind.is_simulated, kind.name)
-        if isinstance(disturbances, Disturbances)
-        else build()
-    )
+    if not isinstance(disturbances, Disturbances):
+        return build()
+    return disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
 
 
 def make_guidance(task: Task, station: Station) -> Diagram:

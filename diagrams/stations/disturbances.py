@@ -161,23 +161,40 @@ class DisturbedStation(Station):
         return {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
 
 
-def disturbed(build: Callable[..., Station], disturbances: Disturbances, is_simulated: bool, name: str) -> Station:
-    """Build a station, with disturbances if any is on.
+def disturbed(
+    build: Callable[..., Station],
+    disturbances: Disturbances,
+    is_simulated: bool,
+    name: str,
+    impedance: Impedance | None = None,
+) -> Station:
+    """Build a station with the impedance of a task, and with disturbances if any is on.
 
-    To disturb its stiffness, `build` needs a parameter `impedance`. The message names the station.
+    Args:
+        build: Builder of the station, with a parameter `impedance` if that or its stiffness is to be set.
+        disturbances: Disturbances.
+        is_simulated: False for a robot.
+        name: Name of the station, for messages.
+        impedance: Impedance of the task; the station's own by default.
 
     Raises:
-        InputError: If the station does not have such a disturbance.
+        InputError: If the station does not have such a disturbance, or no impedance to set.
     """
+    has_impedance = "impedance" in inspect.signature(build).parameters
+    if impedance is not None and not has_impedance:
+        raise InputError(
+            f"station={name!r} takes no impedance, so its force cannot be bounded: give its builder the parameter "
+            "impedance, or choose bounded_force=False"
+        )
+    arguments: dict[str, Any] = {} if impedance is None else {"impedance": impedance}
     if not disturbances.any:
-        return build()
+        return build(**arguments)
     if not is_simulated:
         raise InputError(f"station={name!r} is a real robot, which has disturbances of its own: leave them out")
-    arguments: dict[str, Any] = {}
     if disturbances.stiffness_factor != 1.0:
-        if "impedance" not in inspect.signature(build).parameters:
+        if not has_impedance:
             raise InputError(f"station={name!r} has no impedance whose stiffness could be another: leave it out")
-        nominal = Impedance()
+        nominal = impedance or Impedance()
         stiffness = tuple(disturbances.stiffness_factor * value for value in nominal.stiffness)
         arguments["impedance"] = replace(nominal, stiffness=stiffness)
     return DisturbedStation(build(**arguments), disturbances)

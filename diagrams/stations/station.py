@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -60,6 +60,9 @@ CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
 MAX_HALVINGS = 7
+
+# Limits of the force along x, y and z in relation to a limit of its norm: the box lies inside the ball.
+FORCE_SHARES = (0.45, 0.45, 0.75)
 
 
 class ContactOptions(Options):
@@ -105,6 +108,15 @@ class Impedance:
                 raise InputError(f"the impedance's {name} need six positive numbers, not {getattr(self, name)}")
         if not (np.isfinite(self.damping_ratio) and self.damping_ratio > 0.0):
             raise InputError(f"the impedance's damping_ratio must be positive, not {self.damping_ratio}")
+
+    def with_max_force(self, force: float) -> Impedance:
+        """Return the same impedance with limits at which the norm of its force is below `force` [N].
+
+        A limit is never raised. The shares of the axes favour z, along which workpieces are inserted.
+        """
+        limits = np.array(self.limits)
+        limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))
+        return replace(self, limits=tuple(limits.tolist()))
 
 
 class Station(Diagram):

@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.observation import affine
-from guiderail.diagrams.envs.options import Numbers, ResetOptions
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.envs.options import Numbers, Options, ResetOptions
+from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.poses import POSE_SIZE
@@ -25,6 +25,14 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimeters
+
+
+class ForceOptions(Options):
+    """Options of a task with a force limit, `force_limit`."""
+
+    bounded_force: bool = Field(
+        True, description="limit the impedance, so that its force cannot pass force_limit; without it: 40 N per axis"
+    )
 
 
 class InsertionReset(ResetOptions):
@@ -88,6 +96,12 @@ class InsertionTask(Task):
         With None, the default, the task cannot be learned on hardware.
         """
         return None
+
+    def impedance(self) -> Impedance | None:
+        """Return an impedance with a force below the force limit, unless `bounded_force` is an option and off."""
+        if not getattr(self.options, "bounded_force", True):
+            return None
+        return Impedance().with_max_force(self.collision.above)
 
     def force_limit(self) -> TerminationTerm:
         """Return the term that ends an episode as a collision above the force `collision.above` [N]."""

@@ -19,7 +19,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.registry import stations_for
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -143,6 +143,10 @@ class Task(ABC):
             station: Station, already in the builder.
         """
         return {}
+
+    def impedance(self) -> Impedance | None:
+        """Return the impedance of the station, with limits that the task needs; None: the station's own."""
+        return None
 
     # Prior knowledge. Guidance can be built from the methods that a task overrides here (see `provides`).
 

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.insertion import ForceOptions
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, in_ring
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
@@ -88,7 +89,7 @@ NOMINAL = BncDimensions()
 SHIPPED = ("insert", "search")  # demonstrations
 
 
-class BncOptions(FixtureOffsetOptions):
+class BncOptions(FixtureOffsetOptions, ForceOptions):
     """Options of BncConnector."""
 
     jack_turn: Number = Field(0.0, ge=0, le=10, description="largest sampled turn of the jack about its axis [degrees]")

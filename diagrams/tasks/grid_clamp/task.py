@@ -12,12 +12,12 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options
+from guiderail.diagrams.envs.options import STANDARD, Number, Numbers
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
-from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.insertion import ForceOptions, InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
@@ -39,7 +39,7 @@ HEIGHTS = (0.013, 0.060)  # [m] range of start heights: above the table, and wel
 NOMINAL = GridClampDimensions()
 
 
-class GridClampOptions(Options):
+class GridClampOptions(ForceOptions):
     """Options of GridClamp."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(

@@ -23,7 +23,7 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import (
     reward_terms,
     sides_of_the_rim,
 )
-from guiderail.diagrams.tasks.insertion import DemonstratedInsertion
+from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, ForceOptions
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, reference_of_file
 from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
@@ -45,7 +45,7 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
-class PartOptions(FixtureOffsetOptions):
+class PartOptions(FixtureOffsetOptions, ForceOptions):
     """Options of a task of two meshes."""
 
     start_offset_max: Number = Field(

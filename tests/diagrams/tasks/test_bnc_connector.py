@@ -141,7 +141,12 @@ def test_the_same_seed_is_the_same_episode(kgrl):
 def test_a_hard_push_is_a_collision():
     """A residual that commands 25 mm sideways against the jack's side, which no constraint keeps from it."""
     env = make_env(
-        "BncConnector", guidance="residual", fixture_offset="per_episode", action_dims=(0, 1, 2), action_scale=20.0
+        "BncConnector",
+        guidance="residual",
+        fixture_offset="per_episode",
+        action_dims=(0, 1, 2),
+        action_scale=20.0,
+        bounded_force=False,
     )
     _, info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
     assert info["termination"] == "collision"

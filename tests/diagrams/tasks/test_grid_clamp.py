@@ -76,7 +76,7 @@ def test_straight_descent_inserts_without_offsets(known, seed):
 
 def test_aligned_reward_pays_approach_and_costs_collisions():
     """Two millimeters off, straight down onto the table, until it is too much."""
-    env = make_env("GridClamp", reward="aligned", difficulty="hard")
+    env = make_env("GridClamp", reward="aligned", difficulty="hard", bounded_force=False)
     info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
     assert info["termination"] == "collision"
     assert terms["collision_cost"] == -25.0
@@ -127,7 +127,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
 
 
 def test_without_the_cuboid_a_push_is_a_collision():
-    env = make_env("GridClamp", guidance="none", active_constraints=False)
+    env = make_env("GridClamp", guidance="none", active_constraints=False, bounded_force=False)
     info, _, _ = play(env, lambda _: np.array([0, 0, -0.5, 0, 0, 0]), seed=0, options={"offset": (0.003, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
