@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections newest clean
+.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -57,6 +57,9 @@ mutants: $(VENV)/.ready  ## mutation testing of the safety code, hours
 injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 	$(BIN)/python tests/harness/injections/inject.py --injections 500
 	$(BIN)/python tests/harness/injections/processes.py
+
+scaling: $(VENV)/.ready  ## constraints in every scale against an adversary, minutes
+	$(BIN)/python tests/harness/constraint_scaling.py
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
 	.ci/newest python3.12

@@ -182,16 +182,10 @@ class LcNsKmpSystem(LeafSystem):
         try:
             output, fallback = primitive.predict(step, action, history).output, 0.0
         except UnsolvableError:
-            output, fallback = self._fall_back(context, step), 1.0
+            # The constraints of this step may have changed: the last command alone might violate them.
+            last_command = context.get_discrete_state(self._last_command).value()
+            output, fallback = self._primitive.constraints.nearest(last_command, step), 1.0
         return _Prediction(step, output, fallback)
-
-    def _fall_back(self, context: Context, step: int) -> np.ndarray:
-        """Return the point nearest to the last command within the constraints of this step, which may have changed."""
-        last_command = context.get_discrete_state(self._last_command).value()
-        try:
-            return self._primitive.constraints.nearest(last_command, step)
-        except UnsolvableError:
-            return last_command.copy()  # a command must be output at every step
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._prediction.Eval(context).output)

@@ -332,8 +332,8 @@ class GuidedEnv(DrakeGymEnv):
             if np.iscomplexobj(action):
                 raise TypeError
             action = np.asarray(action, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"an action is {self._neutral.size} numbers in [-1, 1], not {action!r}") from None
+        except (TypeError, ValueError, OverflowError):  # Python's whole numbers can exceed every double
+            raise InputError(f"an action is {self._neutral.size} numbers in [-1, 1], not {brief(action)}") from None
         if action.shape != self._neutral.shape:
             raise InputError(f"an action is an array of shape {self._neutral.shape}, not {action.shape}")
         if not np.isfinite(action).all():

@@ -61,12 +61,13 @@ class PrimitiveOptions(Options):
     action_dims: Integers | None = Field(
         None, description="indices of the outputs that an action moves; default: all", examples=[(0, 1)]
     )
-    history: Integer = Field(10, ge=1, le=1000, description="P, past outputs that sKGRL's motion passes through")
+    # Factoring a step costs O(P² + H³) time: the limits keep a task of six outputs below half a minute and 1 GB.
+    history: Integer = Field(10, ge=1, le=200, description="P, past outputs that sKGRL's motion passes through")
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], variance of the past outputs")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="poses that form the history")
     adaptive_history: bool = Field(False, description="shorten the history during contact")
     gains: Numbers | None = Field(None, description="raw null-space units per action; default: computed from κ")
-    horizon: Integer = Field(40, ge=0, le=1000, description="H, future points at which constraints are satisfied")
+    horizon: Integer = Field(40, ge=0, le=200, description="H, future points at which constraints are satisfied")
     lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
     beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
     kernel: str = Field(DEFAULT_KERNEL, description="name of a registered kernel k(ζ, ζ')")

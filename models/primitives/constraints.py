@@ -1,5 +1,7 @@
 """Linear inequality constraints g_{n,f}ᵀ ζ^O ≥ c_{n,f} on the output of a primitive (thesis, equation 4.5)."""
 
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -8,21 +10,28 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 TOLERANCE = 1e-9
-"""Largest accepted violation of a command, in the unit of a constraint's c (1 nm if that is meters)."""
+"""Largest accepted violation of a command, a distance from the constraint's plane (1 nm if outputs are meters)."""
+_EPS = float(np.finfo(float).eps)
+_ROUNDING = 64 * _EPS  # contradiction that rounding of the rows explains, relative to c and to the output
 
 
 class LinearConstraints:
     """Constraints G y ≥ c, the same at every step or different from step to step.
+
+    Every row is divided by its norm, together with its c: violations are distances in the outputs' unit, and neither
+    results nor tolerances depend on the scale in which a constraint is given.
 
     Args:
         G: Rows g_f, (F, O) or (N, F, O), finite [unit of c / unit of the output].
         c: Lower bounds, (F,) or (N, F), finite.
 
     Raises:
-        InputError: If shapes do not match, a number is not finite, or no output satisfies all constraints of a step.
+        InputError: If shapes do not match, a number is not finite, a bound is not finite relative to its row, or no
+            output satisfies all constraints of a step. A contradiction beyond rounding counts, however small.
 
     Attributes:
-        G, c: Copies of the arguments, read-only.
+        G, c: Rows of unit norm (or zero) and their bounds [unit of the output], read-only; a row whose norm is one up
+            to rounding is unchanged.
     """
 
     def __init__(self, G: np.ndarray, c: np.ndarray):
@@ -34,7 +43,8 @@ class LinearConstraints:
             )
         if not (np.isfinite(self.G).all() and np.isfinite(self.c).all()):
             raise InputError("constraints must be finite: leave out the rows that do not constrain anything")
-        self._refuse_contradictions()
+        self._normalize()
+        self._interior = self._find_interior()
         for values in (self.G, self.c):
             values.setflags(write=False)  # primitives of a process share it
 
@@ -105,7 +115,7 @@ class LinearConstraints:
         return self.G[steps], self.c[steps]
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Compute the maximum over the constraints of c − G y [unit of c].
+        """Compute the maximum over the constraints of c − G y, with rows of unit norm [unit of the output].
 
         Args:
             output: y (O,).
@@ -124,43 +134,103 @@ class LinearConstraints:
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
         """Compute the output (O,) within the constraints of a step that is nearest to `output` (O,).
 
+        Where the solver does not find it, the result is the first allowed point on the straight line to a point inside
+        the constraints, so that there is a result for every finite output.
+
         Raises:
-            UnsolvableError: If the solver does not find it.
+            UnsolvableError: If `output` is not finite.
         """
         output = np.asarray(output, dtype=float)
         if self.violation(output, step) <= 0:
             return output.copy()
+        if not np.isfinite(output).all():
+            raise UnsolvableError(f"an output must be finite to have a nearest one within constraints, not {output}")
         G, c = (a[0] for a in self.window(np.array([step])))
-        scale = 1 / np.where(np.linalg.norm(G, axis=1) > 0, np.linalg.norm(G, axis=1), 1)
-        move, _ = solve_least_norm(G * scale[:, None], (c - G @ output) * scale, np.full(len(c), np.inf))
-        nearest = output + move
-        if not self.violation(nearest, step) <= TOLERANCE:
-            raise UnsolvableError(f"the nearest output violates a constraint by {self.violation(nearest, step):.1e}")
-        return nearest
+        with suppress(UnsolvableError):
+            move, _ = solve_least_norm(G.copy(), c - G @ output, np.full(len(c), np.inf))
+            if self.violation(output + move, step) <= TOLERANCE:
+                return np.asarray(output + move)
+        return self._entry_point(output, step)
 
-    def _refuse_contradictions(self) -> None:
-        if self.num_constraints == 0:
-            return
-        from scipy.optimize import linprog  # takes half a second, and reading a file does not need it
+    def _entry_point(self, output: np.ndarray, step: int) -> np.ndarray:
+        """Return the first point (O,) within the constraints of a step on the line from `output` to a point inside."""
+        G, c = (a[0] for a in self.window(np.array([step])))
+        inside = self._interior if self.G.ndim == 2 else self._interior[min(step, len(self._interior) - 1)]
+        inside = np.where((G == 0.0).all(axis=0), output, inside)  # outputs without a constraint do not move
+        missing, gained = c - G @ output, G @ (inside - output)
+        share = float(np.max(missing[missing > 0.0] / np.maximum(gained, missing)[missing > 0.0]))
+        entry = output + share * (inside - output)
+        return entry if self.violation(entry, step) <= TOLERANCE else inside
 
-        G = self.G.reshape(-1, *self.G.shape[-2:])
-        c = self.c.reshape(-1, self.c.shape[-1])
-        flat = np.concatenate([G.reshape(len(G), -1), c], axis=1)
-        for step in np.sort(np.unique(flat, axis=0, return_index=True)[1]):
-            # Rows are scaled to unit length, so that the solver's tolerance is a tolerance on the output itself.
-            size = np.linalg.norm(G[step], axis=1)
-            scale = np.where(size > 0, size, 1.0)
-            result = linprog(
-                np.zeros(self.num_outputs),
-                A_ub=-G[step] / scale[:, None],
-                b_ub=-c[step] / scale,
-                bounds=(None, None),
-                # The smallest tolerances that HiGHS accepts.
-                options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    def _normalize(self) -> None:
+        """Divide every row and its bound by the row's norm; rows of unit norm up to rounding keep their digits."""
+        # Scaled by the largest entry first: the squares of very large or small entries leave the range of doubles.
+        largest = np.abs(self.G).max(axis=-1, initial=0.0)
+        with np.errstate(over="ignore"):
+            G, c = (a / b for a, b in ((self.G, np.where(largest > 0.0, largest, 1.0)[..., None]), (self.c, 1.0)))
+            norm = np.linalg.norm(G, axis=-1)
+            is_unit = np.abs(np.where(largest > 0.0, norm * largest, 1.0) - 1.0) <= 4 * _EPS
+            norm = np.where(largest > 0.0, norm, 1.0)
+            c = self.c / np.where(largest > 0.0, largest, 1.0) / norm
+        if not np.isfinite(c).all():
+            raise InputError("a constraint's bound divided by the norm of its row is not finite: scale the row up")
+        self.G = np.where(is_unit[..., None], self.G, G / norm[..., None])
+        self.c = np.where(is_unit, self.c, c)
+
+    def _find_interior(self) -> np.ndarray:
+        """Return a point inside the constraints, (O,) or (N, O).
+
+        Raises:
+            InputError: If there is none at a step.
+        """
+        steps = (self.G, self.c) if self.G.ndim == 3 else (self.G[None], self.c[None])
+        if ((self.G != 0.0).sum(axis=-1) <= 1).all():
+            interior = _box_interior(*steps)
+        else:
+            flat = np.concatenate([steps[0].reshape(len(steps[0]), -1), steps[1]], axis=1)
+            _, first, which = np.unique(flat, axis=0, return_index=True, return_inverse=True)
+            found = {at: _max_margin_point(steps[0][at], steps[1][at]) for at in np.sort(first).tolist()}
+            interior = np.array([found[at] for at in first[which.ravel()].tolist()])
+        missing = steps[1] - np.einsum("nfo,no->nf", steps[0], interior)
+        size = np.abs(steps[1]) + np.einsum("nfo,no->nf", np.abs(steps[0]), np.abs(interior))
+        is_contradiction = ~(missing <= _ROUNDING * size).all(axis=1)
+        if is_contradiction.any():
+            where = "" if self.G.ndim == 2 else f" at step {int(np.argmax(is_contradiction))}"
+            raise InputError(
+                f"the constraints{where} contradict each other: no output satisfies all {self.num_constraints} of "
+                "them; loosen c or remove a row of G"
             )
-            if result.status == 2:
-                where = "" if self.G.ndim == 2 else f" at step {step}"
-                raise InputError(
-                    f"the constraints{where} contradict each other: no output satisfies all {self.num_constraints} of "
-                    "them; loosen c or remove a row of G"
-                )
+        return interior if self.G.ndim == 3 else interior[0]
+
+
+def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return the centers (n, O) of boxes, a bound where there is only one, 0 where there is none."""
+    lower = np.where(G > 0.0, c[..., None], -np.inf).max(axis=1, initial=-np.inf)
+    upper = np.where(G < 0.0, -c[..., None], np.inf).min(axis=1, initial=np.inf)
+    both = np.isfinite(lower) & np.isfinite(upper)
+    with np.errstate(invalid="ignore"):
+        return np.where(both, 0.5 * lower + 0.5 * upper, np.clip(0.0, lower, upper))
+
+
+def _max_margin_point(G: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return the point (O,) with the largest smallest margin G y − c, at most the size of c."""
+    from scipy.optimize import linprog  # takes half a second, and reading a file does not need it
+
+    outputs = G.shape[1]
+    size = float(np.abs(c).max(initial=0.0)) or 1.0
+    result = linprog(
+        np.append(np.zeros(outputs), -1.0),
+        A_ub=np.column_stack([-G, (np.abs(G).max(axis=1) > 0.0).astype(float)]),
+        b_ub=-c / size,
+        bounds=[(None, None)] * outputs + [(None, 1.0)],
+        # The smallest tolerances that HiGHS accepts.
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    if result.x is None:  # a row of zeros with a positive bound
+        return np.zeros(outputs)
+    best = np.asarray(size * result.x[:outputs])
+    # The solver's point is accurate to its tolerance; the solution of its active constraints is accurate to rounding.
+    active = np.flatnonzero(result.ineqlin.marginals < -1e-9)
+    system = np.column_stack([G[active], -np.ones(len(active))])
+    correction = np.linalg.lstsq(system, c[active] - G[active] @ best, rcond=None)[0][:outputs]
+    return max((best, best + correction), key=lambda y: float((G @ y - c).min()))

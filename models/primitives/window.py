@@ -5,11 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.features import WindowFeatures
-from guiderail.models.primitives.qp import Solver, solve_least_norm
+from guiderail.models.primitives.qp import Solver, UnsolvableError, solve_least_norm
 
 # Smallest singular value of the unit constraint rows, relative to the largest; smaller ones are rounding errors.
 _NEGLIGIBLE = 1e-13
+_OPPOSITE = 4 * float(np.finfo(float).eps)  # largest difference of two rows of unit norm that are opposite
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,13 @@ class StepFactor:
         Raises:
             UnsolvableError: If the solver finds no solution.
         """
-        return solve_least_norm(self.constraint_rows, self.lower - free, self.upper - free, solver)
+        lower, upper = self.lower - free, self.upper - free
+        try:
+            return solve_least_norm(self.constraint_rows, lower, upper, solver)
+        except UnsolvableError:
+            # In units of a correction that hardly moves the output, rounding of the bounds is a contradiction.
+            loose = 0.5 * TOLERANCE * self._scale
+            return solve_least_norm(self.constraint_rows, lower - loose, upper + loose, solver)
 
     def output_sizes(self) -> np.ndarray:
         """Return the largest displacement (O,) of the executed point by a correction of norm one."""
@@ -220,6 +228,8 @@ class StepFactor:
 def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pair the rows of G (n, F, O) that are each other's negative at every step, as the two sides of a box are.
 
+    Rows that were scaled differently before they were normalized differ by rounding.
+
     Returns:
         For each direction: its row of G, the row of its lower bound, and the row of its upper bound (−1: no bound).
     """
@@ -229,7 +239,8 @@ def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if f in taken:
             continue
         opposite = next(
-            (k for k in range(f + 1, G.shape[1]) if k not in taken and np.array_equal(G[:, k], -G[:, f])), -1
+            (k for k in range(f + 1, G.shape[1]) if k not in taken and np.abs(G[:, k] + G[:, f]).max() <= _OPPOSITE),
+            -1,
         )
         taken |= {f, opposite}
         directions.append(f)

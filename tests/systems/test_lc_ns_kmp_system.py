@@ -157,22 +157,22 @@ def test_fallback_satisfies_the_constraints_of_its_step():
         assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
-def test_last_command_is_output_when_no_nearest_point_is_found(monkeypatch):
-    p = primitive(history=0, upper=0.5)
-
+def test_fallback_satisfies_moving_constraints_if_no_problem_can_be_solved(monkeypatch):
     def unsolvable(*arguments):
         raise UnsolvableError("no")
 
+    lower = np.column_stack([np.linspace(-1.0, 1.0, 50), np.full(50, -1.0)])
+    p = LcNsKmp(primitive().reference, history=0, horizon=8, constraints=LinearConstraints.box(lower, lower + 0.5))
     system = LcNsKmpSystem(p, None, PERIOD)
     p.predict = unsolvable
-    monkeypatch.setattr(LinearConstraints, "nearest", unsolvable)
+    monkeypatch.setattr("guiderail.models.primitives.constraints.solve_least_norm", unsolvable)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
-    started = context.get_discrete_state(1).value().copy()
-    simulator.AdvanceTo(5 * PERIOD)
-    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), started)
-    assert system.get_fallback_output_port().Eval(context)[0] == 1.0
+    for step in range(50):
+        simulator.AdvanceTo(step * PERIOD + 1e-6)
+        assert system.get_constraint_violation_output_port().Eval(context)[0] <= 1e-9
+        assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
 def test_first_fallback_satisfies_the_constraints():

@@ -203,7 +203,9 @@ def test_the_trace_has_every_control_step():
     assert len(env.trace) == 0
 
 
-@pytest.mark.parametrize("action", [[np.nan], [np.inf], [-np.inf], [0.5 + 1j], [0.0, 0.0], 0.0, "up", [[0.0]], None])
+@pytest.mark.parametrize(
+    "action", [[np.nan], [np.inf], [-np.inf], [0.5 + 1j], [0.0, 0.0], 0.0, "up", [[0.0]], None, [10**400]]
+)
 def test_a_bad_action_is_refused_before_anything_moves(action):
     env = make()
     env.reset(options={"start": 0.0})

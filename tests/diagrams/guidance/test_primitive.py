@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.envs.options import PrimitiveOptions
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
@@ -232,3 +234,10 @@ def test_a_skill_that_makes_no_sense_is_refused(skill, change):
 def test_gains_of_the_wrong_size_are_refused(skill):
     with pytest.raises(InputError, match="one per output"):
         build("kgrl", replace(skill, gains=(1.0, 2.0, 3.0)))
+
+
+@pytest.mark.parametrize("option", ["horizon", "history"])
+def test_options_bound_the_time_to_factor_a_step(option):
+    assert getattr(PrimitiveOptions(**{option: 200}), option) == 200
+    with pytest.raises(ValidationError, match="less than or equal to 200"):
+        PrimitiveOptions(**{option: 201})

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
+from constraint_scaling import attack
 from hypothesis import given
 from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 
 def test_box_equals_its_half_spaces():
@@ -78,6 +79,101 @@ def polytope(seed, steps=None):
     return rng, G, G @ inside - size * rng.uniform(0.01, 1, shape[:-1]), inside
 
 
+@given(SEEDS, st.integers(-9, 9))
+def test_rows_are_normalized(seed, exponent):
+    rng, G, c, _ = polytope(seed, steps=3)
+    factor = 10.0 ** (exponent * rng.uniform(0, 1, c.shape))
+    size = np.linalg.norm(G, axis=2)
+    scaled = LinearConstraints(factor[..., None] * G, factor * c)
+    np.testing.assert_allclose(scaled.G, G / size[..., None], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(scaled.c, c / size, rtol=1e-14)
+    again = LinearConstraints(scaled.G, scaled.c)
+    np.testing.assert_array_equal(again.G, scaled.G)
+    np.testing.assert_array_equal(again.c, scaled.c)
+
+
+def test_normalizing_keeps_rows_of_unit_norm_and_of_zeros():
+    G = np.array([[0.6, 0.8], [0.0, -1.0], [0.0, 0.0], [np.cos(0.1), np.sin(0.1)]])
+    c = np.array([-0.1, -0.3, -7.0, -0.7])
+    constraints = LinearConstraints(G, c)
+    np.testing.assert_array_equal(constraints.G, G)
+    np.testing.assert_array_equal(constraints.c, c)
+    assert constraints.violation(np.zeros(2)) == -0.1
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-160, 1e160, 1e300, 5e-324])
+def test_rows_of_any_size_are_normalized(size):
+    constraints = LinearConstraints([[3 * size, 4 * size]] if size > 1e-300 else [[size, 0.0]], [0.0])
+    np.testing.assert_allclose(np.linalg.norm(constraints.G), 1.0, rtol=1e-15)
+
+
+def test_constructor_refuses_a_bound_beyond_all_numbers():
+    with pytest.raises(InputError, match="norm of its row is not finite"):
+        LinearConstraints([[1e-300]], [-1e10])
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("oblique", [False, True])
+@pytest.mark.parametrize(("gap", "is_refused"), [(0.0, False), (1e-16, False), (1e-12, True), (1e-10, True)])
+def test_constructor_refuses_contradictions_beyond_rounding(scale, oblique, gap, is_refused):
+    row = np.array([0.6, 0.8]) if oblique else np.array([1.0, 0.0])
+    G, c = np.array([scale * row, -row, [0.0, 1.0]]), np.array([scale * 0.5, -0.5 + gap, -3.0])
+    if is_refused:
+        with pytest.raises(InputError, match="contradict each other"):
+            LinearConstraints(G, c)
+    else:
+        constraints = LinearConstraints(G, c)
+        assert constraints.violation(constraints.nearest([9.0, 9.0])) <= 1e-9
+
+
+def test_constructor_accepts_three_lines_through_one_point():
+    """Rounding leaves them without a common point."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        angles, point = rng.uniform(0, 2 * np.pi) + np.array([0, 2, 4]) * np.pi / 3, 100 * rng.standard_normal(2)
+        G = np.column_stack([np.cos(angles), np.sin(angles)])
+        constraints = LinearConstraints(G, G @ point)
+        np.testing.assert_allclose(constraints.nearest(point + 1.0), point, atol=1e-9)
+        with pytest.raises(InputError, match="contradict each other"):
+            LinearConstraints(G, G @ point + 1e-10)
+
+
+@given(SEEDS)
+def test_nearest_is_allowed_if_the_solver_fails(seed):
+    def unsolvable(*arguments):
+        raise UnsolvableError("no")
+
+    rng, G, c, inside = polytope(seed, steps=3)
+    G[..., -1] = 0.0 if G.shape[2] > 1 else G[..., -1]  # an output without a constraint, which must not move
+    c = G @ inside - 0.1 * np.linalg.norm(G, axis=2)
+    constraints = LinearConstraints(G, c)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("guiderail.models.primitives.constraints.solve_least_norm", unsolvable)
+        for far in (1e-6, 1.0, 1e9):
+            wanted = inside + far * rng.standard_normal(len(inside))
+            for step in (0, 2, 7):
+                found = constraints.nearest(wanted, step)
+                n = min(step, 2)
+                size = np.linalg.norm(G[n], axis=1)
+                assert ((c[n] - G[n] @ found) / np.where(size > 0, size, 1)).max() <= 1e-9
+                assert len(found) == 1 or found[-1] == wanted[-1]
+        on_line = LinearConstraints.box([0.0, -1.0], [2.0, 1.0]).nearest(np.array([3.0, 2.0]))
+        np.testing.assert_allclose(on_line, [2.0, 1.0])
+        on_line = LinearConstraints.box([0.0, -1.0], [2.0, 1.0]).nearest(np.array([5.0, 1.0]))
+        np.testing.assert_allclose(on_line, [2.0, 0.25])
+
+
+def test_nearest_refuses_an_output_that_is_not_finite():
+    with pytest.raises(UnsolvableError, match="finite"):
+        LinearConstraints.box([0.0], [1.0]).nearest([np.nan])
+
+
+def test_scaled_constraints_hold_against_an_adversary():
+    for result in attack(6000).values():
+        assert result.worst <= 1e-9
+        assert result.corrected + result.fallbacks > 100
+
+
 @given(SEEDS)
 def test_nearest_is_allowed_and_no_allowed_point_is_nearer(seed):
     rng, G, c, inside = polytope(seed)
@@ -99,6 +195,7 @@ def test_nearest_is_allowed_and_no_allowed_point_is_nearer(seed):
 def test_violation_is_the_largest_of_the_rows_of_a_step(seed):
     rng, G, c, inside = polytope(seed, steps=4)
     constraints = LinearConstraints(G, c)
+    G, c = constraints.G, constraints.c
     assert (constraints.num_steps, constraints.num_constraints, constraints.num_outputs) == G.shape
     output = inside + rng.standard_normal(len(inside))
     for step in (0, 1, 3, 4, 100):
