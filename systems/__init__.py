@@ -6,4 +6,8 @@ All systems and the types of their constructor arguments are exported: `from gui
 
 import lazy_loader
 
+from guiderail.models.common.extras import require_extra
+
+require_extra("pydrake")
+
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,9 +14,9 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
+from guiderail.systems.support.drake_poses import pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import CommandValidity
 
 

@@ -5,8 +5,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from guiderail.models.common.poses import transform_to_pose
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_poses import transform_to_pose
 
 
 class MeasuredPose(LeafSystem):

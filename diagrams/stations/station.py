@@ -46,9 +46,10 @@ from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.poses import POSE_SIZE, pose_to_transform
+from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_poses import pose_to_transform
 
 Robot = TypeVar("Robot")
 

@@ -1,7 +1,8 @@
 """Poses as six coordinates [x y z Rz Ry Rx], in which the thesis records and commands."""
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from guiderail.models.common.transforms import RigidTransform, rpy_angles, rpy_rotation
 
 POSE_SIZE = 6
 """Number of coordinates of a pose."""
@@ -12,19 +13,12 @@ WRENCH_SIZE = 6
 
 def pose_to_transform(pose: np.ndarray) -> RigidTransform:
     """Return X = (Rz(a) Ry(b) Rx(c), [x y z]) of a pose [x y z a b c] (6,) [m, rad]."""
-    return RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
+    return RigidTransform(rpy_rotation(float(pose[5]), float(pose[4]), float(pose[3])), pose[:3])
 
 
 def transform_to_pose(X: RigidTransform) -> np.ndarray:
-    """Return the pose (6,) of a transform, with a and c in (−π, π] and b in [−π/2, π/2] [m, rad]."""
-    return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
-
-
-def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
-    """Return the quaternion (η, ε) of R_desired Rᵀ with η ≥ 0, the shorter rotation, which has no singularity."""
-    q = (R_desired @ R.inverse()).ToQuaternion()
-    sign = 1.0 if q.w() >= 0.0 else -1.0
-    return sign * q.w(), sign * q.xyz()
+    """Return the pose (6,) of a transform, Drake's included, with a and c in (−π, π] and b in [−π/2, π/2] [m, rad]."""
+    return np.concatenate([X.translation(), rpy_angles(X.rotation())[::-1]])
 
 
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:

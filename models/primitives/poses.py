@@ -1,13 +1,18 @@
 """Poses as outputs of a primitive: six continuous numbers in a target frame (thesis, section 4.4.2)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
+
+# Importing scipy.spatial takes a fifth of a second, and a primitive does not need it.
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Orientation = Literal["euler_zyx", "rotation_vector"]
 
@@ -40,6 +45,8 @@ def pose_outputs(
     Raises:
         InputError: If shapes do not match, a quaternion is zero, a number is not finite, or Euler angles are singular.
     """
+    from scipy.spatial.transform import Rotation
+
     positions, quaternions = np.asarray(positions, dtype=float), np.asarray(quaternions_wxyz, dtype=float)
     if positions.ndim != 2 or positions.shape[1] != 3 or quaternions.shape != (len(positions), 4):
         raise InputError(
@@ -70,6 +77,8 @@ def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "e
         orientation_numbers: Orientation outputs, (3,) or (N, 3) [rad].
         orientation: As in `pose_outputs`.
     """
+    from scipy.spatial.transform import Rotation
+
     if orientation == "euler_zyx":
         return Rotation.from_euler("ZYX", orientation_numbers)
     return Rotation.from_rotvec(orientation_numbers)

@@ -58,7 +58,10 @@ def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
 
 
 def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    import osqp
+    try:
+        import osqp
+    except ImportError as error:
+        raise InputError("the solver 'osqp' is not installed: pip install 'guiderail[osqp]'") from error
     from scipy import sparse
 
     size = rows.shape[1]

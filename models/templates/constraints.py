@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 from typing_extensions import override
 
+from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.geometry import (
     WORLD,
     Frames,
@@ -87,7 +87,7 @@ class ConstraintGroup:
         if p is not p_FE:
             X_WE = with_position_in(frame, p, X_WE, frames)
         if R is not R_FE:
-            X_WE = RigidTransform(axes(frame, frames).multiply(RotationMatrix(R)), X_WE.translation())
+            X_WE = RigidTransform(axes(frame, frames) @ R, X_WE.translation())
         return X_WE
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
@@ -334,9 +334,9 @@ class TiltConstraint(FrameConstraint):
         return (R if self.turns_along else R @ R_FH.T) @ matrix_deg(self.rpy_deg), p_FE
 
 
-def axes(frame: str, frames: Frames) -> RotationMatrix:
-    """Return R_WF, the orientation of a frame."""
-    return RotationMatrix() if frame == WORLD else frames[frame].rotation()
+def axes(frame: str, frames: Frames) -> np.ndarray:
+    """Return R_WF (3, 3), the orientation of a frame."""
+    return np.eye(3) if frame == WORLD else frames[frame].rotation().matrix()
 
 
 def nearest_turn(angle: float, center: float) -> float:

@@ -10,8 +10,14 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from guiderail.models.common.transforms import (
+    RigidTransform,
+    RotationMatrix,
+    axis_angle,
+    axis_angle_rotation,
+    rpy_rotation,
+)
 
 Frames = Mapping[str, RigidTransform]
 WORLD = "world"
@@ -22,7 +28,8 @@ NEAR_AXIS = 1e-9  # distance from the axis below which the bearing is undefined 
 @lru_cache(maxsize=64)
 def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
     """Return the rotation of roll, pitch and yaw angles (about fixed axes x, y, z) [deg]."""
-    return RotationMatrix(RollPitchYaw(*np.deg2rad(rpy_deg)))
+    roll, pitch, yaw = np.deg2rad(rpy_deg).tolist()
+    return rpy_rotation(roll, pitch, yaw)
 
 
 @lru_cache(maxsize=64)
@@ -75,7 +82,7 @@ def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
 
 def about(axis: Any, angle: float) -> RotationMatrix:
     """Return the rotation by `angle` [rad] about the unit vector `axis`."""
-    return RotationMatrix(AngleAxis(angle, axis))
+    return axis_angle_rotation(axis, angle)
 
 
 def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
@@ -112,9 +119,9 @@ def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> Rigi
         return X_WB
     p_WA, p_WB = X_WA.translation(), X_WB.translation()
     p_WX = p_WA + fraction * (p_WB - p_WA)
-    R_AB = X_WA.rotation().InvertAndCompose(X_WB.rotation()).ToAngleAxis()
-    R_AX = RotationMatrix(AngleAxis(fraction * R_AB.angle(), R_AB.axis()))
-    return RigidTransform(X_WA.rotation().multiply(R_AX), p_WX)
+    R_WA = X_WA.rotation().matrix()
+    axis, angle = axis_angle(RotationMatrix(R_WA.T @ X_WB.rotation().matrix()))
+    return RigidTransform(R_WA @ axis_angle_rotation(axis, fraction * angle).matrix(), p_WX)
 
 
 def interpolate(x: float, xs: tuple[float, ...], ys: tuple[float, ...]) -> float:

@@ -4,9 +4,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 from typing_extensions import override
 
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates.geometry import WORLD, Frames, about, bearing, interpolate, position_in, tilt_axis
 from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import Frames, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
@@ -118,7 +118,7 @@ class SharedControlTemplate:
     def displace(X_WE: RigidTransform, displacement: RigidTransform) -> RigidTransform:
         """Return H^im, translated in the world and rotated about E's origin: displace_q (equation 2.20)."""
         return RigidTransform(
-            displacement.rotation().multiply(X_WE.rotation()), X_WE.translation() + displacement.translation()
+            displacement.rotation().matrix() @ X_WE.rotation().matrix(), X_WE.translation() + displacement.translation()
         )
 
     def project(self, state: int, X_WE: RigidTransform, frames: Frames) -> RigidTransform:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pydrake.math import RigidTransform
 from typing_extensions import override
 
+from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.constraints import TiltLimits, axes
-from guiderail.models.templates.geometry import WORLD, Frames, angle_between, position_in, rotation_deg
+from guiderail.models.templates.geometry import WORLD, Frames, chord_angle, matrix_deg, position_in
 from guiderail.models.templates.kinds import TRANSITION_DISTANCES, register, require, require_three
 
 
@@ -113,4 +113,4 @@ class RotationToGo(TransitionDistance):
 
     @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
-        return angle_between(X_WE.rotation(), axes(self.frame, frames).multiply(rotation_deg(self.rpy_deg)))
+        return chord_angle(X_WE.rotation().matrix(), axes(self.frame, frames) @ matrix_deg(self.rpy_deg))

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates.geometry import Frames, pose_distance
 from guiderail.models.templates.template import SharedControlTemplate
 

@@ -2,7 +2,8 @@
 
 The four folders of the repository are the four parts of this package: `models` (numerics without Drake systems),
 `systems` (one LeafSystem a file), `diagrams` (wiring) and `tools` (the command and the Python API). Importing it
-registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use.
+registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use. Movement
+primitives, templates and `GuidedEnv` need neither Drake nor PyTorch, which the extras `sim` and `learn` install.
 """
 
 from importlib.metadata import version
@@ -10,8 +11,22 @@ from importlib.metadata import version
 import lazy_loader
 
 from guiderail.diagrams.tasks.registry import register_envs
+from guiderail.models.common.extras import explain_missing
 
 __version__ = version("guiderail")
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name.
+
+    Raises:
+        MissingExtraError: If it needs an extra that is not installed.
+    """
+    try:
+        return _load(name)
+    except ModuleNotFoundError as error:
+        raise (explain_missing(error) or error) from error
+
 
 register_envs()

@@ -5,11 +5,11 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems import cartesian_position_controller
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
+from guiderail.systems.support.drake_poses import pose_to_transform, transform_to_pose
 
 READY_POSTURE = np.array(IIWA14.home)
 START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from guiderail.models.common.poses import pose_to_transform
 from guiderail.systems import PoseWrench
+from guiderail.systems.support.drake_poses import pose_to_transform
 
 STEP = 1e-6
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from guiderail.models.common.errors import InputError, RunsFailedError
+from guiderail.models.common.extras import explain_missing
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app
 from guiderail.tools.cli.output import print_message
@@ -61,9 +62,10 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         code = 1
     except Exception as error:
-        if not hasattr(error, "format_message"):
+        missing = explain_missing(error) if isinstance(error, ModuleNotFoundError) else None
+        if missing is None and not hasattr(error, "format_message"):
             raise
-        print_message(_usage_sentence(error))
+        print_message(str(missing) if missing is not None else _usage_sentence(error))
         code = 2
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -19,7 +19,6 @@ from guiderail.diagrams.tasks.part.file import PartTaskFile
 from guiderail.diagrams.tasks.part.task import PartInsertion, write_workcell
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.parts.assembly_check import find_nearest_on_surface
 from guiderail.models.parts.demonstrator import (
@@ -30,6 +29,7 @@ from guiderail.models.parts.demonstrator import (
 )
 from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
+from guiderail.systems.support.drake_poses import pose_to_transform
 
 _VERTICES = 8  # number of vertices of a contact surface, those of the highest pressure, for which depth is measured
 _INTERVAL = 4  # simulator steps between two measurements of depth

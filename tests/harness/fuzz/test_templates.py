@@ -10,12 +10,12 @@ import numpy as np
 import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
-from pydrake.math import RigidTransform, RotationMatrix
 
 import guiderail.models.objects
 from fuzz.changes import changed_texts, changed_trees
 from fuzz.tally import attempt
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.common.yaml import parse_yaml
 from guiderail.models.templates import parse_template
 from guiderail.models.templates.transitions import TransitionDistance

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import mappings as im

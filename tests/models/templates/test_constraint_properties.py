@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates.geometry import WORLD, angle_between, position_in
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import geometry as g
 
 SEEDS = st.integers(0, 2**32 - 1)

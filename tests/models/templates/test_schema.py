@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RotationMatrix
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition, load_template
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import mappings as im

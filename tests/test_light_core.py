@@ -1,0 +1,101 @@
+"""The core of the package: movement primitives, templates and constraints run without Drake and PyTorch."""
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from guiderail.models.common.extras import EXTRAS
+
+BLOCK = f"""
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {sorted(EXTRAS)!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+
+
+def run_light(code, *, exit_code=0):
+    """Run code in an interpreter that has no module of an extra; return its output."""
+    program = BLOCK + textwrap.dedent(code)
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.returncode == exit_code, result.stderr
+    return result.stdout + result.stderr
+
+
+def test_primitive_and_templates_run_without_extras():
+    printed = run_light("""
+    import numpy as np
+    from guiderail import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory, load_template
+    from guiderail.models.common.transforms import RigidTransform
+    from guiderail.models.templates.validate import validate
+
+    t = np.linspace(0.0, 1.0, 50)
+    demonstrations = Demonstrations([t] * 3, [np.column_stack([np.sin(t), a * t]) for a in (0.9, 1.0, 1.1)])
+    reference = ReferenceTrajectory.from_demonstrations(demonstrations, 4, floor=1e-3)
+    constraints = LinearConstraints.box([-1.0, -1.0], [0.5, 2.0])
+    primitive = LcNsKmp(reference, horizon=10, constraints=constraints)
+    outputs = np.array([primitive.predict(step, np.array([50.0, 0.0])).output for step in range(50)])
+    assert outputs[:, 0].max() <= 0.5 + 1e-9 and outputs[:, 0].max() > 0.499
+
+    template = load_template("pouring")
+    frames = {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}
+    X_WE = RigidTransform([0.6, -0.3, 0.45])
+    state = template.state_at(X_WE, frames)
+    for _ in range(50):
+        request = template.displace(X_WE, template.map(state, np.array([0.0, 1.0, -1.0]), X_WE, frames, 0.02))
+        X_WE = template.command(state, X_WE, request, frames, 0.02).X_WE
+        assert template.violation(state, X_WE, frames) <= 1e-9
+        state = template.next_state(state, X_WE, frames, 0.02)
+    assert not [finding for finding in validate(template) if finding.is_error]
+    print(not {"pydrake", "torch", "pandas"} & set(sys.modules))
+    """)
+    assert printed.strip() == "True"
+
+
+@pytest.mark.parametrize(
+    ("code", "software", "extra"),
+    [
+        ("import guiderail; guiderail.Robot", "Drake", "sim"),
+        ("import guiderail.systems", "Drake", "sim"),
+        ("import gymnasium, guiderail; gymnasium.make('guiderail/NarrowPassage-v0')", "Drake", "sim"),
+        ("import guiderail; guiderail.train", "pandas", "sim"),
+    ],
+)
+def test_missing_extra_is_named_with_the_command_that_installs_it(code, software, extra):
+    printed = run_light(code, exit_code=1)
+    assert f'this needs {software}, which is not installed: pip install "guiderail[{extra}]"' in printed
+
+
+def test_command_without_extras_exits_with_2_and_one_sentence():
+    printed = run_light("from guiderail.tools.cli.entry import main; main()", exit_code=2)
+    assert printed == 'guiderail: this needs typer, which is not installed: pip install "guiderail[sim]"\n'
+
+
+def test_train_without_torch_exits_with_2_and_names_the_extra(tmp_path):
+    code = f"""
+    class Torch(Blocked):
+        def find_spec(self, name, path=None, target=None):
+            if name.partition(".")[0] in ("torch", "stable_baselines3", "sb3_contrib"):
+                raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+    sys.meta_path[0] = Torch()
+    sys.argv = ["guiderail", "train", "NarrowPassage", "--episodes", "1", "--out", {str(tmp_path / "run")!r}]
+    from guiderail.tools.cli.entry import main
+    main()
+    """
+    printed = run_light(code, exit_code=2)
+    assert 'which is not installed: pip install "guiderail[learn]"' in printed
+    assert len(printed.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_other_missing_module_is_not_explained():
+    printed = run_light(
+        "from guiderail.models.common.extras import require_extra; require_extra('absent')", exit_code=1
+    )
+    assert "ModuleNotFoundError: No module named 'absent'" in printed

@@ -1,0 +1,18 @@
+"""Entry point of the installed `guiderail` script, which also runs where the extras are missing."""
+
+import sys
+
+from guiderail.models.common.extras import explain_missing
+
+
+def main() -> None:
+    """Run the command; exit with 2 and one sentence if one of its dependencies is not installed."""
+    try:
+        from guiderail.tools.cli import main as command
+    except ModuleNotFoundError as error:
+        missing = explain_missing(error)
+        if missing is None:
+            raise
+        print(f"guiderail: {missing}", file=sys.stderr)
+        sys.exit(2)
+    command.main()
