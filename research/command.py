@@ -86,7 +86,8 @@ def find_task(task: str, imports: Iterable[str]) -> tuple[str, tuple[str, ...]]:
     Raises:
         InputError: If a module cannot be imported or a task folder is invalid.
     """
-    from guiderail.tools.environments import import_modules, task_named
+    from guiderail.tools.environments import task_named
+    from guiderail.tools.imports import import_modules
 
     modules = import_modules(imports)
     name, folders = task_named(task)

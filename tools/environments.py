@@ -1,13 +1,8 @@
-"""Environments by name: known tasks, their options, imports that register them, and `make_environment`."""
+"""Environments by name: known tasks, their options, and `make_environment`."""
 
 import hashlib
 import inspect
-import sys
-import traceback
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from importlib import import_module
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,41 +16,13 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_fol
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import parse_yaml
-
-_IMPORTED_FILES: dict[Path, bytes] = {}  # content of each file when it was imported
-IMPORT_HINT = ", or --import the file that registers it"
+from guiderail.tools.imports import IMPORT_HINT
 
 
 def known_tasks() -> list[str]:
     """Return the names of all registered tasks and of all environments in the namespace "guiderail"."""
     registered = (spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
     return sorted({*TASKS.names(), *registered})
-
-
-def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
-    """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
-
-    Returns:
-        Names to import them again; files and folders by their absolute paths, so that a run can be resumed from another
-        folder.
-
-    Raises:
-        InputError: If there is no such module, file or folder, or it cannot be imported.
-    """
-    names = []
-    for module in modules:
-        path = Path(module)
-        if is_task_folder(path):
-            register_task_folder(path)
-            names.append(str(path.resolve()))
-        elif path.suffix == ".py" and path.is_file():
-            names.append(_import_file(path))
-        elif _is_module(module):
-            names.append(_import_or_refuse(module, partial(import_module, module)).__name__)
-        else:
-            kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
-            raise InputError(f"there is no {kind} {module} to import: restore it, or give another --import")
-    return tuple(names)
 
 
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
@@ -101,50 +68,6 @@ def _read(file: Path) -> bytes:
     except OSError as error:
         raise InputError(f"{file} cannot be read ({error.strerror}): restore it") from error
     return len(content).to_bytes(8, "big") + content
-
-
-def _is_module(name: str) -> bool:
-    """Return True if there is a module of that name, even if its package cannot be imported."""
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError as error:
-        return not f"{name}.".startswith(f"{error.name}.")
-    except (ImportError, ValueError, TypeError):  # empty or relative name
-        return False
-
-
-def _import_file(path: Path) -> str:
-    """Run a file, with its folder on the path as for a program; once for each content."""
-    path = path.resolve()
-    content = path.read_bytes()
-    if _IMPORTED_FILES.get(path) == content:
-        return str(path)
-    name = f"guiderail_imported_{path.stem}"
-    spec = spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[name] = module_from_spec(spec)
-    folder = str(path.parent)
-    sys.path.insert(0, folder)
-    try:
-        _import_or_refuse(path.name, partial(spec.loader.exec_module, module))
-    finally:
-        sys.path.remove(folder)
-    _IMPORTED_FILES[path] = content
-    return str(path)
-
-
-def _import_or_refuse(name: str, load: Callable[[], Any]) -> Any:
-    """Return the imported module; raise an InputError with the line of an error in it."""
-    try:
-        return load()
-    except InputError:
-        raise
-    except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
-        words = " ".join(str(error).split())
-        raise InputError(f"importing {name} failed: {where}{type(error).__name__}: {words}") from error
 
 
 def task_options(task: str) -> dict[str, Any]:

@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.experiments.declaration import LEARNED, Study, load_study
 from guiderail.tools.experiments.job import Job
 from guiderail.tools.experiments.study import BREAKING_SUCCESS, curve, draw_sweeps, each, format_breaking_point
 from guiderail.tools.files import write_atomically
+from guiderail.tools.imports import import_modules
 from guiderail.tools.tables import cell, read_table, table_text
 from research.figures import FIGURES, figure_command
 from research.figures.thesis import THESIS

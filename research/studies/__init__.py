@@ -30,4 +30,5 @@ def study_path(name: str) -> Path:
 
 def study_command_line(name: str) -> str:
     """Return the command that runs a study of this folder from the root of a checkout."""
-    return f"guiderail study research/studies/{name}.yaml --out studies"
+    trust = " --trust-imports" if "\nimports:" in study_path(name).read_text(encoding="utf-8") else ""
+    return f"guiderail study research/studies/{name}.yaml --out studies{trust}"

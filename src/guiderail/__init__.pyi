@@ -43,6 +43,7 @@ from .tools.evaluation.evaluate import evaluate as evaluate
 from .tools.evaluation.rollout import Callback as Callback
 from .tools.evaluation.rollout import Transition as Transition
 from .tools.evaluation.rollout import rollout as rollout
+from .tools.imports import trust_imports as trust_imports
 from .tools.learning.learner import Learner as Learner
 from .tools.learning.learner import LearnerConfig as LearnerConfig
 from .tools.learning.learner import register_learner as register_learner

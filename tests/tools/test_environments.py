@@ -2,7 +2,8 @@ import pytest
 
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.models.common.errors import InputError
-from guiderail.tools.environments import changed_environment, check_environment, import_modules
+from guiderail.tools.environments import changed_environment, check_environment
+from guiderail.tools.imports import import_modules
 
 
 @pytest.mark.parametrize(("learned_on", "eval_set"), [("gantry", "mujoco"), ("gantry", "arm"), ("arm", "gantry")])

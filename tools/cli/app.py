@@ -143,6 +143,26 @@ Imports = Annotated[
 TaskImports = Annotated[
     list[str] | None, option("Module or file (.py) that registers the task.", "--import", metavar="MODULE")
 ]
+
+
+def _trust(context: typer.Context, value: bool) -> bool:
+    """Trust the imports of files until the command ends."""
+    if value:
+        from guiderail.tools.imports import trust_imports
+
+        context.with_resource(trust_imports())
+    return value
+
+
+TrustImports = Annotated[
+    bool,
+    option(
+        "Execute the modules and files that config.yaml or a study names under imports; without it they are refused by "
+        "name.",
+        "--trust-imports",
+        callback=_trust,
+    ),
+]
 Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
 Baseline = Annotated[str, option("Policy that acts in a TASK: scripted, {baselines}.", "--policy")]
 Baselines = Annotated[
@@ -244,7 +264,7 @@ def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tu
         InputError: If an import fails or the task folder is invalid.
     """
     if imports:
-        from guiderail.tools.environments import import_modules
+        from guiderail.tools.imports import import_modules
 
         import_modules(imports)
     if not (Path(typed) / "task.yaml").is_file():

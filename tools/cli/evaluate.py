@@ -47,6 +47,7 @@ def evaluate(
         Path | None, option("Hardware: folder of the table of episodes.  [default: hardware in the run]")
     ] = None,
     imports: cli.TaskImports = None,
+    trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
     """Evaluate a policy on held-out episodes, together with baseline policies.
@@ -141,6 +142,7 @@ def robustness(
     out: Annotated[
         Path | None, option("Folder to write, required for several runs.  [default: robustness/STATION in the run]")
     ] = None,
+    trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
     """Evaluate policies under friction, stiffness, sensor, command and timing errors.
@@ -185,6 +187,7 @@ def certify(
     ] = None,
     attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
     imports: cli.TaskImports = None,
+    trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
     """Compute bounds on all commands of a skill, for any action, and check them with an independent program.

@@ -25,6 +25,7 @@ def deploy(
     scenario: cli.Scenario = None,
     yes: cli.Yes = False,
     out: Annotated[Path | None, option("Folder of the recording.  [default: hardware in the run]")] = None,
+    trust_imports: cli.TrustImports = False,
 ) -> None:
     """Execute a policy on a robot.
 

@@ -24,6 +24,7 @@ def study(
     processes: Annotated[
         int | None, option("Number of runs in parallel.  [default: 2, or the cores of a cluster]")
     ] = None,
+    trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
     """Train and evaluate methods over seeds, as declared in a YAML file.
@@ -35,8 +36,10 @@ def study(
     from guiderail.tools.experiments import declaration
     from guiderail.tools.experiments.engines.engine import make_engine
     from guiderail.tools.experiments.study import study_command
+    from guiderail.tools.imports import import_stored
 
     declared = declaration.load_study(file)
+    import_stored(declared.imports, file)
     chosen = declared.subset(None if methods is None else methods.split(","), cli.parse_integers(seeds, "--seeds"))
     running = make_engine(engine or "process", processes, address)
     result = study_command(chosen, out, running, declared.subset_name(chosen))

@@ -60,6 +60,7 @@ def train(
     yes: cli.Yes = False,
     resume: Annotated[bool, option("Resume the run in --out.", "--resume")] = False,
     imports: cli.Imports = None,
+    trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
     """Train a policy and write a run folder.
@@ -71,7 +72,7 @@ def train(
     task, folders = (None, ()) if task is None else cli.find_task(task)
     modules = (*folders, *(imports or ()))
     if imports:
-        from guiderail.tools.environments import import_modules
+        from guiderail.tools.imports import import_modules
 
         modules = import_modules(modules)  # first, because one of them may register the station
     environment = cli.parse_environment(

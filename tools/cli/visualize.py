@@ -26,6 +26,7 @@ def visualize(
     policy: cli.Baseline = "scripted",
     episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
     imports: cli.TaskImports = None,
+    trust_imports: cli.TrustImports = False,
 ) -> None:
     """Show held-out episodes as a page that any browser opens, and redraw the learning curve of a run.
 
@@ -80,6 +81,7 @@ def report(
     episodes: Annotated[
         int, option("Held-out episodes for each run that no study evaluated; evaluated episodes are used again.")
     ] = 0,
+    trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
     """Write the results of runs or of a study as one self-contained page.

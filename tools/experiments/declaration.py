@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import string
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any
 
 from pydantic import (
@@ -25,7 +26,7 @@ from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import statistics_of
 
 Integer = Annotated[int, Field(strict=True)]  # without `strict`, YAML's `true` would be 1
-FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
+FolderName = Annotated[str, Field(pattern=r"^[\w-][\w.-]*\z", max_length=100)]
 LEARNED = "learned"
 
 
@@ -33,11 +34,17 @@ def _with_placeholders(**examples: Any) -> AfterValidator:
     """Return a validator of file names with placeholders in braces, each given by an example of its value."""
 
     def check(name: str) -> str:
+        known = ", ".join(f"{{{word}}}" for word in examples)
         try:
-            name.format(**examples)
-        except (LookupError, ValueError, TypeError, AttributeError):
-            known = ", ".join(f"{{{word}}}" for word in examples)
-            raise ValueError(f"{name!r} has an unknown placeholder: it may have {known}") from None
+            fields = [field[1:] for field in string.Formatter().parse(name) if field[1] is not None]
+        except ValueError:
+            raise ValueError(f"{name!r} has an open brace: it may have {known}") from None
+        # A format specification could ask for a width of gigabytes, and an attribute is no file name.
+        if any(word not in examples or specification or conversion for word, specification, conversion in fields):
+            raise ValueError(f"{name!r} has an unknown placeholder: it may have {known}")
+        path = PurePath(name.format(**examples))
+        if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in name:
+            raise ValueError(f"{name!r} would be outside the study's folder: name a path inside it")
         return name
 
     return AfterValidator(check)

@@ -9,6 +9,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import socket
 import traceback
 from collections.abc import Callable, Mapping
@@ -25,13 +26,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import (
-    changed_environment,
-    check_reset,
-    import_modules,
-    make_environment,
-    task_content,
-)  # fmt: skip
+from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.evaluate import evaluate_run
@@ -40,6 +35,7 @@ from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollo
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Study
 from guiderail.tools.experiments.engines.engine import Outcome
 from guiderail.tools.files import write_atomically
+from guiderail.tools.imports import import_modules  # fmt: skip
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.learning.train import configure, with_defaults
 
@@ -241,7 +237,8 @@ def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFram
 
 
 def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> Path:
-    values = {"name": eval_set.name.replace(" ", "_"), "after_episodes": episodes, "episodes": eval_set.episodes}
+    name = re.sub(r"[ /\\\0]", "_", eval_set.name).lstrip(".")  # a part of a path, inside the run's folder
+    values = {"name": name, "after_episodes": episodes, "episodes": eval_set.episodes}
     return job.folder.path / eval_set.file.format(**values, digest=digest(job, eval_set, episodes))
 
 

@@ -19,12 +19,12 @@ from rich.console import Console
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.metrics import wilson_of_each
 from guiderail.tools.experiments.declaration import Ratio, Study, Sweep
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, is_done, run_job
 from guiderail.tools.experiments.progress import StudyProgress
+from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import legend, new_figure, save_figure

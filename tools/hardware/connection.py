@@ -150,7 +150,7 @@ class RobotConnection:
         scenario = None if self.scenario is None else str(self.scenario.resolve())
         code = (
             "from pathlib import Path\n"
-            "from guiderail.tools.environments import import_modules\n"
+            "from guiderail.tools.imports import import_modules\n"
             "from guiderail.tools.hardware import sim_driver\n"
             f"import_modules({list(imports)!r})\n"
             f"sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "

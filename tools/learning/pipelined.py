@@ -260,7 +260,7 @@ def _serve(
     # Read at once: two processes that write into full pipes would deadlock, and a robot must not wait.
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     if imports:
-        from guiderail.tools.environments import import_modules  # Drake takes a second
+        from guiderail.tools.imports import import_modules  # Drake takes a second
 
         import_modules(imports)
     learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)

@@ -17,9 +17,10 @@ from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
-from guiderail.tools.environments import check_environment, import_modules, task_content
+from guiderail.tools.environments import check_environment, task_content
 from guiderail.tools.evaluation.metrics import check_rows
 from guiderail.tools.files import LOCK, remove_partial_files, write_atomically, write_error
+from guiderail.tools.imports import import_stored
 from guiderail.tools.learning.config import config_values, make_config
 from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
@@ -168,7 +169,8 @@ class RunFolder:
         """Read the configuration of the run, and import what registers its task and learner.
 
         Raises:
-            InputError: If the folder is not a run, or its configuration is invalid.
+            InputError: If the folder is not a run, its configuration is invalid, or it imports code without
+                `trust_imports`.
         """
         file = self.path / "config.yaml"
         try:
@@ -184,7 +186,7 @@ class RunFolder:
             values["environment"] = as_arguments(values["environment"])
             settings = dict(values["learner"])
             config = RunConfig(**values)
-            import_modules(config.imports)
+            import_stored(config.imports, file)
             return replace(config, learner=make_config(settings.pop("algorithm"), settings))
         except InputError:
             raise

@@ -14,10 +14,11 @@ import pandas as pd
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import check_environment, import_modules, task_content, task_named
+from guiderail.tools.environments import check_environment, task_content, task_named
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
+from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.interventions import Supervisor
 from guiderail.tools.learning.learner import check_log_formats

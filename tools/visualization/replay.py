@@ -137,8 +137,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         run=episode.run,
         # The frame of Meshcat's camera has y up.
         views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
-        # The name of a body cannot end the script.
-        data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
+        # The name of a body cannot end the script, or open a comment in it.
+        data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
     )
     write_atomically(html, _insert(page, episode.heading, caption).encode())
     return rows[episodes]

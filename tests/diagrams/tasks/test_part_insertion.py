@@ -15,7 +15,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.environments import import_modules
+from guiderail.tools.imports import import_modules
 
 PART = {"visual": "{}.obj", "mass": 0.1, "center": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
 BY_PHASE = {

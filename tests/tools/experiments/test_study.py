@@ -8,7 +8,7 @@ import yaml
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.tools.cli.main import main
-from guiderail.tools.environments import import_modules, make_environment
+from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import statistics_of, wilson
@@ -27,6 +27,7 @@ from guiderail.tools.experiments.study import (
     run_study,
     study_command,
 )
+from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
 from research.studies import study_names, study_path
@@ -305,7 +306,14 @@ WRONG = [
     ({"eval_set": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
     ({"eval_set": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
     ({"folder": "{guidance}-{seed}"}, "it may have {method}, {seed}, {episodes}, {algorithm}"),
-    ({"folder": "{method}-{seed"}, "has an unknown placeholder"),
+    ({"folder": "{method}-{seed"}, "has an open brace"),
+    ({"folder": "{method}-{seed:999999999}"}, "has an unknown placeholder"),
+    ({"folder": "{seed.__class__}"}, "has an unknown placeholder"),
+    ({"folder": "../{method}"}, "would be outside the study's folder"),
+    ({"folder": "/{method}"}, "would be outside the study's folder"),
+    ({"folder": "."}, "would be outside the study's folder"),
+    ({"methods": {"..": {}}}, "should match pattern"),
+    ({"eval_set": [{"file": "../{digest}.csv"}]}, "would be outside the study's folder"),
     (
         {"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]},
         "it may have {name}, {after_episodes}, {episodes}, {digest}",

@@ -46,7 +46,7 @@ def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
     try:
         for command in (["sim-driver"], ["safety-monitor"], None):
             monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries})
-            monkeypatch.setattr("guiderail.tools.environments._IMPORTED_FILES", {})
+            monkeypatch.setattr("guiderail.tools.imports._IMPORTED_FILES", {})
             TASKS._entries.pop("mine/Connector", None)  # as in another process
             if command is None:
                 exec(codes[0], {})

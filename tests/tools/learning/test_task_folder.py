@@ -11,10 +11,11 @@ import yaml
 import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
-from guiderail.tools.environments import import_modules, task_content
+from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.cache import episodes_file
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.job import Job, digest
+from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, start_or_resume
 

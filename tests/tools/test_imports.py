@@ -1,0 +1,104 @@
+"""Files that name code, such as the configuration of a run, execute it only if the user trusts them for that call."""
+
+import sys
+
+import pytest
+import yaml
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli.main import main
+from guiderail.tools.imports import import_modules, import_stored, trust_imports
+from guiderail.tools.learning.run_folder import RunFolder
+
+
+@pytest.fixture
+def canary(tmp_path):
+    """Return a module file that writes next to itself when it is executed, and the file it writes."""
+    file = tmp_path / "stored_module.py"
+    file.write_text("from pathlib import Path\nPath(__file__).with_name('executed').touch()\n")
+    return file, tmp_path / "executed"
+
+
+def name_imports(run, *modules):
+    file = run / "config.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"imports": list(map(str, modules))}))
+
+
+def test_run_configuration_executes_nothing_without_trust(bead_run, canary):
+    file, executed = canary
+    name_imports(bead_run, file)
+    with pytest.raises(InputError, match=r"stored_module.py.*--trust-imports"):
+        RunFolder(bead_run).config()
+    assert not executed.exists()
+    with trust_imports():
+        assert RunFolder(bead_run).config().imports == (str(file),)
+    assert executed.exists()
+    executed.unlink()
+    file.write_text(file.read_text() + "# changed after it was trusted\n")
+    RunFolder(bead_run).config()  # the file was named in this process
+
+
+def test_file_that_the_user_names_needs_no_trust(bead_run, canary):
+    file, executed = canary
+    name_imports(bead_run, file)
+    import_modules([str(file)])
+    executed.unlink()
+    RunFolder(bead_run).config()
+    assert not executed.exists(), "it was executed already"
+
+
+@pytest.mark.parametrize("name", ["stored_module", "stored_module.part", "json.tool"])
+def test_module_that_is_not_loaded_needs_trust(name, canary, monkeypatch):
+    file, executed = canary
+    monkeypatch.syspath_prepend(file.parent)
+    with pytest.raises(InputError, match="--trust-imports"):
+        import_stored([name], file)
+    assert not executed.exists()
+    assert name not in sys.modules
+
+
+@pytest.mark.parametrize("name", ["stored_module/part", "../stored_module", "/etc/stored_module", "", ".x", "a..b"])
+def test_path_is_no_module(name, canary, monkeypatch):
+    file, executed = canary
+    monkeypatch.syspath_prepend(file.parent)
+    with trust_imports(), pytest.raises(InputError, match="there is no"):
+        import_stored([name], file)
+    assert not executed.exists()
+
+
+def test_loaded_module_needs_no_trust(tmp_path):
+    assert import_stored(["json"], tmp_path / "config.yaml") == ("json",)
+
+
+COMMANDS = (
+    ("evaluate", "RUN"), ("robustness", "RUN"), ("certify", "RUN"), ("visualize", "RUN"), ("report", "RUN"),
+    ("train", "--resume", "--out", "RUN"), ("deploy", "RUN", "--sim", "--yes"),
+    ("evaluate", "RUN", "--station", "hardware", "--sim", "--yes"), ("study", "STUDY", "--out", "OUT"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_command_executes_nothing_from_a_folder_without_trust(words, bead_run, canary, capsys, tmp_path):
+    file, executed = canary
+    name_imports(bead_run, file)
+    study = tmp_path / "study.yaml"
+    study.write_text(f"name: s\ntask: Bead\nmethods: {{a: {{}}}}\nseeds: [0]\nimports: ['{file}']\n")
+    places = {"RUN": str(bead_run), "STUDY": str(study), "OUT": str(tmp_path / "out")}
+    with pytest.raises(SystemExit) as end:
+        main([places.get(word, word) for word in words])
+    message = capsys.readouterr().err
+    assert end.value.code == 2
+    assert str(file) in message
+    assert "--trust-imports" in message
+    assert not executed.exists()
+
+
+def test_trust_ends_with_the_command(bead_run, canary, capsys, tmp_path):
+    file, executed = canary
+    name_imports(bead_run, file)
+    with pytest.raises(SystemExit) as end:
+        main(["report", str(bead_run), "--out", str(tmp_path / "report.html"), "--trust-imports"])
+    assert end.value.code == 0
+    assert executed.exists()
+    with pytest.raises(InputError, match="--trust-imports"):
+        import_stored(["another_module"], file)

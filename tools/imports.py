@@ -1,0 +1,149 @@
+"""Imports of user code by name: modules, files and task folders that register tasks, guidance, stations or learners.
+
+A name that the user gives is imported by `import_modules`. A name that a file holds, such as the configuration of a
+run, is imported by `import_stored` only while `trust_imports` is active, because importing executes code.
+"""
+
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+from guiderail.diagrams.tasks.registry import is_task_folder, register_task_folder
+from guiderail.models.common.errors import InputError, brief
+
+IMPORT_HINT = ", or --import the file that registers it"
+
+_IMPORTED_FILES: dict[Path, bytes] = {}  # content of each file when it was imported
+_TRUSTED = ContextVar("trusted", default=False)  # whether imports that a file names may be executed
+
+
+@contextmanager
+def trust_imports(trusted: bool = True) -> Iterator[None]:
+    """Let files that are read in this context, such as run folders, import the code that they name.
+
+    Args:
+        trusted: Whether they may; False within a context that trusts them.
+    """
+    token = _TRUSTED.set(trusted)
+    try:
+        yield
+    finally:
+        _TRUSTED.reset(token)
+
+
+def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
+    """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
+
+    Returns:
+        Names to import them again; files and folders by their absolute paths, so that a run can be resumed from another
+        folder.
+
+    Raises:
+        InputError: If there is no such module, file or folder, or it cannot be imported.
+    """
+    names = []
+    for module in modules:
+        path = Path(module)
+        if is_task_folder(path):
+            register_task_folder(path)
+            names.append(str(path.resolve()))
+        elif path.suffix == ".py" and path.is_file():
+            names.append(_import_file(path))
+        elif _is_module(module):
+            names.append(_import_or_refuse(module, partial(import_module, module)).__name__)
+        else:
+            kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
+            raise InputError(f"there is no {kind} {module} to import: restore it, or give another --import")
+    return tuple(names)
+
+
+def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
+    """Import what a file names, as `import_modules`, if that executes nothing new or is trusted.
+
+    A task folder holds no code. A module that this process has imported, and a file that the user has named in this
+    process, need no trust.
+
+    Args:
+        modules: Names in the file.
+        source: The file, for messages.
+
+    Raises:
+        InputError: If code would be executed without trust, or as `import_modules`.
+    """
+    modules = tuple(modules)
+    if not _TRUSTED.get() and (untrusted := [module for module in modules if _executes(module)]):
+        names = [repr(module) if len(module) < 300 else brief(module) for module in untrusted[:2]]
+        more = [f"{len(untrusted) - len(names)} more"] if len(untrusted) > len(names) else []
+        raise InputError(
+            f"{source} imports {' and '.join([*names, *more])}, which would execute code: read it first, then give "
+            "--trust-imports"
+        )
+    return import_modules(modules)
+
+
+def _executes(module: str) -> bool:
+    """Return True if importing would execute code that the user has not named."""
+    path = Path(module)
+    if is_task_folder(path):
+        return False
+    if path.suffix == ".py" and path.is_file():
+        return path.resolve() not in _IMPORTED_FILES
+    return _is_dotted_name(module) and module not in sys.modules
+
+
+def _is_dotted_name(name: str) -> bool:
+    """Return True for identifiers joined by dots; `find_spec` would also take paths and relative names."""
+    return all(part.isidentifier() for part in name.split("."))
+
+
+def _is_module(name: str) -> bool:
+    """Return True if there is a module of that name, even if its package cannot be imported."""
+    if not _is_dotted_name(name):
+        return False
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError as error:
+        return not f"{name}.".startswith(f"{error.name}.")
+    except (ImportError, ValueError):  # such as __main__, which has no specification
+        return False
+
+
+def _import_file(path: Path) -> str:
+    """Run a file, with its folder on the path as for a program; once for each content."""
+    path = path.resolve()
+    content = path.read_bytes()
+    if _IMPORTED_FILES.get(path) == content:
+        return str(path)
+    name = f"guiderail_imported_{path.stem}"
+    spec = spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = module_from_spec(spec)
+    folder = str(path.parent)
+    sys.path.insert(0, folder)
+    try:
+        _import_or_refuse(path.name, partial(spec.loader.exec_module, module))
+    finally:
+        sys.path.remove(folder)
+    _IMPORTED_FILES[path] = content
+    return str(path)
+
+
+def _import_or_refuse(name: str, load: Callable[[], Any]) -> Any:
+    """Return the imported module; raise an InputError with the line of an error in it."""
+    try:
+        return load()
+    except InputError:
+        raise
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
+        words = " ".join(str(error).split())
+        raise InputError(f"importing {name} failed: {where}{type(error).__name__}: {words}") from error
