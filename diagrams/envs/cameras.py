@@ -15,7 +15,6 @@ from pydrake.geometry import (
     LightParameter,
     MakeRenderEngineVtk,
     Meshcat,
-    MeshcatParams,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
     RenderCameraCore,
@@ -27,6 +26,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
+from guiderail.diagrams.envs.meshcat_page import MeshcatPage
 from guiderail.models.common.errors import InputError
 
 _OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
@@ -133,15 +133,13 @@ def check_rendering() -> None:
 
 
 def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
-    """Open a browser view on localhost; Meshcat would listen on every interface by default.
-
-    Without an existing page, a new one is opened.
+    """Open a browser view on this machine, at an address with a token; without an existing page, a new one.
 
     Raises:
         InputError: If the environment forbids Drake to open a network port.
     """
     try:
-        meshcat = meshcat or Meshcat(MeshcatParams(host="localhost"))
+        meshcat = meshcat or MeshcatPage()
     except RuntimeError as error:
         raise InputError(
             f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"

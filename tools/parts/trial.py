@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatParams, Rgba, SurfaceTriangle, TriangleSurfaceMesh
+from pydrake.geometry import MeshcatAnimation, Rgba, SurfaceTriangle, TriangleSurfaceMesh
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import EventStatus
 
+from guiderail.diagrams.envs.meshcat_page import MeshcatPage
 from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
@@ -201,7 +202,7 @@ _SCALE = 10.0  # enlarges parts of some centimeters, which are too close to the 
 def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
     """Write the page of a trial: the parts, and hidden at first the contact pieces, each in its own color."""
     try:
-        meshcat = Meshcat(MeshcatParams(host="localhost"))
+        meshcat = MeshcatPage(is_served=False)
     except RuntimeError as error:
         raise InputError(f"the preview can't be made ({error}): set DRAKE_ALLOW_NETWORK=meshcat") from error
     rng = np.random.default_rng(2)

@@ -1,0 +1,163 @@
+"""Meshcat page behind a gateway: a random token in its address, an allow-list of origins, and checked messages.
+
+Meshcat's own server accepts any connection and parses any bytes: a web page in the same browser could move the sliders,
+and one malformed byte ends the process. `MeshcatPage` lets the gateway connect to it and then closes its port.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import secrets
+import socket
+import stat
+import subprocess
+import sys
+import weakref
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from pydrake.common import FindResourceOrThrow
+from pydrake.geometry import Meshcat, MeshcatParams
+
+END_TIMEOUT = 5.0  # of the gateway [s]
+
+
+class MeshcatPage(Meshcat):
+    """Meshcat whose page is served to those who know its address; everything else is as in its base class.
+
+    The page and its websocket are at a path with a random token. A connection is refused without the token, or with an
+    origin other than this page's. Messages of browsers are parsed here: Meshcat receives only inputs of controls that
+    exist, within their range.
+
+    Args:
+        is_served: Whether browsers may connect; without it the page only serves `StaticHtml`.
+
+    Raises:
+        RuntimeError: If the environment forbids Drake to open a network port, or Meshcat's own port cannot be closed.
+    """
+
+    def __init__(self, *, is_served: bool = True):
+        drake_logger = logging.getLogger("drake")
+        level = drake_logger.level
+        drake_logger.setLevel(logging.WARNING)  # it would print the address without the token
+        try:
+            super().__init__(MeshcatParams(host="localhost"))
+        finally:
+            drake_logger.setLevel(level)
+        self._gateway = _Gateway(super().port()) if is_served else None
+        if self._gateway is None:
+            _close_port(super().port(), keep=())
+        else:
+            self._close = weakref.finalize(self, self._gateway.close)
+
+    def close(self) -> None:
+        """Disconnect the browsers, and accept no others."""
+        if self._gateway is not None:
+            self._close()
+
+    def port(self) -> int:
+        """Return the port of the page; 0 if it is not served."""
+        return 0 if self._gateway is None else self._gateway.port
+
+    def web_url(self) -> str:
+        """Return the address of the page, with its token; empty if it is not served."""
+        return "" if self._gateway is None else f"http://localhost:{self.port()}/{self._gateway.token}/"
+
+    def ws_url(self) -> str:
+        """Return the address of the page's websocket, with its token; empty if it is not served."""
+        return self.web_url().replace("http://", "ws://")
+
+    def GetNumActiveConnections(self) -> int:
+        """Return the number of connected browsers."""
+        return 0 if self._gateway is None else self._gateway.read_browsers()
+
+
+class _Gateway:
+    """Process of the gateway of a page; see `page_gateway`.
+
+    Attributes:
+        port: Port of the page.
+        token: Secret part of its address.
+    """
+
+    def __init__(self, meshcat_port: int):
+        """Start the gateway, and close the port of Meshcat's server when the gateway is connected to it."""
+        self.token, self._num_browsers, self._rest = secrets.token_urlsafe(24), 0, b""
+        program = [sys.executable, "-I", str(Path(__file__).with_name("page_gateway.py"))]
+        self._process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        html, script = (FindResourceOrThrow(f"drake/geometry/meshcat.{ending}") for ending in ("html", "js"))
+        files = {"": html, "index.html": html, "meshcat.js": script}
+        try:
+            self._send(json.dumps({"port": meshcat_port, "token": self.token, "files": files}))
+            _close_port(meshcat_port, keep=[int(port) for port in self._receive().split()])
+            self._send("serve")
+            self.port = int(self._receive())
+            assert self._process.stdout is not None
+            os.set_blocking(self._process.stdout.fileno(), False)
+        except BaseException:
+            self.close()
+            raise
+
+    def _send(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n".encode())
+        self._process.stdin.flush()
+
+    def _receive(self) -> str:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline().decode()
+        if not line:
+            raise RuntimeError("the gateway of the page has ended")
+        return line
+
+    def read_browsers(self) -> int:
+        """Return the number of connected browsers."""
+        assert self._process.stdout is not None
+        *lines, self._rest = (self._rest + (self._process.stdout.read() or b"")).split(b"\n")
+        if lines:
+            self._num_browsers = int(lines[-1])
+        return self._num_browsers
+
+    def close(self) -> None:
+        """End the process."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with suppress(OSError):
+                pipe.close()
+        try:
+            self._process.wait(END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _close_port(port: int, keep: Sequence[int]) -> None:
+    """Replace this process's listening socket of a port by an unconnected one, and end its connections.
+
+    Drake has no interface for it. The descriptor keeps its number, so that Drake can close it at its end.
+
+    Args:
+        port: Port of the listening socket.
+        keep: Ports of peers whose connections stay.
+
+    Raises:
+        RuntimeError: If there is no such socket.
+    """
+    is_closed = False
+    for descriptor in map(int, os.listdir("/dev/fd")):
+        with suppress(OSError):  # closed meanwhile, such as that of the folder
+            if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+                continue
+            with socket.socket(fileno=os.dup(descriptor)) as one, socket.socket() as unconnected:
+                if one.family not in (socket.AF_INET, socket.AF_INET6) or one.getsockname()[1] != port:
+                    continue
+                if one.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+                    os.dup2(unconnected.fileno(), descriptor, inheritable=False)
+                    is_closed = True
+                elif one.getpeername()[1] not in keep:
+                    one.shutdown(socket.SHUT_RDWR)
+    if not is_closed:
+        raise RuntimeError("Meshcat's own port cannot be closed on this system")

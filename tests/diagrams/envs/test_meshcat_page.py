@@ -1,0 +1,286 @@
+"""A page acts only for those who have its token and origin, and survives any message."""
+
+import gc
+import os
+import socket
+import time
+import urllib.error
+import urllib.request
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydrake.geometry import Sphere
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from guiderail.diagrams.envs.meshcat_page import MeshcatPage
+from guiderail.diagrams.envs.page_gateway import MAX_GAMEPAD, MAX_MESSAGE, SceneCache, parse_event
+
+CONTROLS = {"x": (-2.0, 2.0), "keep": None}
+GAMEPAD = {"index": 0, "button_values": [0.5], "axes": [0.25, -1.0]}
+PAGES = []  # Meshcat must not be deleted by the garbage collector in the thread of a client
+
+
+@pytest.fixture(scope="module")
+def opened():
+    PAGES.append(page := MeshcatPage())
+    page.AddSlider("x", -2.0, 2.0, 0.5, 0.0, "KeyA", "KeyD")
+    page.AddButton("keep", "Enter")
+    page.Flush()
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def page(opened):
+    """Return the page with its slider at zero and its clicks taken."""
+    opened.SetSliderValue("x", 0.0)
+    opened.taken = opened.GetButtonClicks("keep")
+    return opened
+
+
+def origin(page, host="localhost"):
+    return f"http://{host}:{page.port()}"
+
+
+def browser(page, **changed):
+    return connect(**({"uri": page.ws_url(), "origin": origin(page), "compression": None, "proxy": None} | changed))
+
+
+def wait_until(condition):
+    for _ in range(500):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise TimeoutError
+
+
+def inputs(page):
+    return page.GetSliderValue("x"), page.GetButtonClicks("keep") - page.taken, list(page.GetGamepad().axes)
+
+
+def test_browser_with_token_and_origin_moves_the_controls(page):
+    for host in ("localhost", "127.0.0.1"):
+        with browser(page, origin=origin(page, host)) as one:
+            clicks = inputs(page)[1]
+            one.send(msgpack.packb({"type": "slider", "name": "x", "value": 7}))  # beyond the slider's limit
+            one.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": GAMEPAD}))
+            one.send(msgpack.packb({"type": "button", "name": "keep"}))
+            wait_until(lambda clicks=clicks: inputs(page)[1] == clicks + 1)
+            assert inputs(page) == (2.0, clicks + 1, [0.25, -1.0])
+            assert page.GetNumActiveConnections() == 1
+        # The gamepad of a closed browser must not stay deflected.
+        wait_until(lambda: not page.GetGamepad().axes)
+        wait_until(lambda: page.GetNumActiveConnections() == 0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "status"),
+    [
+        ({"path": ""}, 404),
+        ({"path": "/" + "A" * 32}, 404),
+        ({"token": lambda token: token[:-1]}, 404),
+        ({"token": lambda token: token + "A"}, 404),
+        ({"token": lambda token: token.swapcase()}, 404),
+        ({"origin": None}, 403),
+        ({"origin": "null"}, 403),
+        ({"origin": "http://localhost"}, 403),
+        ({"origin": "http://localhost:1"}, 403),
+        ({"origin": "http://example.org"}, 403),
+        ({"origin": "https://localhost:{port}"}, 403),
+        ({"origin": "http://localhost:{port}.example.org"}, 403),
+    ],
+)
+def test_connection_without_token_or_origin_is_refused(page, changed, status):
+    token = page._gateway.token
+    path = changed.get("path", f"/{changed.get('token', str)(token)}/")
+    allowed = changed.get("origin", origin(page))
+    allowed = allowed and allowed.format(port=page.port())
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        browser(page, uri=f"ws://localhost:{page.port()}{path}", origin=allowed) as one,
+    ):
+        one.send(msgpack.packb({"type": "button", "name": "keep"}))
+    assert refused.value.response.status_code == status
+    assert inputs(page) == (0.0, 0, [])
+
+
+def test_files_need_the_token(page):
+    address = page.web_url()
+    for name, size in (("", 5_000), ("meshcat.js", 500_000)):
+        with urllib.request.urlopen(address + name) as answer:
+            assert len(answer.read()) > size
+            assert answer.headers["X-Frame-Options"] == "DENY"
+    for other in (address.replace(page._gateway.token, "x"), address + "config.yaml", address + "../etc/passwd"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(other)
+
+
+def test_tokens_differ(page):
+    PAGES.append(other := MeshcatPage())
+    assert other._gateway.token != page._gateway.token
+    assert len(other._gateway.token) >= 32
+    assert other.port() != page.port()
+    other.close()
+
+
+def test_meshcat_itself_accepts_no_connection():
+    """Only the gateway listens: the server inside Meshcat, which a byte can end, is out of reach."""
+    PAGES.append(page := MeshcatPage(is_served=False))
+    port = super(MeshcatPage, page).port()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("localhost", port), 1.0)
+    page.SetTransform("/a", np.eye(4))
+    assert len(page.StaticHtml()) > 500_000
+    assert (page.web_url(), page.port(), page.GetNumActiveConnections()) == ("", 0, 0)
+
+
+@pytest.mark.parametrize("message", [b"\xc1", b"", b"\x81", "text", b"\xdd\xff\xff\xff\xff", b"\x91" * 5_000])
+def test_malformed_message_is_ignored(page, message):
+    with browser(page) as one:
+        one.send(message)
+        one.send(msgpack.packb({"type": "button", "name": "keep"}))
+        wait_until(lambda: inputs(page)[1] == 1)
+    page.SetTransform("/a", np.eye(4))
+    assert inputs(page) == (0.0, 1, [])
+
+
+def test_long_message_ends_its_connection_only(page):
+    with browser(page) as other, browser(page) as one:
+        one.send(b"\xc4" * (MAX_MESSAGE + 1))
+        with pytest.raises(ConnectionClosed):
+            list(one)
+        other.send(msgpack.packb({"type": "button", "name": "keep"}))
+        wait_until(lambda: inputs(page)[1] == 1)
+
+
+def test_bytes_that_are_no_websocket_are_survived(page):
+    for data in (b"\xc1", b"GET / HTTP/1.1\r\n" + b"a" * 100_000, b"POST / HTTP/1.1\r\n\r\n", b"\0" * 1000):
+        with socket.create_connection(("127.0.0.1", page.port()), 5.0) as one:
+            one.sendall(data)
+    with browser(page) as one:
+        one.send(msgpack.packb({"type": "button", "name": "keep"}))
+        wait_until(lambda: inputs(page)[1] == 1)
+
+
+def received(one):
+    messages = []
+    try:
+        while True:
+            messages.append(msgpack.unpackb(one.recv(timeout=0.3)))
+    except TimeoutError:
+        return messages
+
+
+def test_new_browser_receives_the_present_scene(page):
+    page.SetObject("/kept", Sphere(1.0))
+    page.SetTransform("/kept", np.eye(4))
+    page.SetTransform("/kept", 2.0 * np.eye(4))
+    page.SetObject("/gone/part", Sphere(1.0))
+    page.Delete("/gone")
+    page.AddButton("end")
+    page.DeleteButton("end")
+    page.SetSliderValue("x", 1.5)
+    with browser(page) as first:
+        received(first)  # the gateway has everything
+    with browser(page) as one, browser(page) as other:
+        messages = received(one)
+        assert {m["path"] for m in messages if m["type"] == "set_object"} == {"/kept"}
+        assert [m["matrix"][0] for m in messages if m.get("type") == "set_transform"] == [2.0]
+        assert {m["name"] for m in messages if m["type"] == "set_control"} == {"x", "keep"}
+        assert [m["value"] for m in messages if m["type"] == "set_control_value"] == [1.5]
+        received(other)
+        one.send(msgpack.packb({"type": "slider", "name": "x", "value": -1.0}))
+        assert [(m["name"], m["value"]) for m in received(other)] == [("x", -1.0)]
+        page.SetTransform("/kept", 3.0 * np.eye(4))
+        assert [m["matrix"][0] for m in received(other)] == [3.0]
+
+
+def test_page_leaves_no_process_port_or_descriptor():
+    gc.collect()
+    before = len(os.listdir("/dev/fd"))
+    page = MeshcatPage()
+    port, process = page.port(), page._gateway._process
+    assert process.poll() is None
+    del page
+    assert process.returncode == 0
+    assert len(os.listdir("/dev/fd")) == before
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), 1.0)
+
+
+def frame(kind, path, **more):
+    return msgpack.packb({"type": kind, "path": path, **more})
+
+
+def test_deletion_removes_what_is_below_it_only():
+    cache = SceneCache()
+    for path in ("/a", "/a/b", "/ab", "/c"):
+        cache.add(frame("set_object", path, object={}))
+        cache.add(frame("set_property", path, property="color", value=[1, 0, 0]))
+        cache.add(frame("set_property", path, property="visible", value=True))
+    cache.add(frame("delete", "/a"))
+    left = [msgpack.unpackb(one) for one in cache.frames()]
+    assert {one["path"] for one in left if one["type"] != "delete"} == {"/ab", "/c"}
+    assert len(left) == 7
+    cache.add(frame("set_object", "/a", object={}))
+    order = [(one["type"], one["path"]) for one in map(msgpack.unpackb, cache.frames())]
+    assert order.index(("delete", "/a")) < order.index(("set_object", "/a"))
+
+
+EVENTS = [
+    {"type": "slider", "name": "x", "value": 1.0},
+    {"type": "button", "name": "keep"},
+    {"type": "gamepad", "name": "", "gamepad": GAMEPAD},
+    {"type": "gamepad", "name": "", "gamepad": {}},
+]
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_valid_event_is_parsed(event):
+    assert parse_event(msgpack.packb(event), CONTROLS) == event
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        {"type": "slider", "name": "keep", "value": 1.0},
+        {"type": "slider", "name": "x", "value": float("nan")},
+        {"type": "slider", "name": "x", "value": float("inf")},
+        {"type": "slider", "name": "x", "value": True},
+        {"type": "slider", "name": "x", "value": "1"},
+        {"type": "slider", "name": "x"},
+        {"type": "button", "name": "x"},
+        {"type": "button", "name": "other"},
+        {"type": "button", "name": ["keep"]},
+        {"type": ["button"], "name": "keep"},
+        {"type": "camera_pose", "camera_pose": [0.0] * 16, "is_perspective": True},
+        {"type": "gamepad", "name": "", "gamepad": GAMEPAD | {"index": -1}},
+        {"type": "gamepad", "name": "", "gamepad": GAMEPAD | {"index": True}},
+        {"type": "gamepad", "name": "", "gamepad": GAMEPAD | {"axes": [0.0] * (MAX_GAMEPAD + 1)}},
+        {"type": "gamepad", "name": "", "gamepad": GAMEPAD | {"axes": [float("nan")]}},
+        {"type": "gamepad", "name": "", "gamepad": GAMEPAD | {"axes": 1.0}},
+        {"type": "gamepad", "name": "", "gamepad": [0]},
+        {"type": "gamepad", "name": ""},
+        [],
+        None,
+        {1: 2},
+    ],
+)
+def test_other_event_is_ignored(event):
+    assert parse_event(msgpack.packb(event), CONTROLS) is None
+
+
+def test_largest_gamepad_and_range_are_accepted():
+    gamepad = {"index": MAX_GAMEPAD - 1, "button_values": [], "axes": [2.0] * MAX_GAMEPAD}
+    event = parse_event(msgpack.packb({"type": "gamepad", "gamepad": gamepad}), CONTROLS)
+    assert event["gamepad"]["axes"] == [1.0] * MAX_GAMEPAD
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_a_valid_event_or_none(message):
+    event = parse_event(message, CONTROLS)
+    assert event is None or event["type"] in ("slider", "button", "gamepad")
