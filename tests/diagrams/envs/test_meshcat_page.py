@@ -189,7 +189,7 @@ def test_new_browser_receives_the_present_scene(page):
     with browser(page) as one, browser(page) as other:
         messages = received(one)
         assert {m["path"] for m in messages if m["type"] == "set_object"} == {"/kept"}
-        assert [m["matrix"][0] for m in messages if m.get("type") == "set_transform"] == [2.0]
+        assert [m["matrix"][0] for m in messages if m.get("path") == "/kept" and "matrix" in m] == [2.0]
         assert {m["name"] for m in messages if m["type"] == "set_control"} == {"x", "keep"}
         assert [m["value"] for m in messages if m["type"] == "set_control_value"] == [1.5]
         received(other)
