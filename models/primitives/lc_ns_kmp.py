@@ -7,10 +7,11 @@ constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.2), with neither KMP (2
 sKGRL (5.1 to 5.3).
 """
 
+from __future__ import annotations
+
 import hashlib
 from collections import OrderedDict
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -21,67 +22,13 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
+from guiderail.models.primitives.prediction import BatchPrediction, Modification, Prediction
 from guiderail.models.primitives.qp import UnsolvableError, find_solver
 from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import StepFactor, Window
 
-
-@dataclass(slots=True, eq=False)
-class Prediction:
-    """Output of a primitive at one step.
-
-    Attributes:
-        output: Output to execute (O,).
-        factor: Factor of the step.
-        x: History and null-space action of the prediction ((P + 1) O,).
-        correction: Smallest correction v (r,) that satisfies the constraints, or None if every constraint is slack;
-            `output_sizes` is its largest effect per norm.
-        signed_multipliers: Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower
-            bound, or None.
-    """
-
-    output: np.ndarray
-    factor: StepFactor
-    x: np.ndarray
-    correction: np.ndarray | None = None
-    signed_multipliers: np.ndarray | None = None
-
-    @property
-    def constrained(self) -> bool:
-        """True if a constraint of the window is active."""
-        return self.correction is not None
-
-    @property
-    def multipliers(self) -> np.ndarray:
-        """Multipliers α (H+1, F) ≥ 0, zero where a constraint is slack; computed at each access."""
-        if self.signed_multipliers is None:
-            return np.zeros(self.factor.multipliers_shape)
-        return self.factor.multipliers(self.signed_multipliers)
-
-    @property
-    def trajectory(self) -> np.ndarray:
-        """Modified window (H+1, O); computed at each access."""
-        return self.factor.trajectory(self.x, self.correction)
-
-
-@dataclass(frozen=True)
-class Modification:
-    """Part of a motion, modified by null-space actions at several of its points.
-
-    Attributes:
-        steps: Steps of the reference (n,), including steps past its end.
-        trajectory: Outputs (n, O), within the constraints.
-        multipliers: Multipliers α (n, F) ≥ 0, zero where a constraint is slack.
-    """
-
-    steps: np.ndarray
-    trajectory: np.ndarray
-    multipliers: np.ndarray
-
-    @property
-    def constrained(self) -> bool:
-        """True if a constraint is active."""
-        return bool(self.multipliers.any())
+if TYPE_CHECKING:
+    from guiderail.models.primitives.stepper import PrimitiveStepper
 
 
 class LcNsKmp:
@@ -185,6 +132,58 @@ class LcNsKmp:
             raise InputError(f"step counts from 0, not {step}")
         factor = self._cache.get(step) or self._factor(step)
         return self._finish(factor, self._stack(null_space_action, history))
+
+    def predict_batch(
+        self, steps: ArrayLike, null_space_actions: np.ndarray | None = None, histories: np.ndarray | None = None
+    ) -> BatchPrediction:
+        """Compute the outputs of B predictions at once, each equal to that of `predict`.
+
+        Predictions at the same step are two matrix products; a QP is solved for those with an active constraint only.
+
+        Args:
+            steps: Steps n ≥ 0 (B,), or one step for all; past the end, the last step.
+            null_space_actions: ξ̂ (B, O), as in `predict`; zero by default, for which `histories` or `steps` give B.
+            histories: (B, P, O), as in `predict`; None if P = 0.
+
+        Raises:
+            InputError: If an argument has the wrong shape or is not finite.
+        """
+        x, at = self._stack_batch(steps, null_space_actions, histories)
+        outputs = np.empty((len(x), self.num_outputs))
+        is_constrained, is_solved = np.zeros(len(x), dtype=bool), np.ones(len(x), dtype=bool)
+        order = np.argsort(at, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(at[order])) + 1) if len(x) else ():
+            factor = self._factor(int(at[rows[0]]))
+            some = x if len(rows) == len(x) else x[rows]
+            violates = ~factor.find_slack(some)
+            outputs[slice(None) if some is x else rows] = some @ factor.output_map.T + factor.output_offset
+            for row in rows[violates]:
+                try:
+                    outputs[row] = self._finish(factor, x[row]).output
+                except UnsolvableError:
+                    outputs[row], is_solved[row] = np.nan, False
+            is_constrained[rows] = violates
+        return BatchPrediction(outputs, is_constrained, is_solved)
+
+    def start(
+        self,
+        pose: ArrayLike | None = None,
+        gain: ArrayLike | None = None,
+        history_source: Literal["commanded", "measured"] = "commanded",
+    ) -> PrimitiveStepper:
+        """Begin an episode of commands, one a control step, without a diagram.
+
+        Args:
+            pose: Measured output (O,) that fills the history; the first mean by default.
+            gain: Raw null-space action per unit of the action of `PrimitiveStepper.step`, (O,); ones by default.
+            history_source: Outputs that the motion continues from.
+
+        Raises:
+            InputError: If an argument has the wrong shape or is not finite.
+        """
+        from guiderail.models.primitives.stepper import PrimitiveStepper
+
+        return PrimitiveStepper(self, pose, gain, history_source)
 
     def predict_at(
         self,
@@ -361,6 +360,35 @@ class LcNsKmp:
         if not np.isfinite(x @ x):
             raise InputError("history and null-space action must be finite")
         return x
+
+    def _stack_batch(
+        self, steps: ArrayLike, null_space_actions: np.ndarray | None, histories: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Check the arguments of a batch; return x (B, (P + 1) O) and the steps (B,), at most the last one."""
+        at = as_numbers(steps, "steps")
+        if at.ndim > 1 or not (at >= 0).all() or (at % 1 != 0).any():
+            raise InputError(f"steps are whole numbers from 0 on, one for each prediction, not {brief(steps)}")
+        actions = None if null_space_actions is None else np.asarray(null_space_actions, dtype=float)
+        past = np.zeros(0) if histories is None else np.asarray(histories, dtype=float)
+        given = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
+        size = len(given[0]) if given else at.size
+        if actions is not None and actions.shape != (size, self.num_outputs):
+            raise InputError(f"null-space actions have shape ({size}, {self.num_outputs}), not {actions.shape}")
+        if self.history == 0:
+            if past.size:
+                raise InputError("this primitive has no history (P = 0): pass None")
+        elif past.shape != (size, *self._history_shape):
+            raise InputError(f"histories have shape {(size, *self._history_shape)}, not {past.shape}")
+        if at.ndim and len(at) != size:
+            raise InputError(f"there are {len(at)} steps for {size} predictions")
+        x = np.zeros((size, (self.history + 1) * self.num_outputs))
+        if self.history:
+            x[:, : -self.num_outputs] = past.reshape(size, -1)
+        if actions is not None:
+            x[:, -self.num_outputs :] = actions
+        if not np.isfinite(x).all():
+            raise InputError("histories and null-space actions must be finite")
+        return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _factor(self, step: int) -> StepFactor:
         if not float(step).is_integer():

@@ -1,0 +1,119 @@
+"""Episode of a movement primitive without a diagram: history, gains and fallback, one command a control step."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
+from guiderail.models.primitives.qp import UnsolvableError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command of one control step.
+
+    Attributes:
+        output: Command (O,).
+        violation: max(c − G y) of the command: negative if all constraints are slack, −inf without constraints.
+        is_fallback: True if no window within the constraints was found, and the command is the point nearest to the
+            last command within the constraints of its step.
+    """
+
+    output: np.ndarray
+    violation: float
+    is_fallback: bool
+
+
+class PrimitiveStepper:
+    """Commands of a primitive in consecutive control steps, as `LcNsKmpSystem` computes them in a diagram.
+
+    Args:
+        primitive: Primitive with O outputs.
+        pose: Measured output (O,) that fills the history; the first mean by default.
+        gain: Raw null-space action per unit of the action (O,); ones by default.
+        history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
+            or is pushed by an operator.
+
+    Raises:
+        InputError: If an argument has the wrong shape or is not finite.
+
+    Attributes:
+        primitive: Primitive.
+        gain: Gain (O,).
+        num_steps: Number of steps taken.
+    """
+
+    def __init__(
+        self,
+        primitive: LcNsKmp,
+        pose: ArrayLike | None = None,
+        gain: ArrayLike | None = None,
+        history_source: Literal["commanded", "measured"] = "commanded",
+    ):
+        if history_source not in ("commanded", "measured"):
+            raise InputError(f"history_source is commanded or measured, not {brief(history_source)}")
+        self.primitive, self.num_steps = primitive, 0
+        self.gain = np.ones(primitive.num_outputs) if gain is None else self._checked(gain, "gain")
+        first = primitive.reference.means[0]
+        pose = first if pose is None else self._checked(pose, "pose")
+        self._is_measured = history_source == "measured"
+        self._history = np.tile(pose, (primitive.history, 1))
+        self._last = primitive.constraints.nearest(first)
+
+    def step(self, action: ArrayLike, pose: ArrayLike | None = None) -> Command:
+        """Compute the command of the next control step.
+
+        Args:
+            action: Policy's action (O,), in [−1, 1].
+            pose: Measured output (O,); required for a measured history.
+
+        Raises:
+            InputError: If an argument has the wrong shape or is not finite, or a measured history has no pose.
+        """
+        step, raw, history = self.request(action, pose)
+        try:
+            return self.finish(self.primitive.predict(step, raw, history).output)
+        except UnsolvableError:
+            return self.finish(None)
+
+    def request(self, action: ArrayLike, pose: ArrayLike | None = None) -> tuple[int, np.ndarray, np.ndarray | None]:
+        """Return the arguments of `LcNsKmp.predict` for the next step, for a batch of several episodes.
+
+        Args:
+            action: Policy's action (O,), as in `step`.
+            pose: Measured output (O,), as in `step`.
+
+        Raises:
+            InputError: As `step`.
+        """
+        action = self._checked(action, "action")
+        if self._is_measured and self.num_steps and self.primitive.history:
+            if pose is None:
+                raise InputError("a measured history needs the measured pose at every step")
+            self._append(self._checked(pose, "pose"))
+        return self.num_steps, self.gain * action, self._history if self.primitive.history else None
+
+    def finish(self, output: np.ndarray | None) -> Command:
+        """Return the command of a prediction's output (O,), or of None where none was found; the step is complete."""
+        constraints = self.primitive.constraints
+        is_fallback = output is None
+        self._last = constraints.nearest(self._last, self.num_steps) if output is None else output
+        command = Command(self._last, constraints.violation(self._last, self.num_steps), is_fallback)
+        if not self._is_measured:
+            self._append(self._last)
+        self.num_steps += 1
+        return command
+
+    def _append(self, output: np.ndarray) -> None:
+        if self.primitive.history:
+            self._history = np.concatenate([self._history[1:], output[None]])
+
+    def _checked(self, values: ArrayLike, what: str) -> np.ndarray:
+        checked = as_numbers(values, what)
+        if checked.shape != (self.primitive.num_outputs,) or not np.isfinite(checked).all():
+            raise InputError(f"{what} must be {self.primitive.num_outputs} finite numbers, not {brief(values)}")
+        return checked

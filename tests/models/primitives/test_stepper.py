@@ -1,0 +1,109 @@
+"""The stepper commands what the diagram of KGRL and sKGRL commands, and never a point outside the constraints."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
+from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+
+PERIOD, STEPS = 0.02, 40
+GAIN = np.array([20.0, 30.0])
+
+
+def primitive(history=3, upper=0.5):
+    t = PERIOD * np.arange(STEPS)
+    reference = ReferenceTrajectory(t, np.column_stack([t, np.sin(t)]), np.tile(0.01 * np.eye(2), (STEPS, 1, 1)))
+    constraints = LinearConstraints.box([-np.inf, -0.1], [upper, 0.6])
+    return LcNsKmp(reference, history=history, horizon=8, constraints=constraints)
+
+
+def commands_of_diagram(p, action, pose, steps):
+    builder = DiagramBuilder()
+    kmp = builder.AddSystem(LcNsKmpSystem(p, GAIN, PERIOD))
+    source = builder.AddSystem(ConstantVectorSource(action))
+    builder.Connect(source.get_output_port(), kmp.get_null_space_action_input_port())
+    if p.history:
+        buffer = builder.AddSystem(HistoryBuffer(2, p.history, PERIOD))
+        initial = builder.AddSystem(ConstantVectorSource(pose))
+        builder.Connect(buffer.get_history_output_port(), kmp.get_history_input_port())
+        builder.Connect(kmp.get_command_output_port(), buffer.get_output_input_port())
+        builder.Connect(initial.get_output_port(), buffer.get_initial_output_input_port())
+    simulator = Simulator(builder.Build())
+    context, commands = kmp.GetMyContextFromRoot(simulator.get_context()), []
+    for step in range(steps):
+        simulator.AdvanceTo(PERIOD * (step + 0.5))
+        commands.append(kmp.get_command_output_port().Eval(context).copy())
+    return np.array(commands)
+
+
+@pytest.mark.parametrize("history", [0, 3])
+@pytest.mark.parametrize("action", [[0.0, 0.0], [1.0, -1.0]])
+def test_commands_equal_those_of_the_diagram(history, action):
+    p, pose = primitive(history), np.array([0.01, -0.02])
+    stepper = p.start(pose, GAIN)
+    commands = np.array([stepper.step(action).output for _ in range(STEPS + 5)])
+    np.testing.assert_array_equal(commands, commands_of_diagram(p, action, pose, STEPS + 5))
+
+
+def test_violation_is_that_of_the_command_and_never_positive():
+    stepper = primitive(upper=0.3).start(gain=[1e5, 1e5])
+    worst = [stepper.step([1.0, 1.0]) for _ in range(STEPS)]
+    assert max(command.violation for command in worst) <= 1e-9
+    assert worst[-1].violation == pytest.approx(0.0, abs=1e-9)
+    assert not any(command.is_fallback for command in worst)
+
+
+def test_fallback_is_nearest_to_the_last_command_and_inside(monkeypatch):
+    p = primitive(history=0)
+    stepper = p.start()
+    last = stepper.step([0.0, 0.0]).output
+
+    def fail(*_):
+        raise UnsolvableError("no solution")
+
+    monkeypatch.setattr(p, "predict", fail)
+    command = stepper.step([1.0, 1.0])
+    assert command.is_fallback
+    np.testing.assert_array_equal(command.output, last)
+    assert stepper.num_steps == 2
+
+
+def test_measured_history_follows_the_measured_pose():
+    p = primitive()
+    commanded, measured = p.start([0.0, 0.0]), p.start([0.0, 0.0], history_source="measured")
+    pose = np.array([0.0, 0.05])
+    first = [stepper.step([0.0, 0.0], [0.0, 0.0]).output for stepper in (commanded, measured)]
+    np.testing.assert_array_equal(*first)
+    for _ in range(3):
+        a, b = (stepper.step([0.0, 0.0], pose).output for stepper in (commanded, measured))
+    assert b[1] > a[1] + 0.01
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"pose": [0.0]}, "pose must be 2 finite numbers"),
+        ({"pose": [0.0, np.nan]}, "pose must be 2 finite numbers"),
+        ({"gain": [1.0, 2.0, 3.0]}, "gain must be 2 finite numbers"),
+        ({"history_source": "guessed"}, "commanded or measured"),
+    ],
+)
+def test_wrong_start_is_refused(keywords, message):
+    with pytest.raises(InputError, match=message):
+        primitive().start(**keywords)
+
+
+def test_wrong_step_is_refused_and_the_episode_goes_on():
+    stepper = primitive().start(history_source="measured")
+    for action in ([0.0], [np.nan, 0.0], [np.inf, 0.0]):
+        with pytest.raises(InputError, match="action must be 2 finite numbers"):
+            stepper.step(action)
+    stepper.step([0.0, 0.0])
+    with pytest.raises(InputError, match="measured pose at every step"):
+        stepper.step([0.0, 0.0])
+    assert stepper.num_steps == 1
