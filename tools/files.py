@@ -1,5 +1,6 @@
 """Output files and folders: complete or absent, and checked before anything is computed for them."""
 
+import glob
 import os
 import re
 import shutil
@@ -89,11 +90,15 @@ def check_writable(path: Path) -> None:
 def atomic_folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that is renamed to `out` at the end, or removed after an error.
 
+    What killed processes left of the same folder is removed.
+
     Raises:
         InputError: If the folder cannot be written.
     """
     temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
-    shutil.rmtree(temporary, ignore_errors=True)
+    for left in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
+        if _is_abandoned(left.name) and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
     try:
         temporary.mkdir(parents=True)
         yield temporary

@@ -17,6 +17,8 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 """Length of one unit of a file [m]."""
 
 SMALLEST, LARGEST = 1e-3, 0.5  # bounds of the longest side of a part that an arm inserts [m]
+MAX_FILE_SIZE = 200_000_000  # [bytes]
+MAX_TRIANGLES = 500_000  # of a file; checking a million takes two minutes
 _KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
 
 
@@ -82,20 +84,34 @@ def load_part(path: Path, unit: str) -> Part:
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
-    if not path.is_file():
-        raise InputError(f"there is no file {path}: name the part's mesh")
+    try:
+        if not path.is_file():
+            raise InputError(f"there is no file {path}: name the part's mesh")
+        file_size = path.stat().st_size
+    except OSError as error:  # such as a name that is too long
+        raise InputError(f"{brief(str(path))} can't be read ({error.strerror}): check the path") from error
+    if file_size > MAX_FILE_SIZE:
+        raise InputError(f"{path} is larger than {MAX_FILE_SIZE} bytes: export it with a coarser tolerance")
     mesh = _read(path)
     if mesh is None or not len(mesh.faces):
         raise InputError(f"{path} holds no triangles: export the part as a mesh")
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    mesh.update_faces(mesh.nondegenerate_faces())
-    if not np.isfinite(mesh.vertices).all():
+    if len(mesh.faces) > MAX_TRIANGLES:
+        raise InputError(
+            f"{path} has {len(mesh.faces)} triangles, more than {MAX_TRIANGLES}: export it with a coarser tolerance"
+        )
+    corners = np.asarray(mesh.vertices, dtype=float)[mesh.faces.ravel()]
+    if not np.isfinite(corners).all():
         raise InputError(f"{path} holds vertices that are NaN or infinite: export it again")
-    size = float(mesh.extents.max()) * UNITS[unit]
+    with np.errstate(over="ignore"):
+        size = float(np.ptp(corners, axis=0).max()) * UNITS[unit]
     if not SMALLEST <= size <= LARGEST:
         fitting = [name for name, scale in UNITS.items() if SMALLEST <= size / UNITS[unit] * scale <= LARGEST]
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
+    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    if not len(mesh.faces):
+        raise InputError(f"{path} holds triangles without an area only: export the part as a mesh")
     bodies = []
     parts = mesh.split(only_watertight=False, repair=False)
     for body in parts:

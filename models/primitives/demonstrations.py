@@ -71,6 +71,8 @@ class Demonstrations:
         for name in self.names:
             if not (isinstance(name, str) and name.isprintable() and name == name.strip() and len(name) <= 200):
                 raise InputError(f"an output can't be named {brief(name)}: use a short text that can be printed")
+        if repeated := io.find_repeated(self.names):
+            raise InputError(f"two outputs are called {brief(repeated)}: rename one")
 
     def _drop_repeated_samples(self) -> None:
         """Drop the copies of a sample that a recorder logs if it runs faster than its robot."""

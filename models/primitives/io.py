@@ -13,7 +13,7 @@ import sys
 import zipfile
 import zlib
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import prod
 from pathlib import Path
 from tokenize import TokenError
@@ -251,6 +251,8 @@ def _read_csv(data: bytes) -> Recording:
         header = [name.strip() for name in next(rows, [])]
         is_numbered = header[:2] == ["demonstration", "time"]
         _check_clock(header, int(is_numbered))
+        if repeated := find_repeated(header):
+            raise InputError(f"it has two columns {brief(repeated)}: keep only the right one")
         for row in rows:
             if not row:
                 continue
@@ -271,6 +273,12 @@ def _read_csv(data: bytes) -> Recording:
         return Recording([samples[:, 0]], [samples[:, 1:]], header[1:])
     parts = _split_samples(samples)
     return Recording([part[:, 1] for part in parts], [part[:, 2:] for part in parts], header[2:])
+
+
+def find_repeated(names: Iterable[str]) -> str:
+    """Return the first name that occurs twice; empty if there is none, because a column may have no name."""
+    names = list(names)
+    return next((name for number, name in enumerate(names) if name and name in names[:number]), "")
 
 
 def _check_clock(header: list[str], column: int) -> None:

@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import check_seed
-from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_partial_files
+from guiderail.tools.files import LOCK, atomic_folder, check_page, check_picture, check_writable, remove_partial_files
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
@@ -92,3 +92,13 @@ def test_partial_files_of_running_processes_stay(ended_process, tmp_path):
         path.touch()
     remove_partial_files(tmp_path)
     assert all(path.exists() for path in kept)
+
+
+def test_atomic_folder_removes_what_a_killed_process_left(ended_process, tmp_path):
+    for name in (f".peg.{ended_process}.part", f".pegs.{ended_process}.part", f".peg.{os.getppid()}.part", ".peg.part"):
+        (tmp_path / name / "parts").mkdir(parents=True)
+    with atomic_folder(tmp_path / "peg") as folder:
+        (folder / "file").touch()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"peg", f".pegs.{ended_process}.part", f".peg.{os.getppid()}.part", ".peg.part"}
+    assert [path.name for path in (tmp_path / "peg").iterdir()] == ["file"]

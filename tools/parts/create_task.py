@@ -28,7 +28,8 @@ from guiderail.models.parts.assembly_check import (
 from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces, to_arrays
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
 from guiderail.models.parts.symmetry import find_symmetries
-from guiderail.tools.files import atomic_folder, check_writable
+from guiderail.tools.datasets.paths import check_new
+from guiderail.tools.files import atomic_folder
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 MODULI = (2e9, 1e10, 3e10)  # moduli of the compliant part [Pa], tried in this order until it is stiff enough
@@ -40,6 +41,10 @@ FAST_ENOUGH = 4.0  # real-time factor from which the other part is not tried as 
 MIN_SPEED = 2.0  # real-time factor below which less penetration does not count
 DENSITY = 2700.0  # density of a part, that of aluminum [kg/m³]; a gantry is weightless
 CLEAR = 3.0 * MM  # height of the start above the rim
+MAX_GAP = 1.0 * MM  # between the bounding boxes of parts that are assembled
+MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
+MAX_FORCE = 1e4  # largest force limit [N]
+MAX_CENTER = 1.0  # largest distance of the axis from the plug's own [m]
 
 
 @dataclass(frozen=True)
@@ -110,10 +115,24 @@ def read_parts(
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
     first, second = (part.transform(to_target, np.zeros(3)) for part in (first, second))
+    _refuse_separate(first, second)
     origin = np.array([*compute_center_of_mass(first)[:2], first.bounds[0, 2]])
     if center is not None:
-        origin[:2] = (to_target @ (np.asarray(center, dtype=float) * scale))[:2]
+        on_axis = (to_target @ (np.asarray(center, dtype=float) * scale))[:2]
+        if not np.linalg.norm(on_axis - origin[:2]) <= MAX_CENTER:
+            raise InputError(f"--center {list(center)} is not near the plug: give a point on the axis of insertion")
+        origin[:2] = on_axis
     return first.transform(np.eye(3), -origin), second.transform(np.eye(3), -origin)
+
+
+def _refuse_separate(plug: Part, socket: Part) -> None:
+    """Raise InputError if the bounding boxes of the assembled parts are apart."""
+    gaps = np.maximum(plug.bounds[0] - socket.bounds[1], socket.bounds[0] - plug.bounds[1])
+    if not gaps.max() <= MAX_GAP:
+        raise InputError(
+            f"the parts are {1e3 * gaps.max():.4g} mm apart: draw them assembled in one frame, or place the plug with "
+            "--plug-pose"
+        )
 
 
 def _rotation(angles: np.ndarray) -> np.ndarray:
@@ -156,10 +175,8 @@ def create_task(
     Raises:
         InputError: If the parts cannot be used; no folder is left then.
     """
-    if out.exists():
-        raise InputError(f"{out} already exists: name another folder with --out, or remove it")
-    check_writable(out)
-    _check_arguments(friction, scenario)
+    check_new(out, "folder with --out, or remove it")
+    _check_arguments(plug_pose, turn, force_limit, friction, scenario)
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     check_target(*parts)
     path = plan_motion(*parts, turn * DEGREE, CLEAR)
@@ -172,8 +189,16 @@ def create_task(
     return {"task": str(out), **measured, "page": str(out / "preview.html")}
 
 
-def _check_arguments(friction: float, scenario: Sequence[Path]) -> None:
+def _check_arguments(
+    plug_pose: Sequence[float], turn: float, force_limit: float, friction: float, scenario: Sequence[Path]
+) -> None:
     """Raise InputError for arguments that would be refused only after minutes."""
+    if not np.isfinite(plug_pose).all():
+        raise InputError(f"--plug-pose is finite, not {list(plug_pose)}")
+    if not abs(turn) <= MAX_TURN:
+        raise InputError(f"--turn is at most {MAX_TURN:g} degrees either way, not {turn:g}")
+    if not 0.0 < force_limit <= MAX_FORCE:
+        raise InputError(f"--force-limit is positive and at most {MAX_FORCE:g} N, not {force_limit:g}")
     from guiderail.diagrams.envs.options import validate_options
     from guiderail.diagrams.tasks.part.file import FILE_NAME, Piece
 
@@ -236,6 +261,11 @@ def _write_task(
     say(f"misaligned by 1.5 mm: {'blocked (as required)' if is_blocked else 'seated, but must be blocked'}")
     penetration = max(trial.penetration for trial in (aligned, *misaligned))
     succeeded, page = demonstrate(folder, file), folder / "preview.html"
+    if not succeeded:
+        raise InputError(
+            "none of the 5 scripted demonstrations seats the plug: check --plug-pose, --axis, --center and --turn, or "
+            "give a larger --force-limit"
+        )
     measured = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
         "compliant": contact.compliant,

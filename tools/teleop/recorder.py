@@ -196,6 +196,9 @@ class DemonstrationRecorder:
         self.task, self.out = EnvConfig.resolve(task, environment).make_task(), out
         if self.task.workcell_kind != "workcell":
             raise InputError(f"{task} has no tool that can be led: demonstrate a task that inserts a part")
+        kind = self.task.config.station_kind
+        if not kind.is_simulated:
+            raise InputError(f"demonstrations are recorded in simulation: leave station={kind.name} out")
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", make_station(self.task))
         builder.ExportInput(self.station.get_desired_pose_input_port(), "desired_pose")

@@ -1,5 +1,8 @@
 """A faulty mesh is refused in one sentence with the remedy."""
 
+from contextlib import nullcontext
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -56,6 +59,10 @@ def test_load_part_returns_metres(ending, tmp_path):
         (hollow, "mm", "has a closed cavity, around .*fill it"),
         (one_flipped, "mm", "face different ways.*recalculate"),
         (lambda mesh: mesh, "m", "would be 20 m long with --unit m: is its unit mm or cm"),
+        (lambda mesh: mesh.apply_scale(1e30), "mm", "would be 2e.28 m long"),
+        (lambda mesh: mesh.apply_scale(1e-30), "mm", "would be 2e-32 m long|holds no triangles"),
+        (lambda mesh: trimesh.Trimesh(np.zeros((1, 3)), [[0, 0, 0]], process=False), "mm", "would be 0 m long"),
+        (lambda mesh: trimesh.Trimesh([[0, 0, 0], [9, 0, 0]], [[0, 0, 1]], process=False), "mm", "without an area"),
     ],
 )
 def test_load_part_names_the_remedy_when_a_mesh_is_faulty(spoil, unit, message, tmp_path):
@@ -70,3 +77,24 @@ def test_load_part_refuses_files_without_a_mesh(tmp_path):
     for name in ("part.stl", "part.txt", "none.stl"):
         with pytest.raises(InputError):
             load_part(tmp_path / name, "mm")
+
+
+def test_load_part_refuses_a_name_that_no_file_system_takes():
+    with pytest.raises(InputError, match="check the path"):
+        load_part(Path("n" * 300 + ".stl"), "mm")
+
+
+@pytest.mark.parametrize(("limit", "is_accepted"), [(12, True), (11, False)])
+def test_number_of_triangles_is_limited(limit, is_accepted, tmp_path, monkeypatch):
+    monkeypatch.setattr("guiderail.models.parts.mesh_file.MAX_TRIANGLES", limit)
+    box().export(tmp_path / "part.stl")
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="12 triangles, more than 11"):
+        load_part(tmp_path / "part.stl", "mm")
+
+
+@pytest.mark.parametrize(("more", "is_accepted"), [(0, True), (-1, False)])
+def test_size_of_a_mesh_file_is_limited(more, is_accepted, tmp_path, monkeypatch):
+    box().export(file := tmp_path / "part.stl")
+    monkeypatch.setattr("guiderail.models.parts.mesh_file.MAX_FILE_SIZE", file.stat().st_size + more)
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="is larger than"):
+        load_part(file, "mm")

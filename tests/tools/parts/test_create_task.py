@@ -1,6 +1,7 @@
 """Two meshes become a task by the command alone: it is checked, inserted, trained, evaluated and replayed."""
 
 import json
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import gymnasium
@@ -203,6 +204,13 @@ def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
         (("--unit", "mm"), "does not pass the socket"),
         (("--unit", "mm", "--axis", "z"), "--axis is one of"),
         (("--unit", "mm", "--plug-pose", "1,2"), "--plug-pose takes 6 numbers"),
+        (("--unit", "mm", "--plug-pose", "1e9,0,0,0,0,0"), "mm apart: draw them assembled"),
+        (("--unit", "mm", "--center", "1e9,0,0"), "is not near the plug"),
+        (("--unit", "mm", "--turn", "361"), "--turn is at most 360"),
+        (("--unit", "mm", "--turn", "nan"), "--turn is at most 360"),
+        (("--unit", "mm", "--force-limit", "0"), "--force-limit is positive"),
+        (("--unit", "mm", "--force-limit", "10001"), "--force-limit is positive"),
+        (("--unit", "mm", "--out", tmp_path / ("n" * 300)), "check it"),
         (("--unit", "mm", "--out", folder), "already exists"),
         (("--unit", "mm", "--friction", "5"), "friction must be at most 2, not 5"),
         (("--unit", "mm", "--scenario", tmp_path / "none.yaml"), "there is no scenario"),
@@ -230,3 +238,23 @@ def test_parts_drawn_in_another_pose_give_the_same_task(tmp_path):
         np.testing.assert_allclose(one.bounds, other.bounds, atol=1e-8)
     with pytest.raises(InputError, match="--axis"):
         read_parts(plug, socket, "mm", (0,) * 6, "up", None)
+
+
+@pytest.mark.parametrize(("apart", "is_accepted"), [(0.9, True), (1.1, False)])
+def test_assembled_parts_are_not_apart(apart, is_accepted, tmp_path):
+    from guiderail.tools.parts.create_task import read_parts
+
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    first, second = read_parts(plug, socket, "mm", (0,) * 6, "+z", None)
+    beside = 1e3 * (second.bounds[1, 0] - first.bounds[0, 0]) + apart
+    with nullcontext() if is_accepted else pytest.raises(InputError, match=r"the parts are 1\.1 mm apart"):
+        read_parts(plug, socket, "mm", (beside, 0, 0, 0, 0, 0), "+z", None)
+
+
+@pytest.mark.parametrize(("distance", "is_accepted"), [(999.0, True), (1001.0, False)])
+def test_axis_is_near_the_plug(distance, is_accepted, tmp_path):
+    from guiderail.tools.parts.create_task import read_parts
+
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="is not near the plug"):
+        read_parts(plug, socket, "mm", (0,) * 6, "+z", (distance, 0, 0))

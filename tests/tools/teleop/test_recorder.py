@@ -304,3 +304,8 @@ def test_recorder_raises_when_arguments_are_invalid(tmp_path):
     for task, file in (("GridClamp", "there.npz"), ("GridClamp", "new.txt"), ("NarrowPassage", "new.npz")):
         with pytest.raises(InputError):
             DemonstrationRecorder(task, {}, tmp_path / file, meshcat=Page())
+
+
+def test_recorder_refuses_a_hardware_station(tmp_path):
+    with pytest.raises(InputError, match="recorded in simulation: leave station=hardware out"):
+        DemonstrationRecorder("BncConnector", {"station": "hardware"}, tmp_path / "recorded.npz")

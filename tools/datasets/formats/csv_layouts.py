@@ -19,7 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.primitives.io import SECONDS
+from guiderail.models.common.files import read_bytes
+from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
 from guiderail.tools.datasets.formats.recorded import POSE_NAMES, UNITS, Recorded, poses_in_target, rotations_of
 from guiderail.tools.datasets.paths import in_order
 
@@ -166,7 +167,8 @@ def _table(file: Path) -> list[_Column]:
         InputError: If it is not a table of numbers, or a line has more or fewer fields than the header.
     """
     try:
-        text = file.read_text(encoding="utf-8-sig")  # Excel writes a byte-order mark, which is not part of a name
+        data = read_bytes(file, "table", MAX_FILE_SIZE)
+        text = data.decode("utf-8-sig")  # Excel writes a byte-order mark, which is not part of a name
         first = next((line for line in io.StringIO(text) if line.strip()), "")
         delimiter = next((one for one in _DELIMITERS if one in first), ",")
         lines = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True, strict=True)
@@ -183,6 +185,8 @@ def _table(file: Path) -> list[_Column]:
         raise InputError(f"{file} is not a table of numbers below a line of names: {brief(str(error))}") from error
     if not names:
         raise InputError(f"{file} is not a table of numbers below a line of names: it is empty")
+    if repeated := find_repeated(name.strip() for name in names):
+        raise InputError(f"{file} has {repeated[:200]} and {repeated[:200]}: keep only one of the two columns")
     table = np.frombuffer(values, dtype=float).reshape(-1, len(names))
     return [_Column(name.strip(), column) for name, column in zip(names, table.T, strict=True)]
 

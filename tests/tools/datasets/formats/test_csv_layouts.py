@@ -118,6 +118,7 @@ def test_common_delimiters_are_detected(between, file):
         ("t,is.x_m,is.y_m,is.z_m,set.x_m,set.y_m,set.z_m", "is.x_m and set.x_m"),
         ("t,x_m,y_m,z_m,qx,qx,qy,qz,qw", "qx and qx"),
         ("t,x_m,y_m,z_m,q1,q2,q3,q4,q4", "q4 and q4"),
+        ("t,x_m,y_m,z_m,force,force", "force and force"),
     ],
 )
 def test_ambiguous_columns_are_both_named(header, named, file):
