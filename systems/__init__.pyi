@@ -31,6 +31,7 @@ from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter
 from .pose_wrench import PoseWrench as PoseWrench
 from .recorder import Recorder as Recorder
 from .recorder import Recording as Recording
+from .reference_governor import ReferenceGovernor as ReferenceGovernor
 from .relative_poses import RelativePoses as RelativePoses
 from .residual import Residual as Residual
 from .reward_system import RewardSystem as RewardSystem

@@ -9,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
+from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support.declarations import declare_cache, declare_plant_context, input_getter, output_getter
 from guiderail.systems.support.drake_poses import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import LastValidPose
@@ -26,6 +27,7 @@ class ImpedanceGains:
         posture_stiffness: Stiffness of the return to the posture [Nm/rad], not negative, finite.
         posture_damping: Decay rate of null-space motion [1/s], not negative, finite. Its torque is this rate times M v,
             which dissipates energy in every posture.
+        bound: Bound of the wrench along the axes of the stiffness frame, in place of `wrench_limits`; default: none.
     """
 
     stiffness: np.ndarray
@@ -34,6 +36,7 @@ class ImpedanceGains:
     damping_ratio: float = 1.0
     posture_stiffness: float = 10.0
     posture_damping: float = 5.0
+    bound: WrenchBound | None = None
 
     def __post_init__(self) -> None:
         K = np.asarray(self.stiffness, dtype=float)
@@ -68,6 +71,7 @@ class CartesianImpedanceController(LeafSystem):
         - desired_pose
         - estimated_state
         - command_time (optional)
+        - max_wrench (optional)
         output_ports:
         - generalized_force
         - pose
@@ -77,7 +81,8 @@ class CartesianImpedanceController(LeafSystem):
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
-    is not connected, commands never time out. ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench``
+    is not connected, commands never time out. ``max_wrench`` is (8,), [fx fy fz tx ty tz] along the axes of the gains,
+    norm of the force and norm of the torque [N, Nm]; it lowers the bound and cannot raise it. ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench``
     is (6,), force first, in the axes of T. ``saturation`` (1,) is 1 while the wrench or a motor is at its limit.
     ``command_timed_out`` (1,) is 1 while no valid command is available.
 
@@ -129,10 +134,11 @@ class CartesianImpedanceController(LeafSystem):
             timeout=timeout,
         )
 
+        self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
         state = {self._estimated_state_port.ticket()}
         self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
         self._law = declare_cache(
-            self, "law", self._calc_law, prerequisites_of_calc=self._followed_pose.tickets | state
+            self, "law", self._calc_law, prerequisites_of_calc=self._followed_pose.tickets | state | {self._max_wrench_port.ticket()}
         )
         law = {self._law.ticket()}
         self._generalized_force_port = self.DeclareVectorOutputPort(
@@ -155,6 +161,7 @@ class CartesianImpedanceController(LeafSystem):
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
+    get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
     get_generalized_force_output_port = output_getter("generalized_force", "joint torques, (n,) [Nm]")
     get_pose_output_port = output_getter("pose", "measured pose of the tool center, (6,)")
     get_impedance_wrench_output_port = output_getter("impedance_wrench", "wrench of spring and damper, (6,)")
@@ -195,7 +202,14 @@ class CartesianImpedanceController(LeafSystem):
             posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
             gravity_torque=self._gravity_torque(plant_context),
             torque_limits=self._torque_limits,
+            bound=self._bound(context),
         )
+
+    def _bound(self, context: Context) -> WrenchBound | None:
+        if not self._max_wrench_port.HasValue(context):
+            return self._gains.bound
+        bound = self._gains.bound or WrenchBound(np.asarray(self._gains.wrench_limits), np.inf, np.inf)
+        return bound.lowered_to(self._max_wrench_port.Eval(context))
 
     def _gravity_torque(self, plant_context: Context) -> np.ndarray:
         if not self._compensate_gravity:

@@ -77,6 +77,7 @@ class MujocoGantry(LeafSystem):
         - nominal_body_poses
         output_ports:
         - pose
+        - state
         - wrench
         - impedance_wrench
         - body_poses
@@ -84,7 +85,7 @@ class MujocoGantry(LeafSystem):
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
     output of the static plant; ``body_poses`` contains the same poses with the simulated ones of tool and workpiece.
-    ``geometry_poses`` contains the poses of all frames with geometry. ``wrench`` is the filtered wrench y, (6,), force
+    ``state`` is (12,), the pose and its velocity. ``geometry_poses`` contains the poses of all frames with geometry. ``wrench`` is the filtered wrench y, (6,), force
     first, in N and Nm. ``impedance_wrench`` is (6,), the forces and torques of the six motors in the order of the pose.
     Positions, velocities and warm start of the engine and the state of the filter are declared state.
 
@@ -157,6 +158,9 @@ class MujocoGantry(LeafSystem):
             return self.DeclareVectorOutputPort(name, 6, calc, prerequisites_of_calc=state)
 
         self._pose_port = declare_state_output("pose", self._positions)
+        self._state_port = self.DeclareVectorOutputPort(
+            "state", 2 * POSE_SIZE, self._calc_state, prerequisites_of_calc=state
+        )
         self._wrench_port = declare_state_output("wrench", self._filtered)
         self._impedance_wrench_port = self.DeclareVectorOutputPort(
             "impedance_wrench",
@@ -178,6 +182,7 @@ class MujocoGantry(LeafSystem):
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_nominal_body_poses_input_port = input_getter("nominal_body_poses", "body poses of the static plant")
     get_pose_output_port = output_getter("pose", "pose of the tool center, (6,)")
+    get_state_output_port = output_getter("state", "pose of the tool center and its velocity, (12,)")
     get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
     get_impedance_wrench_output_port = output_getter("impedance_wrench", "forces and torques of the six motors, (6,)")
     get_body_poses_output_port = output_getter("body_poses", "poses of all bodies of the plant")
@@ -272,6 +277,10 @@ class MujocoGantry(LeafSystem):
         """Return the wrench of the generalized contact forces: slides are the axes of T, a hinge a carries a · t."""
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        state = self._values(context)
+        output.SetFromVector([*state[self._positions], *state[self._velocities]])
 
     def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
         model, state = self.model, self._values(context)

@@ -197,6 +197,7 @@ class HardwareStation(Station):
             contact_force=impedance_monitor.get_contact_force_output_port(),
             saturation=controller.get_saturation_output_port(),
             command_timed_out=limiter.get_not_following_output_port(),
+            max_wrench=None if self.impedance.bound is None else controller.get_max_wrench_input_port(),
         )
         builder.ExportOutput(limiter.get_fault_output_port(), "fault")
         builder.ExportOutput(limiter.get_arm_state_output_port(), "arm_state")

@@ -125,7 +125,11 @@ class DisturbedStation(Station):
             "wrench": wrench.get_disturbed_measurement_output_port(),
         }
         export_station_ports(
-            builder, commands.get_command_input_port(), station.get_command_time_input_port(), **outputs
+            builder,
+            commands.get_command_input_port(),
+            station.get_command_time_input_port(),
+            max_wrench=station.GetInputPort("max_wrench") if station.HasInputPort("max_wrench") else None,
+            **outputs,
         )
         for name in SIMULATION_PORTS:
             builder.ExportOutput(station.GetOutputPort(name), name)

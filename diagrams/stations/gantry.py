@@ -123,7 +123,11 @@ class GantryStation(Station):
             desired = add_joint_impedance(
                 builder,
                 impedance,
+                damping=damping(impedance),
+                mass=moving_mass(plant),
+                time_step=time_step,
                 pose=pose.get_output_port(),
+                state=plant.get_state_output_port(gantry),
                 wrench=wrench,
                 impedance_wrench=plant.get_net_actuation_output_port(gantry),
             )
@@ -150,6 +154,12 @@ class GantryStation(Station):
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositions(plant_context, self.gantry, check_pose(pose, POSE_SIZE))
         self.plant.SetVelocities(plant_context, self.gantry, np.zeros(POSE_SIZE))
+
+
+def moving_mass(plant: MultibodyPlant) -> float:
+    """Return the mass of the tool with the bodies that are fixed to it [kg]; the links are negligible."""
+    tool = plant.GetBodiesWeldedTo(plant.GetBodyByName("tool_center"))
+    return float(sum(body.default_mass() for body in tool))
 
 
 def max_stable_time_step(impedance: Impedance) -> float:

@@ -15,6 +15,7 @@ from guiderail.diagrams.stations.station import (
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.reference_governor import ReferenceGovernor
 
 
 def add_controller(
@@ -37,6 +38,7 @@ def add_controller(
                 wrench_limits=to_wrench_order(impedance.limits),
                 posture=controller_plant.posture,
                 damping_ratio=impedance.damping_ratio,
+                bound=impedance.bound,
             ),
             period=period,
             compensate_gravity=compensate_gravity,
@@ -74,19 +76,47 @@ def add_impedance_control(
         contact_force=monitor.get_contact_force_output_port(),
         saturation=controller.get_saturation_output_port(),
         command_timed_out=controller.get_command_timed_out_output_port(),
+        max_wrench=None if impedance.bound is None else controller.get_max_wrench_input_port(),
     )
     return controller.get_generalized_force_output_port()
 
 
 def add_joint_impedance(
-    builder: DiagramBuilder, impedance: Impedance, *, pose: OutputPort, wrench: OutputPort, impedance_wrench: OutputPort
+    builder: DiagramBuilder,
+    impedance: Impedance,
+    *,
+    damping: np.ndarray,
+    mass: float,
+    time_step: float,
+    pose: OutputPort,
+    state: OutputPort,
+    wrench: OutputPort,
+    impedance_wrench: OutputPort,
 ) -> OutputPort:
-    """Add watchdog and monitor of six joints that have an impedance, and export the ports of a station.
+    """Add watchdog, governor and monitor of six joints with an impedance, and export the ports of a station.
 
-    All ports are (6,): positions, wrench, and forces of the joints. Returns the port of the desired positions.
+    Args:
+        builder: Builder of the station.
+        impedance: Impedance of the joints.
+        damping: Damping of the joints, (6,) [N s/m, Nm s/rad].
+        mass: Moving mass [kg].
+        time_step: Time step of the plant [s].
+        pose: Port of the joint positions, (6,).
+        state: Port of the joint positions and velocities, (12,).
+        wrench: Port of the measured wrench, (6,).
+        impedance_wrench: Port of the forces of the joints, (6,).
+
+    Returns:
+        Port of the desired positions, (6,).
     """
     watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
+    governor = None
+    if impedance.bound is not None:
+        stiffness = np.array(impedance.stiffness)
+        governor = builder.AddNamedSystem(
+            "governor", ReferenceGovernor(stiffness, damping, mass, time_step, impedance.bound)
+        )
     builder.Connect(pose, watchdog.get_pose_input_port())
     builder.Connect(impedance_wrench, monitor.get_impedance_wrench_input_port())
     export_station_ports(
@@ -98,5 +128,10 @@ def add_joint_impedance(
         contact_force=monitor.get_contact_force_output_port(),
         saturation=monitor.get_saturation_output_port(),
         command_timed_out=watchdog.get_command_timed_out_output_port(),
+        max_wrench=None if governor is None else governor.get_max_wrench_input_port(),
     )
-    return watchdog.get_safe_pose_output_port()
+    if governor is None:
+        return watchdog.get_safe_pose_output_port()
+    builder.Connect(watchdog.get_safe_pose_output_port(), governor.get_desired_pose_input_port())
+    builder.Connect(state, governor.get_state_input_port())
+    return governor.get_reference_pose_output_port()

@@ -202,7 +202,11 @@ class MujocoStation(Station):
         desired_pose = add_joint_impedance(
             builder,
             impedance,
+            damping=damping(impedance),
+            mass=CARRIAGE_MASS + inertia.get_mass(),
+            time_step=time_step,
             pose=gantry.get_pose_output_port(),
+            state=gantry.get_state_output_port(),
             wrench=gantry.get_wrench_output_port(),
             impedance_wrench=gantry.get_impedance_wrench_output_port(),
         )

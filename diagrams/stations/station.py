@@ -7,6 +7,8 @@ input              size   meaning
 =================  =====  ==========================================================================================
 `desired_pose`     6      desired pose X_TP of the tool center P, [x y z Rz Ry Rx] in meters and radians
 `command_time`     1      optional: time of `desired_pose` [s]; if it stops, the last safe pose is held
+`max_wrench`       8      optional, only if the impedance is bounded: largest [fx fy fz tx ty tz], norm of the force
+                          and norm of the torque [N, Nm]; lowers the bound of the impedance
 =================  =====  ==========================================================================================
 
 =================  =====  ==========================================================================================
@@ -47,6 +49,7 @@ from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.wrench_bound import WrenchBound
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_poses import pose_to_transform
@@ -64,6 +67,7 @@ MAX_HALVINGS = 7
 
 # Limits of the force along x, y and z in relation to a limit of its norm: the box lies inside the ball.
 FORCE_SHARES = (0.45, 0.45, 0.75)
+CONTACT_STIFFNESS = 1e5  # [N/m] of workpiece, grasp and fixture in series, in an impact
 
 
 class ContactOptions(Options):
@@ -96,11 +100,14 @@ class Impedance:
         stiffness: Stiffness [N/m], [Nm/rad].
         damping_ratio: Damping ratio of every mode.
         limits: Largest forces [N] and torques [Nm].
+        bound: Bound of the wrench and of the approach speed inside the limits, along [x y z Rx Ry Rz]; None: the
+            limits alone.
     """
 
     stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)
     damping_ratio: float = 1.0
     limits: tuple[float, ...] = (40.0, 40.0, 40.0, 3.0, 3.0, 3.0)
+    bound: WrenchBound | None = None
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "limits"):
@@ -111,13 +118,16 @@ class Impedance:
             raise InputError(f"the impedance's damping_ratio must be positive, not {self.damping_ratio}")
 
     def with_max_force(self, force: float) -> Impedance:
-        """Return the same impedance with limits at which the norm of its force is below `force` [N].
+        """Return the same impedance, bounded so that the norm of its force is below `force` [N].
 
-        A limit is never raised. The shares of the axes favour z, along which workpieces are inserted.
+        A limit is never raised. The shares of the axes favor z, along which workpieces are inserted. The approach speed
+        is limited for contacts of `CONTACT_STIFFNESS`.
         """
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))
-        return replace(self, limits=tuple(limits.tolist()))
+        axes = to_wrench_order(limits.tolist())
+        norms = (float(np.linalg.norm(axes[:3])), float(np.linalg.norm(axes[3:])))
+        return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS))
 
 
 class Station(Diagram):
@@ -281,8 +291,11 @@ def export_station_ports(
     contact_force: OutputPort,
     saturation: OutputPort,
     command_timed_out: OutputPort,
+    max_wrench: InputPort | None = None,
 ) -> None:
-    """Export the ports of every station."""
+    """Export the ports of every station, and `max_wrench` if it has a bounded impedance."""
+    if max_wrench is not None:
+        builder.ExportInput(max_wrench, "max_wrench")
     builder.ExportInput(desired_pose, "desired_pose")
     builder.ExportInput(command_time, "command_time")
     builder.ExportOutput(pose, "pose")

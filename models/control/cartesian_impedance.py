@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from guiderail.models.common.arrays import cross
+from guiderail.models.control.wrench_bound import WrenchBound, bounded_wrench
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 
@@ -16,6 +17,7 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 # [kg] only the impedance acts in a direction, from the second on only the posture's torque; usual are 1 to 50 kg.
 LIGHT, HEAVY = 300.0, 3000.0
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
+_ROUNDING = 1e-9  # [N, Nm] smaller differences of wrenches are no limitation
 _SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 
 
@@ -117,12 +119,13 @@ def impedance_torques(
     posture_torque: np.ndarray,
     gravity_torque: np.ndarray,
     torque_limits: np.ndarray,
+    bound: WrenchBound | None = None,
 ) -> JointTorques:
     """Compute τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to the torque limits.
 
-    The sum of spring and damper is clipped per axis: the tool never pushes with more, and it can still follow a fast
-    command, for which the two cancel. N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the
-    tool.
+    Without a bound, the sum of spring and damper is clipped per axis: the tool never pushes with more, and it can still
+    follow a fast command, for which the two cancel. With a bound, see `bounded_wrench`. N = I − Jᵀ Λ J M⁻¹ removes the
+    part of the posture's torque that accelerates the tool.
 
     Args:
         K: Stiffness (6, 6) in the axes of the stiffness frame.
@@ -138,6 +141,7 @@ def impedance_torques(
         posture_torque: Torque (n,) that pulls the joints to their preferred posture [Nm].
         gravity_torque: Gravity compensation (n,) [Nm].
         torque_limits: Torque limits (n,) [Nm].
+        bound: Bound of the wrench along the axes of the stiffness frame, in place of `wrench_limits`; default: none.
 
     Raises:
         LinAlgError: If the mass matrix or the inertia at the tool is not positive definite.
@@ -153,10 +157,20 @@ def impedance_torques(
     Lambda_inverse = J @ M_inverse_JT + _REGULARIZATION
     R_inverse = _root_of_inverse(Lambda_inverse)
     L_modes, eigenvalues = _modes(K, R_inverse)
-    damping = L_modes @ (_dampings(eigenvalues, damping_ratio) * (L_modes.T @ (J @ v)))
-    unlimited_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
+    velocity = J @ v
+    damping = L_modes @ (_dampings(eigenvalues, damping_ratio) * (L_modes.T @ velocity))
+    spring = spring_wrench(K, p_error, eta, epsilon)
+    unlimited_wrench = spring - damping
     along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
-    wrench = _clipped(along_axes, wrench_limits)
+    if bound is None:
+        wrench = _clipped(along_axes, wrench_limits)
+        is_limited = bool((np.abs(along_axes) >= wrench_limits).any())
+    else:
+        mass = _mass_along(velocity[:3], Lambda_inverse)
+        if R_axes is not None:
+            spring, damping, velocity = R.T @ spring, R.T @ damping, R.T @ velocity
+        wrench = bounded_wrench(spring, damping, velocity[:3], mass, bound)
+        is_limited = bool(np.abs(wrench - along_axes).max() > _ROUNDING)
     if R_axes is not None:
         wrench = R @ wrench
     tool_acceleration = M_inverse_JT.T @ posture_torque
@@ -166,8 +180,13 @@ def impedance_torques(
         leak = reachable_inertia(Lambda_inverse) @ tool_acceleration
     unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
     torque = _clipped(unlimited_torque, torque_limits)
-    is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != unlimited_torque).any())
-    return JointTorques(torque, wrench, is_saturated)
+    return JointTorques(torque, wrench, is_limited or bool((torque != unlimited_torque).any()))
+
+
+def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:
+    """Return the mass [kg] that an obstacle feels which stops the velocity (3,) of a tool that is free to turn."""
+    square = float(velocity @ velocity)
+    return square / float(velocity @ Lambda_inverse[:3, :3] @ velocity) if square > 0.0 else 0.0
 
 
 def _is_regular(R_inverse: np.ndarray) -> bool:

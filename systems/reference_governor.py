@@ -1,0 +1,92 @@
+"""Reference governor of an impedance whose spring and damper belong to the plant."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound, governed_error
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+
+# Order of the coordinates of a pose, [x y z Rz Ry Rx], in those of a wrench, and the reverse.
+_REVERSED = [0, 1, 2, 5, 4, 3]
+
+
+class ReferenceGovernor(LeafSystem):
+    """Move a desired pose towards the measured one, so that the force of a spring and damper stays inside a bound.
+
+        x_r = x + e_r,  K e_r inside the bound less (K h + D) |v|,  |v| → at most F / √(k m)
+
+    for six joints with stiffness K and damping D, a moving mass m and contacts of stiffness k: see `governed_error`. A
+    desired pose that is close enough is output unchanged up to rounding.
+
+    .. pydrake_system::
+
+        name: ReferenceGovernor
+        input_ports:
+        - desired_pose
+        - state
+        - max_wrench (optional)
+        output_ports:
+        - reference_pose
+
+    ``desired_pose`` and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``state`` is (12,), the
+    measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), [fx fy fz tx ty tz], norm of the force and norm
+    of the torque [N, Nm]; it lowers the bound and cannot raise it.
+
+    Args:
+        stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
+        damping: Damping (6,) of each coordinate [N s/m, Nm s/rad], not negative.
+        mass: Moving mass [kg], positive.
+        step: Time step of the plant [s], positive.
+        bound: Bound of the wrench.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, stiffness: np.ndarray, damping: np.ndarray, mass: float, step: float, bound: WrenchBound):
+        super().__init__()
+        check_period(step)
+        self._stiffness, self._damping = (np.array(values, dtype=float) for values in (stiffness, damping))
+        shapes_agree = self._stiffness.shape == self._damping.shape == (POSE_SIZE,)
+        if not shapes_agree or not (self._stiffness > 0.0).all() or not (self._damping >= 0.0).all():
+            raise InputError("a reference governor needs six positive stiffnesses and six dampings, none negative")
+        if not 0.0 < mass < np.inf:
+            raise InputError(f"the moving mass must be positive, not {mass} kg")
+        self._mass, self._step, self._bound = mass, step, bound
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
+        self._state_port = self.DeclareVectorInputPort("state", 2 * POSE_SIZE)
+        self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
+        self._reference_pose_port = self.DeclareVectorOutputPort(
+            "reference_pose",
+            POSE_SIZE,
+            self._calc_reference_pose,
+            prerequisites_of_calc={
+                self._desired_pose_port.ticket(),
+                self._state_port.ticket(),
+                self._max_wrench_port.ticket(),
+            },
+        )
+
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
+    get_state_input_port = input_getter("state", "measured pose and its velocity, (12,)")
+    get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
+    get_reference_pose_output_port = output_getter("reference_pose", "governed pose, (6,)")
+
+    def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
+        state, bound = self._state_port.Eval(context), self._bound
+        if self._max_wrench_port.HasValue(context):
+            bound = bound.lowered_to(self._max_wrench_port.Eval(context))
+        pose, velocity = state[:POSE_SIZE], state[POSE_SIZE:]
+        in_pose_order = WrenchBound(bound.axes[_REVERSED], bound.force, bound.torque, bound.contact_stiffness)
+        error = governed_error(
+            self._stiffness,
+            self._damping,
+            self._desired_pose_port.Eval(context) - pose,
+            velocity,
+            self._mass,
+            self._step,
+            in_pose_order,
+        )
+        output.SetFromVector(pose + error)
