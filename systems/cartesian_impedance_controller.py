@@ -138,7 +138,10 @@ class CartesianImpedanceController(LeafSystem):
         state = {self._estimated_state_port.ticket()}
         self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
         self._law = declare_cache(
-            self, "law", self._calc_law, prerequisites_of_calc=self._followed_pose.tickets | state | {self._max_wrench_port.ticket()}
+            self,
+            "law",
+            self._calc_law,
+            prerequisites_of_calc=self._followed_pose.tickets | state | {self._max_wrench_port.ticket()},
         )
         law = {self._law.ticket()}
         self._generalized_force_port = self.DeclareVectorOutputPort(

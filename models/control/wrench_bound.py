@@ -15,7 +15,7 @@ MAX_WRENCH_SIZE = 8
 """Numbers of a bound as a signal: six along and about the axes, and the norms of force and torque."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays do not compare to one truth value
 class WrenchBound:
     """Largest wrench of an impedance, per axis and as norms, and the stiffness of the contacts that it expects.
 

@@ -141,8 +141,9 @@ def test_robot_page_has_the_limits_of_the_code():
         "joint speed": f"{VELOCITY_SHARE:.0%} of its limit".replace("%", " %"),
         "position of the tool and of the command": f"±{limits.upper[0]} m lateral, −{-limits.lower[2]} to "
         f"{limits.upper[2]} m above",
-        "force on the tool": f"{limits.force:.0f} N measured; the impedance is limited to {force.max():.0f} N along "
-        f"each axis of the target, {np.linalg.norm(force):.0f} N along",
+        "force on the tool": f"{limits.force:.0f} N measured; the impedance's force is below the task's force limit, "
+        f"unless `bounded_force=False` (then {force.max():.0f} N along each axis of the target, "
+        f"{np.linalg.norm(force):.0f} N along",
         "external joint torque": f"{EXTERNAL_TORQUE_SHARE:.0%} of".replace("%", " %"),
         "commanded torque": f"{TORQUE_SHARE:.0%} of that".replace("%", " %"),
         "task force": f"the task's own, {COLLISION_FORCE:.0f} N",

@@ -27,6 +27,7 @@ from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.wrench_bound import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.templates import load_template
 
@@ -91,6 +92,7 @@ def built():
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.PoseWrench(),
         systems.Recorder({"u": 2}, 4, PERIOD),
+        systems.ReferenceGovernor(np.ones(6), np.ones(6), 1.0, PERIOD, WrenchBound(np.ones(6), 1.0, 1.0)),
         systems.RelativePoses(plant, [body], other),
         systems.Residual(np.ones(2)),
         systems.RewardSystem([term]),

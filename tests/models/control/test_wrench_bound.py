@@ -1,0 +1,116 @@
+"""Bound of an impedance's wrench: inside for every input, passive, and with a limited approach speed."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench_bound import (
+    WrenchBound,
+    approach_impedance,
+    bounded_wrench,
+    clip_wrench,
+    damping_share,
+    governed_error,
+)
+
+AXES = np.array([9.0, 9.0, 15.0, 3.0, 3.0, 3.0])
+BOUND = WrenchBound(AXES, 18.0, 4.0, 1e5)
+K, D, MASS = 1500.0, 95.0, 1.5
+
+
+def is_inside(wrench, bound=BOUND, tolerance=1e-9):
+    force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
+    within_axes = (np.abs(wrench) <= bound.axes + tolerance).all()
+    return within_axes and force <= bound.force + tolerance and torque <= bound.torque + tolerance
+
+
+def test_wrench_is_inside_bound_for_every_spring_damper_and_speed():
+    rng = np.random.default_rng(0)
+    for _ in range(3000):
+        spring, damping, velocity = (10.0 ** rng.uniform(-2, 3) * rng.normal(size=size) for size in (6, 6, 3))
+        assert is_inside(bounded_wrench(spring, damping, velocity, rng.uniform(0.5, 20.0), BOUND))
+
+
+def test_law_is_spring_and_damper_while_both_are_small():
+    spring, velocity = np.array([2.0, -1.0, 3.0, 0.1, 0.2, -0.1]), np.array([0.004, 0.0, -0.003])
+    damping = np.r_[D * velocity, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(bounded_wrench(spring, damping, velocity, MASS, BOUND), spring - damping, atol=1e-12)
+
+
+def test_damping_share_is_the_largest_inside():
+    rng = np.random.default_rng(1)
+    shares = []
+    for _ in range(500):
+        spring = clip_wrench(10.0 * rng.normal(size=6), AXES, 18.0, 4.0)
+        damping = 10.0 ** rng.uniform(-2, 2) * rng.normal(size=6)
+        share = damping_share(spring, damping, BOUND)
+        assert is_inside(spring - share * damping)
+        if share < 1.0:
+            assert not is_inside(spring - (share + 1e-6) * damping)
+        shares.append(share)
+    assert min(shares) < 0.2
+    assert 0.1 < np.mean(np.array(shares) < 1.0) < 0.9
+
+
+@pytest.mark.parametrize("mass", [1.5, 8.0])
+def test_approach_speed_stays_below_that_of_an_impact_at_the_limit(mass):
+    """A mass that is pulled to a far reference hits a stop with at most the force of the bound."""
+    damping, speed, step = 2.0 * np.sqrt(K * mass), 0.0, 1e-4
+    for _ in range(20_000):
+        velocity = np.array([speed, 0.0, 0.0])
+        pulled = bounded_wrench(np.r_[100.0, np.zeros(5)], np.r_[damping * velocity, 0, 0, 0], velocity, mass, BOUND)
+        speed += step * pulled[0] / mass
+    impedance = approach_impedance(BOUND.contact_stiffness, mass)
+    assert 0.4 * BOUND.force < speed * impedance <= BOUND.force * (1.0 + 1e-3)
+    free = bounded_wrench(
+        np.r_[100.0, np.zeros(5)], np.zeros(6), np.array([1.0, 0, 0]), mass, WrenchBound(AXES, 18.0, 4.0)
+    )
+    assert free[0] == AXES[0]  # without a contact stiffness nothing limits the speed
+
+
+def test_no_environment_gains_energy_at_a_fixed_reference():
+    """An adversary moves the tool along random closed paths; the bound is per axis, as `Impedance` makes it."""
+    rng = np.random.default_rng(2)
+    bound = WrenchBound(AXES, float(np.linalg.norm(AXES[:3])), 10.0, 1e5)
+    for _ in range(40):
+        corners = np.vstack([np.zeros(3), rng.normal(scale=0.02, size=(4, 3)), np.zeros(3)])
+        gained = 0.0
+        for start, end in zip(corners, corners[1:], strict=False):
+            velocity = (end - start) / np.linalg.norm(end - start) * 10.0 ** rng.uniform(-3, 0)
+            points = np.linspace(start, end, 400)
+            for point in 0.5 * (points[1:] + points[:-1]):
+                wrench = bounded_wrench(np.r_[-K * point, 0, 0, 0], np.r_[D * velocity, 0, 0, 0], velocity, MASS, bound)
+                gained += float(wrench[:3] @ (end - start)) / 399.0
+        assert gained <= 1e-5
+
+
+def test_lowering_a_bound_never_raises_it():
+    lower = BOUND.lowered_to(np.array([20.0, 5.0, np.nan, -1.0, 1.0, np.inf, 8.0, 0.5]))
+    np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
+    assert lower.contact_stiffness == BOUND.contact_stiffness
+    np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, np.inf)).numbers, BOUND.numbers)
+
+
+@pytest.mark.parametrize("numbers", [(AXES[:5], 1.0, 1.0), (-AXES, 1.0, 1.0), (AXES, np.nan, 1.0), (AXES, 1.0, -1.0)])
+def test_bound_raises_when_a_number_is_invalid(numbers):
+    with pytest.raises(InputError, match="six limits, two norms and a stiffness"):
+        WrenchBound(*numbers)
+
+
+def test_governed_error_leaves_room_for_an_implicit_damper():
+    """K e − (K h + D) v₁ is inside the bound for every velocity v₁ that is not faster than v₀ in any coordinate."""
+    rng, step = np.random.default_rng(3), 0.01
+    stiffness, damping = np.r_[np.full(3, K), np.full(3, 30.0)], np.r_[np.full(3, D), np.full(3, 0.5)]
+    for _ in range(2000):
+        error, velocity = rng.normal(size=6) * 10.0 ** rng.uniform(-4, 0), rng.normal(size=6) * 0.03
+        governed = governed_error(stiffness, damping, error, velocity, MASS, step, BOUND)
+        implicit = (stiffness * step + damping) * velocity
+        spring = stiffness * governed
+        for after in (implicit, -implicit, 0.0 * implicit, rng.uniform(-1, 1, 6) * implicit):
+            room = np.maximum(BOUND.axes, np.abs(implicit))
+            force = max(BOUND.force, np.linalg.norm(implicit[:3]))
+            torque = max(BOUND.torque, np.linalg.norm(implicit[3:]))
+            assert is_inside(spring - after, WrenchBound(room, force, torque))
+    np.testing.assert_allclose(
+        governed_error(stiffness, damping, np.full(6, 1e-3), np.zeros(6), MASS, step, BOUND), 1e-3, atol=1e-15
+    )

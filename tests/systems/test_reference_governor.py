@@ -1,0 +1,65 @@
+"""Tests of the system alone; `tests/diagrams/tasks/test_bounded_force.py` tests the physics."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench_bound import WrenchBound
+from guiderail.systems import ReferenceGovernor
+
+STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(3, 95.0), np.full(3, 0.5)]
+BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 1e5)  # [x y z Rx Ry Rz]
+
+
+def governed(desired, velocity=np.zeros(6), pose=np.zeros(6), max_wrench=None):
+    system = ReferenceGovernor(STIFFNESS, DAMPING, 1.5, 0.01, BOUND)
+    context = system.CreateDefaultContext()
+    system.get_desired_pose_input_port().FixValue(context, desired)
+    system.get_state_input_port().FixValue(context, np.r_[pose, velocity])
+    if max_wrench is not None:
+        system.get_max_wrench_input_port().FixValue(context, max_wrench)
+    return system.get_reference_pose_output_port().Eval(context)
+
+
+def test_output_equals_desired_pose_inside_bound():
+    pose, change = np.full(6, 0.3), np.r_[0.003, -0.002, 0.004, 0.02, 0.01, -0.01]
+    np.testing.assert_allclose(governed(pose + change, pose=pose), pose + change, atol=1e-15)
+
+
+def test_angles_have_the_limits_of_their_axes():
+    reference = governed(np.r_[0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # Rz
+    assert STIFFNESS[3] * reference[3] == pytest.approx(3.0)
+    reference = governed(np.r_[0.0, 0.0, 0.0, 0.0, 0.0, 1.0])  # Rx
+    assert STIFFNESS[5] * reference[5] == pytest.approx(1.0)
+
+
+def test_max_wrench_lowers_the_bound():
+    down = np.r_[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]
+    assert STIFFNESS[2] * governed(down)[2] == pytest.approx(-15.0)
+    lower = np.r_[4.0, 4.0, 6.0, np.full(3, np.inf), np.inf, np.inf]
+    assert STIFFNESS[2] * governed(down, max_wrench=lower)[2] == pytest.approx(-6.0)
+    assert STIFFNESS[2] * governed(down, max_wrench=np.full(8, 100.0))[2] == pytest.approx(-15.0)
+    np.testing.assert_array_equal(governed(down, max_wrench=np.full(8, np.nan)), 0.0)
+
+
+def test_motion_leaves_less_for_the_spring():
+    down, velocity = np.r_[0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.r_[0.0, 0.0, 0.05, 0.0, 0.0, 0.0]
+    against = STIFFNESS[2] * governed(down, velocity)[2]
+    assert against == pytest.approx(-15.0 + (15.0 + 95.0) * 0.05)
+    towards = STIFFNESS[2] * governed(down, -velocity)[2]
+    assert against < towards < 0.0  # and not faster than an impact allows
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
+        ({"damping": np.full(5, 1.0)}, "six positive stiffnesses"),
+        ({"mass": 0.0}, "moving mass must be positive"),
+        ({"step": 0.0}, "period must be positive"),
+    ],
+)
+def test_governor_raises_when_an_argument_is_invalid(change, words):
+    arguments = {"stiffness": STIFFNESS, "damping": DAMPING, "mass": 1.5, "step": 0.01, "bound": BOUND} | change
+    with pytest.raises(InputError, match=words):
+        ReferenceGovernor(**arguments)
