@@ -20,7 +20,7 @@ from typing import Any
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate_run
-from guiderail.tools.evaluation.rollout import check_compatible
+from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.learning.run_folder import RunFolder
 from research.benchmarks import with_progress
 

@@ -347,7 +347,7 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
     found = run_study(
         figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], evaluate=False), out
     )
-    learned = EpisodeSpec.of_run(Path(found["folder"].iloc[0]))
+    learned = EpisodeSpec.of_policy(Path(found["folder"].iloc[0]))
     unlearned = replace(learned, policy=partial(BaselinePolicy, uniform_random), acting="before learning")
     figure, axes = new_figure(2, 4, (13, 6.2))
     rows = []

@@ -8,8 +8,8 @@ from guiderail.models.policy import Policy
 from guiderail.tools.certify import _find_subject
 from guiderail.tools.environments import changed_environment, check_environment, make_environment
 from guiderail.tools.evaluation import evaluate
+from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.robustness import robustness
-from guiderail.tools.evaluation.rollout import check_compatible
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.job import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
@@ -72,7 +72,7 @@ def test_a_policy_is_shown_and_certified_at_another_difficulty(tmp_path):
     RunFolder(tmp_path).create(configure("NarrowPassage", {}, episodes=1))
     policy(3, 2).save(tmp_path)
     hard = check_environment("NarrowPassage", HARD)
-    assert EpisodeSpec.of_run(tmp_path, HARD).environment == hard
+    assert EpisodeSpec.of_policy(tmp_path, HARD).environment == hard
     assert _find_subject(str(tmp_path), HARD)[1] == hard
 
 

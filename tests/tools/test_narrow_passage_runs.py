@@ -79,7 +79,7 @@ def test_held_out_starts_differ_and_follow_the_seed():
 
 
 def test_replay_is_one_self_contained_page(trained):
-    write_page(default_page(trained.path, {}), EpisodeSpec.of_run(trained.path), episodes=1)
+    write_page(default_page(trained.path, {}), EpisodeSpec.of_policy(trained.path), episodes=1)
     page = (trained.path / "replay.html").read_text()
     assert "the constraint" in page
     assert "demonstrations" in page
@@ -89,11 +89,11 @@ def test_replay_is_one_self_contained_page(trained):
 
 
 def test_image_has_the_format_of_its_ending(trained, tmp_path, monkeypatch):
-    watched = camera.record_frames(EpisodeSpec.of_run(trained.path), camera.ROWS * camera.COLUMNS)
+    watched = camera.record_frames(EpisodeSpec.of_policy(trained.path), camera.ROWS * camera.COLUMNS)
     monkeypatch.setattr(camera, "record_frames", lambda *_: watched)  # once for both
     for ending, magic in ((".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")):
         picture = tmp_path / f"film{ending}"
-        row = camera.write_image(picture, EpisodeSpec.of_run(trained.path))
+        row = camera.write_image(picture, EpisodeSpec.of_policy(trained.path))
         assert row["success"]
         assert picture.read_bytes().startswith(magic)
         image = imread(picture)
@@ -103,7 +103,7 @@ def test_image_has_the_format_of_its_ending(trained, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("ending", [".webp", ".gif"])
 def test_video_is_an_animation_in_real_time(ending, trained, tmp_path):
-    row = camera.write_video(tmp_path / f"video{ending}", EpisodeSpec.of_run(trained.path))
+    row = camera.write_video(tmp_path / f"video{ending}", EpisodeSpec.of_policy(trained.path))
     with Image.open(tmp_path / f"video{ending}") as video:
         assert video.n_frames > 10
         durations = []
@@ -116,9 +116,9 @@ def test_video_is_an_animation_in_real_time(ending, trained, tmp_path):
 
 def test_visualization_refuses_wrong_input_and_writes_nothing(trained, tmp_path):
     with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
-        write_page(tmp_path / "replay.html", EpisodeSpec.of_run(trained.path, {"station": "arm"}))
+        write_page(tmp_path / "replay.html", EpisodeSpec.of_policy(trained.path, {"station": "arm"}))
     with pytest.raises(InputError, match="a picture is"):
-        camera.write_image(tmp_path / "film.gif", EpisodeSpec.of_run(trained.path))
+        camera.write_image(tmp_path / "film.gif", EpisodeSpec.of_policy(trained.path))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -20,7 +20,7 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 from guiderail.tools.cli.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
-from guiderail.tools.evaluation.evaluate import _counts_collisions, evaluation_scope
+from guiderail.tools.evaluation.scope import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from research.action_fuzzing.campaign import fuzz
 
@@ -259,10 +259,10 @@ def test_scope_is_training_without_held_out_conditions():
 
 def test_collisions_are_counted_only_if_declared():
     declare()
-    assert not _counts_collisions("lab/Own")
+    assert not counts_collisions("lab/Own")
     declare(collision=Threshold("contact_force"))
-    assert _counts_collisions("lab/Own")
-    assert all(map(_counts_collisions, ("BncConnector", "GridClamp", "Pouring", "NarrowPassage")))
+    assert counts_collisions("lab/Own")
+    assert all(map(counts_collisions, ("BncConnector", "GridClamp", "Pouring", "NarrowPassage")))
 
 
 def test_own_task_is_fuzzed_with_every_guidance():

@@ -56,6 +56,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
     "pictures": _names("tools.files", "PICTURES"),
     "videos": _names("tools.files", "VIDEOS"),
     "baselines": _names("tools.evaluation.baselines", "BASELINES"),
+    "pretrained": _names("tools.evaluation.policies", "pretrained_names"),
     "axes": lambda: [axis.name for axis in import_module("guiderail.tools.evaluation.robustness").AXES],
     "listed": lambda: [*LISTED, *LISTED["tasks"]()],
 }
@@ -119,7 +120,14 @@ def _completion(choices: str | None) -> Callable[[str], list[str]] | None:
 
 Json = Annotated[bool, option("Print one JSON object.", "--json")]
 Run = Annotated[Path, argument("Folder of a run of guiderail train.", "RUN")]
-Shown = Annotated[str, argument("Folder of a run; or a task, for --policy: {tasks}.", "RUN or TASK")]
+Shown = Annotated[
+    str,
+    argument(
+        "Folder of a run, or pretrained:NAME ({pretrained}); a policy of any origin, with --task; or a task, with "
+        "--policy: {tasks}.",
+        "RUN|POLICY|TASK",
+    ),
+]
 Demonstrations = Annotated[Path, argument("Demonstrations: .npz, .csv or a folder of them.", "FILE")]
 DemonstrationsOut = Annotated[Path, option("File of demonstrations to write, .npz or .csv.")]
 Seed = Annotated[int, option("Seed of the first held-out episode; episode i has seed + i.")]
@@ -173,6 +181,15 @@ Baselines = Annotated[
         "[default: uniform_random, scripted where the task has one, constant in evaluate, and zero without a "
         "demonstration]"
     ),
+]
+PolicyTask = Annotated[str | None, option("Task that a POLICY without a run acts in: {tasks}.", choices="tasks")]
+AllowCode = Annotated[
+    bool,
+    option("Read a policy's file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--allow-code"),
+]
+Processes = Annotated[
+    int | None,
+    option("Largest number of processes; results do not depend on it.  [default: the number of cores]"),
 ]
 Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
 

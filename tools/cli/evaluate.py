@@ -11,19 +11,20 @@ from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option
 from guiderail.tools.cli.output import print_message, print_result, to_json
 
+QUICK = 20  # episodes of a quick evaluation
+
 
 @cli.command("evaluate runs/passage --episodes 100 --json")
 def evaluate(
-    subject: Annotated[
-        str,
-        argument(
-            "Folder of a run; or the folder of a policy, with --task; or a task, with --policy: {tasks}.",
-            "RUN|POLICY|TASK",
-        ),
-    ],
-    episodes: Annotated[int, option("Number of held-out episodes.")] = 100,
+    subject: cli.Shown,
+    episodes: Annotated[int | None, option("Number of held-out episodes.  [default: 100]")] = None,
+    quick: Annotated[
+        bool, option(f"Evaluate {QUICK} episodes: a wide interval, in a fifth of the time.", "--quick")
+    ] = False,
     seed: cli.Seed = 1_000_000,
-    task: Annotated[str | None, option("Task that a POLICY is evaluated in: {tasks}.", choices="tasks")] = None,
+    task: cli.PolicyTask = None,
+    allow_code: cli.AllowCode = False,
+    processes: cli.Processes = None,
     policy: Annotated[
         str | None,
         option("Policy that is evaluated in a TASK, or on hardware instead of the run's: scripted, {baselines}."),
@@ -52,10 +53,15 @@ def evaluate(
 ) -> None:
     """Evaluate a policy on held-out episodes, together with baseline policies.
 
-    The policy acts deterministically, on initial conditions that training never samples. The demonstration alone,
-    random actions and the scripted policy of the task run on the same episodes: if they succeed as well, the task is
-    too easy to show learning. The row evaluation_scope of the table states what the result is valid for.
+    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX or TorchScript file, or
+    module:function (FILE.py:function), which returns an action for an observation. The policy acts deterministically,
+    on initial conditions that training never samples. The demonstration alone, random actions and the scripted policy
+    of the task run on the same episodes: if they succeed as well, the task is too easy to show learning. The row
+    evaluation_scope of the table states what the result is valid for, and the last line is the result in one sentence.
     """
+    if quick and episodes is not None:
+        raise InputError("--quick is a number of episodes: leave --episodes out")
+    episodes = QUICK if quick else 100 if episodes is None else episodes
     environment = cli.parse_environment(env, station=station, robot=robot, lcm_url=lcm_url)
     if cli.is_hardware(environment.get("station")):
         given = environment.keys() - {"station", "robot", "lcm_url"} or task or baselines or save
@@ -75,22 +81,27 @@ def evaluate(
         raise InputError("--policy is evaluated in a task: name the task instead of a folder, or give --baselines")
     from guiderail.tools.evaluation.evaluate import evaluate as evaluate_policy
 
-    result = evaluate_policy(
-        policy or Path(name),
+    evaluation = evaluate_policy(
+        policy or name,
         name if policy is not None else task if task is None else cli.find_task(task)[0],
-        episodes=episodes,
+        episodes,
         seed=seed,
         environment=environment,
         baselines=_split(baselines),
         resample_offsets=resample_offsets,
         save=save,
         signal=signal,
+        processes=processes,
+        allow_code=allow_code,
     )
+    result = dict(evaluation)
     for skipped in result.pop("skipped_baselines"):
         print_message(f"{skipped} is left out: its observation or action does not match this environment")
     if result.get("saved") == 0:
         print_message(f"no episode succeeded: {save} is not written")
-    print_result(result, as_json)
+    print_result(result | ({"sentence": evaluation.sentence} if as_json else {}), as_json)
+    if not as_json:
+        typer.echo(evaluation.sentence)
 
 
 def _split(names: str | None) -> list[str] | None:
@@ -133,14 +144,25 @@ def _evaluate_on_hardware(
 
 @cli.command("robustness runs/connector --env station=mujoco --episodes 50")
 def robustness(
-    runs: Annotated[list[Path], argument("Folders of runs of one task, which are compared.", "RUN...")],
+    policies: Annotated[
+        list[str],
+        argument("Runs of one task, which are compared; or policies of any origin, with --task.", "RUN|POLICY..."),
+    ],
+    task: cli.PolicyTask = None,
     episodes: Annotated[int, option("Number of held-out episodes of each policy at each value.")] = 30,
     seed: cli.Seed = 1_000_000,
     axes: Annotated[str | None, option("Disturbances, comma-separated: {axes}.  [default: all]")] = None,
     env: cli.Env = None,
     baselines: cli.Baselines = None,
+    processes: cli.Processes = None,
+    allow_code: cli.AllowCode = False,
+    imports: cli.TaskImports = None,
     out: Annotated[
-        Path | None, option("Folder to write, required for several runs.  [default: robustness/STATION in the run]")
+        Path | None,
+        option(
+            "Folder to write, required for several runs and for a policy without a run.  "
+            "[default: robustness/STATION in the run]"
+        ),
     ] = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
@@ -154,7 +176,8 @@ def robustness(
     from guiderail.tools.evaluation.robustness import values_below
 
     result = evaluate_robustness(
-        runs,
+        policies,
+        task=None if task is None else cli.find_task(task, imports)[0],
         episodes=episodes,
         seed=seed,
         environment=cli.parse_environment(env),
@@ -162,6 +185,8 @@ def robustness(
         baselines=_split(baselines),
         out=out,
         say=print_message,
+        processes=processes,
+        allow_code=allow_code,
     )
     if as_json:
         typer.echo(to_json({"table": str(result["table"]), "picture": str(result["picture"]), "rows": result["rows"]}))

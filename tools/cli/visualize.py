@@ -24,6 +24,8 @@ def visualize(
     env: cli.Env = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
     policy: cli.Baseline = "scripted",
+    task: cli.PolicyTask = None,
+    allow_code: cli.AllowCode = False,
     episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
@@ -40,13 +42,13 @@ def visualize(
     from guiderail.tools.visualization.replay import default_page, write_page
 
     environment = cli.parse_environment(env, station=station)
-    episode = _episode(subject, policy, environment, seed, imports)
+    episode = _episode(subject, policy, environment, seed, imports, task, allow_code)
     if image is not None:
         check_picture(image)
     if video is not None:
         check_video(video)
     if html is None and image is None and video is None:
-        html = default_page(Path(subject), environment)
+        html = default_page(Path(subject) if episode.run is None else episode.run, environment)
     if html is not None:
         if episode.run is not None:
             typer.echo(plot_run(episode.run))
@@ -59,19 +61,23 @@ def visualize(
 
 
 def _episode(
-    subject: str, policy: str, environment: Mapping[str, Any], seed: int, imports: Sequence[str] | None
+    subject: str,
+    policy: str,
+    environment: Mapping[str, Any],
+    seed: int,
+    imports: Sequence[str] | None,
+    task: str | None,
+    allow_code: bool,
 ) -> Any:
-    """Return the specification of an episode: of a run, or of a task with a baseline policy."""
+    """Return the specification of an episode: of a run or another policy, or of a task with a baseline policy."""
     from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
-    subject = cli.find_task(subject, imports)[0]
-    if Path(subject).is_dir() or subject not in cli.CHOICES["tasks"]():
-        return EpisodeSpec.of_run(Path(subject), environment, seed)
-    from guiderail.tools.environments import check_environment
-    from guiderail.tools.evaluation.baselines import make_baseline
-
-    arguments = check_environment(subject, environment)
-    return EpisodeSpec(subject, arguments, make_baseline(subject, policy), policy, policy, seed=seed)
+    name = cli.find_task(subject, imports)[0]
+    if task is None and not Path(name).is_dir() and name in cli.CHOICES["tasks"]():
+        name, task = policy, name
+    elif task is not None:
+        task = cli.find_task(task)[0]
+    return EpisodeSpec.of_policy(name, environment, seed, task=task, allow_code=allow_code)
 
 
 @cli.command("report studies --out report.html")

@@ -86,6 +86,10 @@ class BaselinePolicy(Callback):
         self._size = int(np.prod(env.action_space.shape or ()))
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
+    def start_episode(self, index: int) -> None:
+        """Continue with episode `index`, whichever episodes this process has run before."""
+        self._episode = index - 1
+
     def on_episode_start(self) -> None:
         """Make the policy of the next episode."""
         self._episode += 1

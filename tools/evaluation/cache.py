@@ -39,9 +39,9 @@ def episodes_file(
         config: Configuration of the run, for its task and seed.
         environment: Options of the environment.
         about: Anything else that the rows depend on, such as the digest of a learned policy.
-        how: Arguments of `evaluate_policy`; `label` does not count.
+        how: Arguments of `evaluate_policy`; `label` and `processes` do not count.
     """
-    how.pop("label", None)
+    how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)
     more = [*([] if about is None else [about]), *filter(None, [content])]
     key = json.dumps([environment, how, config.seed, installed_versions(), *more], sort_keys=True, default=str)

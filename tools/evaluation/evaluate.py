@@ -1,9 +1,9 @@
 """Evaluation of a policy on held-out episodes, together with baseline policies."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -12,14 +12,11 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.guidance.registry import GUIDANCE
-from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.datasets.paths import ENDINGS, check_new
 from guiderail.tools.environments import changed_environment, make_environment
-from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline, scripted_policies, zero_policy
+from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import (
     BASELINES_FOLDER,
     POLICY,
@@ -28,48 +25,55 @@ from guiderail.tools.evaluation.cache import (
     load_or_compute,
     policy_digest,
 )
-from guiderail.tools.evaluation.metrics import episodes_to_convergence, summary
+from guiderail.tools.evaluation.evaluation import COLLISIONS, LABELS, Evaluation, compare, statistics
+from guiderail.tools.evaluation.forks import check_processes, forked_map
+from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, check_seed, is_compatible, rollout
+from guiderail.tools.evaluation.rollout import PolicyFn, check_seed, is_compatible, rollout
+from guiderail.tools.evaluation.scope import counts_collisions, evaluation_scope, refuse_guidance_change
+from guiderail.tools.evaluation.subject import Subject, find_subject, make_baselines
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.tables import table_text
+from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.visualization.style import is_demonstrated
 
 HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode
-COMPARED = (
-    "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "max_commanded_violation",
-    "max_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
-)  # fmt: skip
-"""Statistics of the policy and of every baseline policy."""
-COLLISIONS = ("collisions", "collision_steps")  # those that need a task with a collision signal
-LABELS = {
-    POLICY: "policy", "demonstration": "demonstration alone", "zero": "zero action",
-    "uniform_random": "uniform random actions", "constant": "constant action", "scripted": "scripted policy",
-}  # fmt: skip
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
+# Returns what is kept of an episode, from its environment and its row.
+Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
 
-def evaluate_policy(
+
+def evaluate_policies(
     env: gymnasium.Env,
-    act: PolicyFn,
+    policies: Mapping[str, PolicyFn],
     *,
     episodes: int,
     seed: int = HELD_OUT_SEED,
     options: Mapping[str, Any] | None = None,
-    label: str = "",
-    on_episode: Callable[[gymnasium.Env, Mapping[str, Any]], None] | None = None,
-) -> pd.DataFrame:
-    """Return the rows of held-out episodes.
+    labels: Mapping[str, str] | None = None,
+    collect: Collect | None = None,
+    processes: int | None = 1,
+) -> Iterator[tuple[str, pd.DataFrame, list[Any]]]:
+    """Evaluate several policies on the same held-out episodes of one environment.
+
+    All episodes are distributed over processes, forks of this one. Conditions of an episode depend on its seed only,
+    so that the results do not depend on the number of processes. A policy that has a memory resets it in
+    `Callback.on_episode_start`; one that draws random numbers has a method `start_episode(index)`, which is called
+    before each episode, and seeds its generator there.
 
     Args:
         env: Environment; what is constant in a run stays as it is, unless the reset option `new_run` is given.
-        act: Policy.
-        episodes: Number of episodes.
+        policies: Policies by name.
+        episodes: Number of episodes of each.
         seed: Seed of the first; episode i has seed + i.
         options: Further options of the resets.
-        label: Name of the progress bar on standard error; no bar if empty.
-        on_episode: Called with the environment and the row after each episode.
+        labels: Names of progress bars on standard error by the policy's name; no bar by default.
+        collect: Returns what is kept of each episode.
+        processes: Largest number of processes; None for the number of cores.
+
+    Yields:
+        Name of a policy, its rows, and what was kept of each of its episodes.
 
     Raises:
         InputError: If a number is out of range.
@@ -77,15 +81,44 @@ def evaluate_policy(
     if episodes < 1:
         raise InputError(f"an evaluation needs at least one episode, not {episodes}")
     check_seed(seed)
-    rows = []
-    with EpisodeProgress(episodes, name=label, window=None) if label else nullcontext() as progress:
-        for i in range(episodes):
-            rows.append(rollout(env, act, index=i, seed=seed + i, held_out=True, options=options))
-            if on_episode is not None:
-                on_episode(env, rows[-1])
-            if progress is not None:
-                progress.update(rows[-1])
-    return pd.DataFrame(rows)
+    processes = check_processes(processes)
+    names = list(policies)
+
+    def run(number: int) -> tuple[dict[str, Any], Any]:
+        act, index = policies[names[number // episodes]], number % episodes
+        if (start := getattr(act, "start_episode", None)) is not None:
+            start(index)
+        row = rollout(env, act, index=index, seed=seed + index, held_out=True, options=options)
+        return row, None if collect is None else collect(env, row)
+
+    results = forked_map(run, len(names) * episodes, processes)
+    for name in names:
+        rows, kept = [], []
+        label = (labels or {}).get(name, "")
+        with EpisodeProgress(episodes, name=label, window=None) if label else nullcontext() as progress:
+            for _ in range(episodes):
+                row, collected = next(results)
+                rows.append(row)
+                kept.append(collected)
+                if progress is not None:
+                    progress.update(row)
+        yield name, pd.DataFrame(rows), kept
+
+
+def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
+    """Return the rows of held-out episodes of one policy; see `evaluate_policies` for the other arguments.
+
+    Args:
+        env: Environment.
+        act: Policy.
+        label: Name of the progress bar on standard error; no bar if empty.
+        how: Arguments of `evaluate_policies`.
+
+    Raises:
+        InputError: If a number is out of range.
+    """
+    ((_, rows, _),) = evaluate_policies(env, {POLICY: act}, labels={POLICY: label}, **how)
+    return rows
 
 
 def evaluate_run(
@@ -156,50 +189,40 @@ def _make_compatible(make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:
     return make_policy(env)
 
 
-@dataclass(frozen=True)
-class _Subject:
-    """Policy that is evaluated.
-
-    Attributes:
-        config: Configuration of its run; of no run, one with the environment it is evaluated in.
-        make_policy: Makes the policy for an environment.
-        folder: Its run, or None.
-        is_learned: Whether its actions were learned through the run's guidance.
-    """
-
-    config: RunConfig
-    make_policy: MakePolicy
-    folder: RunFolder | None
-    is_learned: bool
-
-
 def evaluate(
-    run_or_policy: Path | str | PolicyFn,
-    task: str | None = None,
-    *,
-    environment: Mapping[str, Any] | None = None,
+    policy: Path | str | PolicyFn | Any,
+    env: str | gymnasium.Env | None = None,
     episodes: int = 100,
+    *,
+    baselines: Mapping[str, MakePolicy] | Sequence[str] | None = None,
+    environment: Mapping[str, Any] | None = None,
     seed: int = HELD_OUT_SEED,
-    baselines: Mapping[str, MakePolicy] | Sequence[str] | None = (),
+    processes: int | None = None,
+    allow_code: bool = False,
     resample_offsets: bool = False,
     save: Path | None = None,
     signal: str = "commanded",
     describe_differences: Callable[[RunConfig], Sequence[str]] | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
 
     The rows of the baseline policies are stored in the run's folder and used again; so are those of the run's policy in
     its own environment, for a report.
 
     Args:
-        run_or_policy: Folder of a run. With `task`: the folder of a policy, a function from an observation to an
-            action, or the name of a baseline policy.
-        task: Name of the task that a policy without a run is evaluated in.
-        environment: Options of the environment that differ from those of the run, or of the task's defaults.
+        policy: Folder of a run, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
+            baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
+            a model of Stable-Baselines3.
+        env: Name of the task, or an environment, that a policy without a run is evaluated in. An environment of another
+            origin is reset with the seed of the episode; `info["is_success"]` or `info["success"]` is its success.
         episodes: Number of held-out episodes.
+        baselines: Baseline policies: their names, or functions that make them for an environment, by name; None for the
+            default set of the task. The demonstration alone is always evaluated where the guidance has one.
+        environment: Options of the environment that differ from those of the run, or of the task's defaults.
         seed: Seed of the first; episode i has seed + i.
-        baselines: Baseline policies: their names, or functions that make them, by name; None for the default set of
-            the task. The demonstration alone is always evaluated where the guidance has one.
+        processes: Largest number of processes; None for the number of cores. The results do not depend on it, see
+            `evaluate_policies` for policies with a memory.
+        allow_code: Read a policy's file that can execute code: a zip of Stable-Baselines3 or TorchScript.
         resample_offsets: Whether what is hidden and constant in a run is sampled again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved: "commanded", which a primitive should learn under impedance control because the
@@ -207,9 +230,10 @@ def evaluate(
         describe_differences: Returns sentences on how a configuration differs from a reference, for `differences`.
 
     Returns:
-        `evaluation_scope`, what the result is valid for; the statistics `COMPARED`, each also as
-        `demonstration_<name>` (None without a demonstration) and `<baseline>_<name>`; `baselines`, the names of the
-        baseline policies evaluated, and `skipped_baselines`, those with another observation or action;
+        Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, what the
+        result is valid for; the statistics `COMPARED`, each also as `demonstration_<name>` (None without a
+        demonstration) and `<baseline>_<name>`; `baselines`, the names of the baseline policies evaluated, and
+        `skipped_baselines`, those with another observation or action; `best_baseline` and `p`, see `Comparison`;
         `episodes` and `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run;
         `saved`, the number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is.
         Collisions are None if the task declares no collision signal.
@@ -219,22 +243,22 @@ def evaluate(
             guidance does not match the environment, nothing can be resampled, or an episode would repeat the offset of
             the run.
     """
-    if signal not in SIGNALS:
-        raise InputError(f"there is no signal {signal!r} to save: choose one of {', '.join(SIGNALS)}")
+    _check_saved(save, signal)
     check_seed(seed)
-    if save is not None:
-        if save.suffix not in ENDINGS:
-            raise InputError(f"{save} has the ending {save.suffix!r}: demonstrations are .npz or .csv")
-        check_new(save, "file")
-    subject = _find_subject(run_or_policy, task, environment or {})
+    check_processes(processes)
+    subject = find_subject(policy, env, environment or {}, allow_code=allow_code)
     config, folder = subject.config, subject.folder
-    where = changed_environment(config.task, config.environment, environment or {})
-    scope = evaluation_scope(config.task, where, resample_offsets)
-    if subject.is_learned and (remark := check_guidance_change(config.environment, where)):
-        scope += f"; {remark}"
-        print(f"the policy acts {remark}", file=sys.stderr, flush=True)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
-    if resample_offsets:
+    if config is None:
+        if environment or resample_offsets or save is not None:
+            raise InputError("an environment that is given as an object has its options: give the name of a task")
+        where, scope = {}, "seeds of the environment as it was given"
+    else:
+        where = changed_environment(config.task, config.environment, environment or {})
+        scope = evaluation_scope(config.task, where, resample_offsets)
+        if folder is not None:
+            refuse_guidance_change(config.environment, where)
+    if resample_offsets and config is not None:
         how["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed
             raise InputError(
@@ -242,86 +266,105 @@ def evaluate(
                 f"{config.seed + 1}"
             )
     others = {"demonstration": zero_policy} if is_demonstrated(where.get("guidance")) else {}
-    if not isinstance(baselines, Mapping):
-        names = default_baselines(config.task, where) if baselines is None else baselines
-        baselines = {name: make_baseline(config.task, name, config.seed) for name in names}
-    others |= baselines
-    labels = {
-        name: f"series {number} of {1 + len(others)}: {LABELS.get(name, name)}"
-        for number, name in enumerate((POLICY, *others), start=1)
-    }
-    recorder = None if save is None else _DemonstrationRecorder(signal)
-    rows = evaluate_run(config, subject.make_policy, where, label=labels[POLICY], on_episode=recorder, **how)
-    if folder is not None and subject.is_learned and where == config.environment and not resample_offsets:
-        digest = policy_digest(folder)
-        file = episodes_file(folder.path / POLICY_FOLDER, POLICY, config, where, about=digest, **how)
-        write_atomically(file, table_text(rows).encode())
-    evaluated: dict[str, pd.DataFrame] = {}
-    for name, make_policy in others.items():
-        found = _evaluate_baseline(folder, name, config, make_policy, where, label=labels[name], **how)
-        if found is not None:
-            evaluated[name] = found
-    statistics = summary(rows, COMPARED)
-    for name, found in ({"demonstration": pd.DataFrame()} | evaluated).items():
-        statistics |= summary(found, COMPARED, f"{name}_")
-    counts = _counts_collisions(config.task)
-    trained = None if folder is None else folder.episodes()
-    result = {
-        "evaluation_scope": scope,
-        **{key: value if counts or not key.endswith(COLLISIONS) else None for key, value in statistics.items()},
-        "baselines": [*evaluated],
-        "skipped_baselines": [name for name in others if name not in evaluated],
-        "episodes": episodes,
-        "seed": seed,
+    others |= make_baselines(config, where, baselines)
+    evaluation_env = make_environment(config.task, where) if config is not None else cast(gymnasium.Env, env)
+    try:
+        if config is not None:
+            evaluation_env.reset(seed=config.seed)  # samples what is hidden and constant in the run
+        stored = _stored_baselines(subject, others, where, how)
+        skipped = [
+            name for name, make in others.items() if name not in stored and not is_compatible(make, evaluation_env)
+        ]
+        policies = {POLICY: subject.make_policy(evaluation_env)}
+        policies |= {
+            name: make(evaluation_env) for name, make in others.items() if name not in stored and name not in skipped
+        }
+        labels = {
+            name: f"series {number} of {1 + len(others)}: {LABELS.get(name, name)}"
+            for number, name in enumerate((POLICY, *others), start=1)
+        }
+        for name in stored:
+            print(f"{labels[name]}: evaluated before, and used again", file=sys.stderr, flush=True)
+        recorder = None if save is None else _DemonstrationRecorder(signal)
+        evaluated = dict(stored)
+        for name, rows, kept in evaluate_policies(
+            evaluation_env, policies, labels=labels, processes=processes, collect=recorder, **how
+        ):
+            evaluated[name] = rows
+            if name == POLICY and recorder is not None:
+                recorder.keep(kept)
+            _store(subject, name, rows, where, how)
+    finally:
+        if config is not None:
+            evaluation_env.close()
+    rows_of = {name: evaluated[name] for name in (POLICY, *others) if name in evaluated}
+    counts = config is None or counts_collisions(config.task)
+    result = {"evaluation_scope": scope, **_statistics(rows_of, counts), "baselines": [*rows_of][1:]}
+    result |= {"skipped_baselines": skipped, "episodes": episodes, "seed": seed} | _training(folder)
+    if (comparison := compare(rows_of)) is not None:
+        result |= {"best_baseline": comparison.baseline, "p": comparison.p}
+    if recorder is not None and save is not None:
+        result["saved"] = recorder.save(save)
+    if describe_differences is not None and config is not None:
+        result["differences"] = list(describe_differences(replace(config, environment=where)))
+    return Evaluation(result, rows_of)
+
+
+def _check_saved(save: Path | None, signal: str) -> None:
+    """Raise an InputError if demonstrations cannot be saved."""
+    if signal not in SIGNALS:
+        raise InputError(f"there is no signal {signal!r} to save: choose one of {', '.join(SIGNALS)}")
+    if save is not None:
+        if save.suffix not in ENDINGS:
+            raise InputError(f"{save} has the ending {save.suffix!r}: demonstrations are .npz or .csv")
+        check_new(save, "file")
+
+
+def _stored_baselines(
+    subject: Subject, names: Iterable[str], environment: Mapping[str, Any], how: Mapping[str, Any]
+) -> dict[str, pd.DataFrame]:
+    """Return the rows of baseline policies that are stored in the run's folder."""
+    files = {name: _baseline_file(subject, name, environment, how) for name in names}
+    return {name: read_table(file) for name, file in files.items() if file is not None and file.exists()}
+
+
+def _baseline_file(subject: Subject, name: str, environment: Mapping[str, Any], how: Mapping[str, Any]) -> Path | None:
+    if subject.folder is None or subject.config is None or not subject.is_stored:
+        return None
+    return episodes_file(subject.folder.path / BASELINES_FOLDER, name, subject.config, environment, **how)
+
+
+def _store(
+    subject: Subject, name: str, rows: pd.DataFrame, environment: Mapping[str, Any], how: Mapping[str, Any]
+) -> None:
+    """Store evaluated episodes in the run's folder: those of its policy only in its own environment."""
+    file = _baseline_file(subject, name, environment, how)
+    if file is None or subject.folder is None or subject.config is None:
+        return
+    if name == POLICY:
+        if environment != subject.config.environment or "options" in how:
+            return
+        about, folder = policy_digest(subject.folder), subject.folder.path / POLICY_FOLDER
+        file = episodes_file(folder, POLICY, subject.config, environment, about=about, **how)
+    write_atomically(file, table_text(rows).encode())
+
+
+def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any]:
+    """Return the statistics of the policy, of the demonstration and of each baseline policy."""
+    found: dict[str, Any] = {}
+    for name, table in ({POLICY: pd.DataFrame(), "demonstration": pd.DataFrame()} | dict(rows)).items():
+        found |= statistics(table, "" if name == POLICY else f"{name}_")
+    return {key: value if counts or not key.endswith(COLLISIONS) else None for key, value in found.items()}
+
+
+def _training(folder: RunFolder | None) -> dict[str, Any]:
+    """Return the length of the training and its episodes to convergence, None without a table of its episodes."""
+    has_table = folder is not None and (folder.path / "episodes.csv").is_file()
+    trained = folder.episodes() if folder is not None and has_table else None
+    return {
         "episodes_to_convergence": None if trained is None else episodes_to_convergence(trained),
         "trained_episodes": None if trained is None else len(trained),
     }
-    if recorder is not None and save is not None:
-        result["saved"] = recorder.save(save)
-    if describe_differences is not None:
-        result["differences"] = list(describe_differences(replace(config, environment=where)))
-    return result
-
-
-def _find_subject(run_or_policy: Path | str | PolicyFn, task: str | None, environment: Mapping[str, Any]) -> _Subject:
-    """Return the policy that is evaluated, with the configuration of its run or of the task."""
-    if task is None:
-        if not isinstance(run_or_policy, Path | str):
-            raise InputError("a policy without a run is evaluated in a task: name it")
-        folder = RunFolder(run_or_policy)
-        config, policy = folder.config(), Policy.load(folder.path)
-        make_policy = partial(check_compatible, policy, learned_in=config.environment)
-        return _Subject(config, make_policy, folder, True)
-    from guiderail.tools.learning.train import configure
-
-    config = configure(task, environment)
-    if not isinstance(run_or_policy, Path | str):
-        return _Subject(config, lambda env: run_or_policy, None, False)
-    if Path(run_or_policy).is_dir():
-        return _Subject(config, partial(check_compatible, Policy.load(Path(run_or_policy))), None, False)
-    return _Subject(config, make_baseline(task, str(run_or_policy), config.seed), None, False)
-
-
-def _evaluate_baseline(
-    folder: RunFolder | None,
-    name: str,
-    config: RunConfig,
-    make_policy: MakePolicy,
-    environment: Mapping[str, Any],
-    *,
-    label: str,
-    **how: Any,
-) -> pd.DataFrame | None:
-    """Return the rows of a baseline policy; stored in the run's folder, if there is a run."""
-    if folder is None:
-        try:
-            return evaluate_run(config, partial(_make_compatible, make_policy), environment, label=label, **how)
-        except _IncompatibleError:
-            return None
-    stored = folder.path / BASELINES_FOLDER
-    if episodes_file(stored, name, config, environment, **how).exists():
-        print(f"{label}: evaluated before, and used again", file=sys.stderr, flush=True)
-    return evaluate_once(stored, name, config, make_policy, environment, label=label, **how)
 
 
 class _DemonstrationRecorder:
@@ -329,91 +372,24 @@ class _DemonstrationRecorder:
 
     def __init__(self, signal: str):
         self._signal = signal
-        self._times: list[Any] = []
-        self._outputs: list[Any] = []
+        self._times: list[np.ndarray] = []
+        self._outputs: list[np.ndarray] = []
 
-    def __call__(self, env: gymnasium.Env, row: Mapping[str, Any]) -> None:
-        if row["success"]:
-            trace = cast(Any, env.unwrapped).trace
-            self._outputs.append(getattr(trace, self._signal).copy())
-            self._times.append(trace.period * np.arange(1, len(trace) + 1))
+    def __call__(self, env: gymnasium.Env, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return times and poses of a successful episode; None of another one."""
+        if not row["success"]:
+            return None
+        trace = cast(Any, env.unwrapped).trace
+        return trace.period * np.arange(1, len(trace) + 1), getattr(trace, self._signal).copy()
+
+    def keep(self, found: Sequence[tuple[np.ndarray, np.ndarray] | None]) -> None:
+        """Keep what was returned for the episodes."""
+        for times, outputs in filter(None, found):
+            self._times.append(times)
+            self._outputs.append(outputs)
 
     def save(self, file: Path) -> int:
         """Write the demonstrations, if there are any; return their number."""
         if self._outputs:
             Demonstrations(self._times, self._outputs).save(file)
         return len(self._outputs)
-
-
-def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
-    """Return the names of the baseline policies that a task's evaluation includes by default.
-
-    Args:
-        task: Name of the task.
-        environment: Options of its environment.
-    """
-    zero = [] if is_demonstrated(environment.get("guidance")) else ["zero"]
-    has_scripted = bool(scripted_policies(task)) and environment.get("observation") != "image"
-    return [*zero, "uniform_random", "constant", *(["scripted"] if has_scripted else [])]
-
-
-def check_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Return a remark if an environment has another guidance than the policy was trained with; empty if not.
-
-    Args:
-        own: Options of the environment that the policy was trained in.
-        other: Options of the environment that it acts in.
-
-    Raises:
-        InputError: If actions of one guidance displace outputs and those of the other do not.
-    """
-    trained, used = str(own.get("guidance")), str(other.get("guidance"))
-    if trained == used:
-        return ""
-    if not all(GUIDANCE.get(name).displaces for name in (trained, used)):
-        raise InputError(
-            f"the policy was trained with guidance {trained}, and its actions mean something else with {used}: leave "
-            "guidance out of --env"
-        )
-    return f"with guidance {used}, and was trained with {trained}"
-
-
-def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets: bool) -> str:
-    """Return what an evaluation is valid for: the hidden offset of one run, or offsets sampled in every episode.
-
-    Args:
-        task: Name of the task.
-        environment: Options of its environment.
-        resample_offsets: Whether what a run hides is sampled again in every episode.
-
-    Raises:
-        InputError: If `resample_offsets` is True and a run of the task hides nothing.
-    """
-    if resample_offsets and not _can_hide(task):
-        raise InputError(f"a run of {task} has no hidden offset to resample: leave --resample-offsets out")
-    if not has_held_out_distribution(task):
-        return f"conditions as in training: {task} declares no held-out conditions"
-    if not _can_hide(task):
-        return "held-out starts"
-    if resample_offsets or not hides(task, environment):
-        return "any offset: sampled again in every episode"
-    return "the one offset that is hidden in this run (--resample-offsets: any offset)"
-
-
-def hides(task: str, environment: Mapping[str, Any]) -> bool:
-    """Return True if something hidden is constant in all episodes of a run, unless `new_run` samples it again."""
-    return _can_hide(task) and environment.get("fixture_offset", "per_run") == "per_run"
-
-
-def _can_hide(task: str) -> bool:
-    return task in TASKS.names() and "new_run" in TASKS.get(task).Reset.model_fields
-
-
-def _counts_collisions(task: str) -> bool:
-    """Return True if a task declares a collision signal; a `TerminationTerm` named collision is not one."""
-    return task not in TASKS.names() or TASKS.get(task).declares_collision()
-
-
-def has_held_out_distribution(task: str) -> bool:
-    """Return True if a task declares held-out conditions, or is registered with Gymnasium only."""
-    return task not in TASKS.names() or TASKS.get(task).has_held_out_distribution

@@ -6,7 +6,6 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +16,15 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.units import MM
-from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment, check_environment
-from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline, zero_policy
-from guiderail.tools.evaluation.cache import POLICY, policy_digest
-from guiderail.tools.evaluation.evaluate import (
-    HELD_OUT_SEED,
-    check_guidance_change,
-    default_baselines,
-    evaluate_once,
-    hides,
-)
+from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
+from guiderail.tools.evaluation.cache import POLICY
+from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, evaluate_once
+from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import wilson
-from guiderail.tools.evaluation.rollout import check_compatible
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.evaluation.scope import default_baselines, hides, refuse_guidance_change
+from guiderail.tools.evaluation.subject import Subject, find_subject, make_baselines
+from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import is_demonstrated, label, legend, new_figure, save_figure
 
@@ -261,8 +255,9 @@ class _Actor:
 
 
 def robustness(
-    runs: Sequence[Path],
+    policies: Sequence[Path | str],
     *,
+    task: str | None = None,
     episodes: int = EPISODES,
     seed: int = HELD_OUT_SEED,
     environment: Mapping[str, Any] | None = None,
@@ -270,48 +265,57 @@ def robustness(
     baselines: Mapping[str, MakePolicy] | Sequence[str] | None = (),
     out: Path | None = None,
     say: Callable[[str], None] = lambda sentence: None,
+    processes: int | None = None,
+    allow_code: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate the policies of runs along each axis, the rest of the environment being as in training.
+    """Evaluate policies along each axis, the rest of the environment being as in training.
 
     The episodes of every point are stored in the folder: an interrupted evaluation is resumed by the same call, and a
     further run costs only its own episodes.
 
     Args:
-        runs: Folders of runs of one task. Baseline policies act through the guidance of the first.
+        policies: Runs of one task; with `task`, any policies that `find_subject` takes. Baseline policies act through
+            the guidance of the first.
+        task: Task of policies without a run.
         episodes: Number of held-out episodes of each policy at each point, with the same seeds.
         seed: Seed of the first.
         environment: Options of the environment that differ throughout, such as the station.
         axes: Names of axes, comma-separated; all by default.
         baselines: Baseline policies: their names, or functions that make them, by name; None for the default set of
             the task.
-        out: Folder to write; in the run, named after its station, by default. Several runs need it.
+        out: Folder to write; in the run, named after its station, by default. Several policies and one without a run
+            need it.
         say: Called with a sentence on what the runs differ in and on each point left out.
+        processes: Largest number of processes; None for the number of cores. The results do not depend on it.
+        allow_code: Read a policy's file that can execute code.
 
     Returns:
-        `table` and `picture`, the files; `rows`, those of the table; `policies`, the names of the runs' policies.
+        `table` and `picture`, the files; `rows`, those of the table; `policies`, the names of the policies.
 
     Raises:
         InputError: If there is no trained run, runs are of different tasks, or an argument is invalid.
     """
     if episodes < 1:
         raise InputError(f"robustness needs at least one episode at each point, not {episodes}")
-    policies = _run_policies(runs, dict(environment or {}), say)
-    if out is None and len(runs) > 1:
-        raise InputError("give the folder of the table and the picture of several runs with --out")
-    first = policies[0]
+    check_processes(processes)
+    subjects = [find_subject(policy, task, environment, allow_code=allow_code) for policy in policies]
+    compared = _actors(subjects, dict(environment or {}), say)
+    first, folder = compared[0], subjects[0].folder if subjects[0].is_stored else None
+    if out is None and (len(policies) > 1 or folder is None):
+        raise InputError("give the folder of the table and the picture of several runs, or of no run, with --out")
     if not isinstance(baselines, Mapping):
-        task, run_seed = first.config.task, first.config.seed
-        default = [name for name in default_baselines(task, first.environment) if name != "constant"]
-        baselines = {
-            name: make_baseline(task, name, run_seed) for name in (default if baselines is None else baselines)
-        }
-    actors = list(policies)
+        if baselines is None:
+            baselines = [name for name in default_baselines(first.config.task, first.environment) if name != "constant"]
+        baselines = make_baselines(first.config, first.environment, baselines)
+    actors = list(compared)
     if is_demonstrated(first.environment.get("guidance")):
         actors.append(_Actor(DEMONSTRATION, zero_policy, first.config, first.environment))
     for name, make_policy in baselines.items():
-        if name != "zero" or len(actors) == len(policies):
+        if name != "zero" or len(actors) == len(compared):
             actors.append(_Actor(name, make_policy, first.config, first.environment))
-    out = runs[0] / "robustness" / str(first.environment.get("station", "")) if out is None else out
+    if out is None:
+        assert folder is not None
+        out = folder.path / "robustness" / str(first.environment.get("station", ""))
     jobs = _jobs(actors, select_axes(axes), say)
     rows: list[dict[str, Any]] = []
     for number, (actor, point) in enumerate(jobs, start=1):
@@ -319,7 +323,7 @@ def robustness(
         options = {"options": dict(point.options)} if point.options else {}
         evaluated = evaluate_once(
             out / "episodes", actor.name, actor.config, actor.make_policy, point.environment,
-            about=actor.about, episodes=episodes, seed=seed, label=progress, **options,
+            about=actor.about, episodes=episodes, seed=seed, label=progress, processes=processes, **options,
         )  # fmt: skip
         if evaluated is not None:
             rows.append(_row(point, actor.name, evaluated))
@@ -328,29 +332,30 @@ def robustness(
     given = dict(environment or {})
     given |= {"episodes": episodes} if episodes != EPISODES else {}
     given |= {"seed": seed} if seed != HELD_OUT_SEED else {}
-    names = [*([actor.name for actor in policies] if len(policies) > 1 else []), *sorted(baselines)]
+    names = [*([actor.name for actor in compared] if len(compared) > 1 else []), *sorted(baselines)]
     table = write_table(out / f"{_table_name(axes, given, names)}.csv", rows).with_suffix(".csv")
     picture = draw(table.with_suffix(".png"), rows)
-    return {"table": table, "picture": picture, "rows": rows, "policies": [actor.name for actor in policies]}
+    return {"table": table, "picture": picture, "rows": rows, "policies": [actor.name for actor in compared]}
 
 
-def _run_policies(runs: Sequence[Path], environment: Mapping[str, Any], say: Callable[[str], None]) -> list[_Actor]:
-    """Return the policies of the runs, named after their guidance, or after their folders if that is the same."""
-    if not runs:
+def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], say: Callable[[str], None]) -> list[_Actor]:
+    """Return the policies, those of runs named after their guidance, or after their folders if that is the same."""
+    if not subjects:
         raise InputError("robustness needs the folder of a run")
-    folders = [RunFolder(run) for run in runs]
-    configs = [folder.config() for folder in folders]
+    configs = [subject.config for subject in subjects if subject.config is not None]
     tasks = sorted({config.task for config in configs})
     if len(tasks) > 1:
         raise InputError(f"runs that are compared are of one task, not of {' and '.join(tasks)}")
     kinds = [label(str(config.environment.get("guidance"))) for config in configs]
-    names = [POLICY] if len(runs) == 1 else kinds if len(set(kinds)) == len(kinds) else [run.name for run in runs]
+    names = [POLICY] if len(subjects) == 1 else kinds
+    if len(set(names)) < len(names):
+        names = [subject.name for subject in subjects]
     if len(set(names)) < len(names):
         raise InputError("runs that are compared are different ones, in folders of different names")
     changed = [changed_environment(config.task, config.environment, environment) for config in configs]
-    for config, options in zip(configs, changed, strict=True):
-        if remark := check_guidance_change(config.environment, options):
-            say(f"the policy acts {remark}")
+    for subject, config, options in zip(subjects, configs, changed, strict=True):
+        if subject.folder is not None:
+            refuse_guidance_change(config.environment, options)
     settings: list[dict[str, Any]] = [
         {"seed": config.seed, **options} for config, options in zip(configs, changed, strict=True)
     ]
@@ -358,14 +363,8 @@ def _run_policies(runs: Sequence[Path], environment: Mapping[str, Any], say: Cal
     if differing := [key for key in keys if any(one.get(key) != settings[0].get(key) for one in settings)]:
         say(f"the runs differ in {', '.join(differing)}")
     return [
-        _Actor(
-            name,
-            partial(check_compatible, Policy.load(folder.path), learned_in=config.environment),
-            config,
-            options,
-            policy_digest(folder),
-        )
-        for name, folder, config, options in zip(names, folders, configs, changed, strict=True)
+        _Actor(name, subject.make_policy, config, options, subject.digest)
+        for name, subject, config, options in zip(names, subjects, configs, changed, strict=True)
     ]
 
 

@@ -9,8 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.models.common.errors import InputError, brief
-from guiderail.models.policy import Policy
+from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import Episode, episode_row
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
@@ -157,39 +156,3 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
     except (IndexError, ValueError):
         return False
     return shapes == {env.action_space.shape}
-
-
-def check_compatible(policy: Policy, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
-    """Return a learned policy for an environment that may differ from the one it learned in.
-
-    Args:
-        policy: Learned policy.
-        env: Environment.
-        learned_in: Options of the environment that it learned in, for the message.
-
-    Raises:
-        InputError: If the shape of its observations or its actions is another one than the environment's.
-    """
-    if is_compatible(lambda env: policy, env):
-        return policy
-    raise InputError(_describe_mismatch(policy, env, learned_in))
-
-
-_MAX_DIFFERENCES = 5  # options that a message names
-
-
-def _describe_mismatch(policy: Policy, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
-    """Return a sentence with the shapes of policy and environment, and the options that differ."""
-    sees, moves = tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
-    config = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
-    options = {} if config is None else config.config.options
-    changed = [
-        f"{name}={brief(value)} instead of {brief(options[name])}"
-        for name, value in (learned_in or {}).items()
-        if name in options and options[name] != value
-    ][:_MAX_DIFFERENCES]
-    differences = f"; it learned with {', '.join(changed)}" if changed else ""
-    return (
-        f"the policy takes observations {sees} and returns actions {moves}, and this environment has observations "
-        f"{env.observation_space.shape} and actions {env.action_space.shape}{differences}: change --env"
-    )

@@ -31,7 +31,8 @@ from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.evaluate import evaluate_run
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollout
+from guiderail.tools.evaluation.policies import check_compatible
+from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Study
 from guiderail.tools.experiments.engines.engine import Outcome
 from guiderail.tools.files import write_atomically

@@ -230,7 +230,7 @@ def draw_pictures(out: Path) -> dict[str, str]:
 
     curve = str(plot_run(out))
     try:
-        write_page(page := default_page(out, {}), EpisodeSpec.of_run(out))
+        write_page(page := default_page(out, {}), EpisodeSpec.of_policy(out))
         return {"curve": curve, "replay": str(page)}
     except InputError as error:
         return {"curve": curve, "replay": f"none: {error}"}

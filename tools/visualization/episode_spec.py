@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import MakePolicy
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, check_guidance_change
+from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import COLLISION
-from guiderail.tools.evaluation.rollout import check_compatible, check_seed
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.evaluation.rollout import check_seed
+from guiderail.tools.evaluation.scope import refuse_guidance_change
+from guiderail.tools.evaluation.subject import find_subject
 
 
 @dataclass(frozen=True)
@@ -42,30 +41,42 @@ class EpisodeSpec:
     run: Path | None = None
 
     @classmethod
-    def of_run(cls, run: Path, environment: Mapping[str, Any] | None = None, seed: int = HELD_OUT_SEED) -> EpisodeSpec:
-        """Return an episode of the deterministic policy of a run.
+    def of_policy(
+        cls,
+        policy: Path | str,
+        environment: Mapping[str, Any] | None = None,
+        seed: int = HELD_OUT_SEED,
+        *,
+        task: str | None = None,
+        allow_code: bool = False,
+    ) -> EpisodeSpec:
+        """Return an episode of a policy of any origin; one of a run acts deterministically.
 
         Args:
-            run: Folder of the run.
-            environment: Options of the environment that differ from the run's.
+            policy: Folder of a run, or `pretrained:NAME`; with `task`, any policy that `find_subject` takes.
+            environment: Options of the environment that differ from the run's, or from the task's defaults.
             seed: Seed of the episode.
+            task: Task of a policy without a run.
+            allow_code: Read a policy's file that can execute code.
 
         Raises:
-            InputError: If there is no trained run, or its actions mean something else with another guidance.
+            InputError: If there is no such policy, or its actions mean something else with another guidance.
         """
-        folder = RunFolder(run)
-        config, policy = folder.config(), Policy.load(folder.path)
+        subject = find_subject(policy, task, environment, allow_code=allow_code)
+        config, folder = subject.config, subject.folder
+        assert config is not None
         changed = changed_environment(config.task, config.environment, environment or {})
-        remark = check_guidance_change(config.environment, changed)
+        if folder is not None:
+            refuse_guidance_change(config.environment, changed)
         return cls(
             task=config.task,
             environment=changed,
-            policy=partial(check_compatible, policy, learned_in=config.environment),
-            acting="after learning",
-            title=config.learner.algorithm.upper() + (f", {remark}" if remark else ""),
+            policy=subject.make_policy,
+            acting=subject.name if folder is None else "after learning",
+            title=subject.name if folder is None else config.learner.algorithm.upper(),
             run_seed=config.seed,
             seed=seed,
-            run=folder.path,
+            run=folder.path if folder is not None and subject.is_stored else None,
         )
 
     def __post_init__(self) -> None:

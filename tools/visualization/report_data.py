@@ -235,7 +235,7 @@ def _evaluate(run: Run, episodes: int) -> None:
     """Evaluate a run's policy and baseline policies on held-out episodes, unless they are stored in its folder."""
     folder, where = RunFolder(run.path), run.config.environment
     policy = Policy.load(run.path)
-    how: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED}
+    how: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
     evaluate_once(
         run.path / POLICY_FOLDER, POLICY, run.config, lambda env: policy, where, about=policy_digest(folder), **how
     )

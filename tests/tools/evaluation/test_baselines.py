@@ -52,7 +52,7 @@ def test_policy_of_a_gantry_run_drives_the_arm(tmp_path, monkeypatch):
     monkeypatch.setattr(replay, "EPISODES", 1)
     arm = {"station": "arm"}
     html = replay.default_page(folder.path, arm)
-    replay.write_page(html, EpisodeSpec.of_run(folder.path, arm, 1_000_003))
+    replay.write_page(html, EpisodeSpec.of_policy(folder.path, arm, 1_000_003))
     page = html.read_text()
     assert '"outcome":"success after' in page.partition('"name":"after"')[2]
     assert "the arm</button>" in page

@@ -11,13 +11,12 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.cache import load_or_compute, stored_episodes
 from guiderail.tools.evaluation.evaluate import (
-    COMPARED,
     HELD_OUT_SEED,
-    check_guidance_change,
     evaluate,
     evaluate_policy,
-    evaluation_scope,
 )
+from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare
+from guiderail.tools.evaluation.scope import evaluation_scope, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder
 
 
@@ -48,7 +47,7 @@ def test_load_or_compute_computes_once(tmp_path):
 
 
 def test_demonstration_runs_on_the_episodes_of_the_policy(bead_run, capsys):
-    result = evaluate(bead_run, episodes=3)
+    result = evaluate(bead_run, episodes=3, baselines=())
     printed = capsys.readouterr().err
     assert "series 1 of 2: policy 3/3" in printed
     assert "series 2 of 2: demonstration alone 3/3" in printed
@@ -132,12 +131,87 @@ def test_evaluate_describes_differences_when_asked(bead_run):
     assert result["differences"] == ["Bead"]
 
 
-def test_another_guidance_is_refused_or_stated():
-    assert check_guidance_change({"guidance": "skgrl"}, {"guidance": "skgrl"}) == ""
-    remark = check_guidance_change({"guidance": "skgrl"}, {"guidance": "residual"})
-    assert remark == "with guidance residual, and was trained with skgrl"
-    with pytest.raises(InputError, match="its actions mean something else with none"):
-        check_guidance_change({"guidance": "skgrl"}, {"guidance": "none"})
+def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
+    def run(processes):
+        return evaluate(
+            "uniform_random", "NarrowPassage", 3, baselines=["constant", "scripted"],
+            environment={"action_repeat": 40}, processes=processes, save=tmp_path / f"{processes}.npz",
+        )  # fmt: skip
+
+    one, several = run(1), run(2)
+    assert one == several
+    assert one.rows.keys() == several.rows.keys() == {"policy", "demonstration", "constant"}
+    assert one["skipped_baselines"] == ["scripted"]
+    for name, rows in one.rows.items():
+        pd.testing.assert_frame_equal(rows, several.rows[name], check_exact=True)
+    assert one["saved"] == several["saved"] > 0
+    saved = [Demonstrations.load(tmp_path / f"{processes}.npz") for processes in (1, 2)]
+    for first, second in zip(saved[0].outputs, saved[1].outputs, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_baseline_draws_the_same_numbers_in_any_process():
+    """Each episode has a generator of its own, whichever episodes its process has run before."""
+    env = make_environment("Bead", {})
+    rows = {
+        processes: evaluate_policy(env, BaselinePolicy(uniform_random, env), episodes=6, processes=processes)
+        for processes in (1, 3)
+    }
+    assert rows[1]["return"].nunique() == 6
+    pd.testing.assert_frame_equal(rows[1], rows[3], check_exact=True)
+
+
+def won(*successes):
+    return pd.DataFrame({"success": successes})
+
+
+def test_comparison_is_an_exact_paired_test_against_each_baseline():
+    """Of 10 discordant episodes the policy wins 9: p = (1 + 10) / 2**10."""
+    policy, weak, other = won(*[1] * 9, 0, 1), won(*[0] * 9, 1, 1), won(*[0] * 11)
+    comparison = compare({"policy": policy, "weak": weak, "other": other})
+    assert comparison.baseline == "weak"
+    assert comparison.successes == 2
+    assert comparison.p == pytest.approx(11 / 2**10)
+    assert compare({"policy": policy, "same": policy}).p == 1.0
+    assert compare({"policy": policy}) is None
+
+
+def test_comparison_counts_the_baseline_that_is_hardest_to_beat():
+    """The baseline with most successes has 5 to 0 discordant episodes, another one 4 to 0, which is less certain."""
+    policy = won(*[1] * 10)
+    best, other = won(*[0] * 5, *[1] * 5), won(*[0] * 6, *[1] * 4)
+    assert compare({"policy": policy, "other": other, "best": best}).p == pytest.approx(1 / 2**5)
+    losing = won(*[1] * 5, *[0] * 5)
+    assert compare({"policy": losing, "better": policy, "best": best}).p == 1.0
+
+
+def test_evaluation_has_a_table_and_a_sentence(bead_run):
+    result = evaluate(bead_run, episodes=4, baselines=["constant"])
+    assert list(result.table.index) == ["policy", "demonstration alone", "constant action"]
+    assert result.table.loc["policy", "mean_return"] == result["mean_return"]
+    low, high = 100 * result["success_low"], 100 * result["success_high"]
+    assert f"in {4 * result['success_rate']:.0f} of 4 held-out episodes (95 % interval {low:.0f} to {high:.0f} %)" in (
+        result.sentence
+    )
+    assert "not shown to be better than the best baseline" in result.sentence
+    assert result.sentence.endswith("; every command satisfied the constraints.")
+    assert result.sentence in str(result)
+    assert result.sentence in result._repr_html_()
+
+
+def test_sentence_names_the_best_baseline():
+    rows = {"policy": won(*[1] * 12), "zero": won(1, *[0] * 11)}
+    statistics = {"success_low": 0.7, "success_high": 1.0, "max_commanded_violation": 2e-3}
+    sentence = Evaluation(statistics, rows).sentence
+    assert "better than the best baseline, zero action with 1 (p = 0.00049); the largest constraint" in sentence
+    assert "was 0.002 m or rad." in sentence
+
+
+@pytest.mark.parametrize("other", ["residual", "kgrl", "none"])
+def test_another_guidance_is_refused(other):
+    refuse_guidance_change({"guidance": "skgrl"}, {"guidance": "skgrl"})
+    with pytest.raises(InputError, match=f"its actions mean something else with {other}"):
+        refuse_guidance_change({"guidance": "skgrl"}, {"guidance": other})
 
 
 def test_scope_differs_between_one_offset_and_any(bead_run):

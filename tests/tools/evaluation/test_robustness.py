@@ -17,13 +17,13 @@ from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.robustness import (
     AXES,
     Axis,
-    _Actor,
     draw,
     points,
     robustness,
     select_axes,
     values_below,
 )
+from guiderail.tools.evaluation.subject import Subject
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.trainer import run_training
 
@@ -173,13 +173,14 @@ def test_all_policies_get_the_same_resampled_offsets(bead_config, tmp_path, monk
 
         return acts
 
-    def one(*_):
-        return [_Actor("policy", watching("policy"), config, environment)]
+    def one(*_, **options):
+        return Subject("policy", config, watching("policy"))
 
     (offsets,) = select_axes("offsets")
-    monkeypatch.setattr("guiderail.tools.evaluation.robustness._run_policies", one)
+    monkeypatch.setattr("guiderail.tools.evaluation.robustness.find_subject", one)
     monkeypatch.setattr(module, "AXES", (replace(offsets, values=(2.0,)),))
-    robustness([tmp_path], episodes=2, baselines={"uniform_random": watching("uniform_random")}, out=tmp_path)
+    baselines = {"uniform_random": watching("uniform_random")}
+    robustness([tmp_path], episodes=2, baselines=baselines, out=tmp_path, processes=1)
     # The first offset is that of the compatibility check, in the run's own environment.
     places = {name: set(seen) - {seen[0]} for name, seen in met.items()}
     assert len(places["policy"]) == 2

@@ -1,0 +1,62 @@
+import os
+import time
+
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.evaluation.forks import check_processes, forked_map, num_cores
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 9])
+def test_forked_map_yields_results_in_order(processes):
+    assert list(forked_map(lambda i: i * i, 7, processes)) == [i * i for i in range(7)]
+
+
+def test_forked_map_uses_several_processes():
+    def slow(index):
+        time.sleep(0.05)  # otherwise the first process takes them all
+        return os.getpid()
+
+    found = set(forked_map(slow, 6, 3))
+    assert len(found) > 1
+    assert os.getpid() not in found
+    assert set(forked_map(slow, 1, 3)) == {os.getpid()}
+
+
+def test_forked_map_raises_the_error_of_a_process():
+    def refuse(index):
+        raise InputError(f"{index} is refused")
+
+    with pytest.raises(InputError, match="is refused"):
+        list(forked_map(refuse, 3, 2))
+    with pytest.raises(RuntimeError, match="_Unpicklable"):
+        list(forked_map(lambda index: _raise(), 3, 2))
+
+
+class _UnpicklableError(Exception):
+    def __init__(self, one, two):
+        super().__init__("neither")
+
+
+def _raise():
+    raise _UnpicklableError(1, 2)
+
+
+def test_forked_map_raises_when_a_process_is_killed():
+    with pytest.raises(RuntimeError, match="was killed"):
+        list(forked_map(lambda index: os.kill(os.getpid(), 9), 3, 2))
+
+
+def test_forked_map_leaves_no_process_when_it_is_abandoned():
+    results = forked_map(lambda index: os.getpid(), 50, 2)
+    worker = next(results)
+    results.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
+
+
+def test_check_processes_counts_the_cores():
+    assert check_processes(None) == num_cores() >= 1
+    assert check_processes(3) == 3
+    with pytest.raises(InputError, match="at least one process, not 0"):
+        check_processes(0)

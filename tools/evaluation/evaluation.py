@@ -1,0 +1,142 @@
+"""Result of an evaluation: episodes and statistics of a policy and of baseline policies, and their comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import pandas as pd
+from scipy import stats
+
+from guiderail.tools.evaluation.cache import POLICY
+from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, summary
+
+COMPARED = (
+    "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "max_commanded_violation",
+    "max_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
+)  # fmt: skip
+"""Statistics of the policy and of every baseline policy."""
+COLLISIONS = ("collisions", "collision_steps")  # those that need a task with a collision signal
+LABELS = {
+    POLICY: "policy", "demonstration": "demonstration alone", "zero": "zero action",
+    "uniform_random": "uniform random actions", "constant": "constant action", "scripted": "scripted policy",
+}  # fmt: skip
+SIGNIFICANT = 0.05  # p-values below it support that a policy is better
+
+
+class Comparison(NamedTuple):
+    """Comparison of a policy's success with that of the best baseline policy, on the same episodes.
+
+    Attributes:
+        baseline: Name of the baseline policy with the most successes.
+        successes: Number of its successes.
+        p: Probability of a difference at least as large if the policy were not better than every baseline policy.
+    """
+
+    baseline: str
+    successes: int
+    p: float
+
+
+@dataclass(frozen=True, eq=False)  # equal as mappings
+class Evaluation(Mapping[str, Any]):
+    """Result of `evaluate`, and a mapping of its statistics by name.
+
+    Attributes:
+        statistics: Statistics, as `guiderail evaluate --json` prints them.
+        rows: Episodes of each policy by name, one row each; the first is the policy evaluated.
+    """
+
+    statistics: Mapping[str, Any]
+    rows: Mapping[str, pd.DataFrame]
+
+    def __getitem__(self, name: str) -> Any:
+        return self.statistics[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.statistics)
+
+    def __len__(self) -> int:
+        return len(self.statistics)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Statistics `COMPARED`, one row for each policy; `success_low` and `success_high` end the 95 % interval."""
+        names = [self._name(name) for name in self.rows]
+        rows = [statistics(rows) for rows in self.rows.values()]
+        return pd.DataFrame(rows, index=pd.Index(names, name="policy")).dropna(axis="columns", how="all")
+
+    @property
+    def comparison(self) -> Comparison | None:
+        """Comparison with the best baseline policy; None without one."""
+        return compare(self.rows)
+
+    @property
+    def sentence(self) -> str:
+        """Result in one sentence."""
+        rows, low, high = self.rows[POLICY], *(self.statistics[f"success_{end}"] for end in ("low", "high"))
+        text = (
+            f"The policy succeeds in {int(rows['success'].sum())} of {len(rows)} held-out episodes "
+            f"(95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
+        )
+        if self.comparison is not None:
+            baseline, successes, p = self.comparison
+            verdict = "better than" if p < SIGNIFICANT else "not shown to be better than"
+            text += f", {verdict} the best baseline, {self._name(baseline)} with {successes} (p = {p:.2g})"
+        violation = self.statistics.get("max_commanded_violation")
+        if violation is not None and violation == violation:
+            is_within = violation <= TOLERANCE
+            text += "; every command satisfied the constraints" * is_within
+            text += f"; the largest constraint violation of a command was {violation:.2g} m or rad" * (not is_within)
+        return text + "."
+
+    def __str__(self) -> str:
+        return f"{self.table.to_string()}\n{self.sentence}"
+
+    def _repr_html_(self) -> str:
+        return f"{self.table.to_html()}<p>{self.sentence}</p>"
+
+    @staticmethod
+    def _name(policy: str) -> str:
+        return LABELS.get(policy, policy.replace("_", " "))
+
+
+def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
+    """Compare the success of a policy with that of baseline policies on the same episodes.
+
+    The test is McNemar's, exact and one-sided: of the episodes in which one policy succeeds and the other does not, the
+    policy would win half if it were not better. Of all baseline policies the largest p counts, so that "better than the
+    best baseline" means better than each of them (intersection-union test), without a correction for their number.
+
+    Args:
+        rows: Episodes by the policy's name, with the same conditions in each; those of the policy are named `POLICY`.
+
+    Returns:
+        The comparison; None without a baseline policy.
+    """
+    won = rows[POLICY]["success"].to_numpy(float)
+    others = {name: table["success"].to_numpy(float) for name, table in rows.items() if name != POLICY}
+    if not others:
+        return None
+    best = max(others, key=lambda name: others[name].sum())
+    return Comparison(best, int(others[best].sum()), max(_mcnemar(won, other) for other in others.values()))
+
+
+def _mcnemar(won: Any, other: Any) -> float:
+    wins, losses = int((won > other).sum()), int((won < other).sum())
+    return float(stats.binomtest(wins, wins + losses, alternative="greater").pvalue) if wins + losses else 1.0
+
+
+def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
+    """Return the statistics `COMPARED` of episodes; None for one whose column an outside environment does not have."""
+    if not len(rows):
+        return summary(rows, COMPARED, prefix)
+    found: dict[str, Any] = {}
+    for name in COMPARED:
+        try:
+            found[prefix + name] = STATISTICS[name].compute(rows)
+        except KeyError:
+            found[prefix + name] = None
+    return found

@@ -1,0 +1,385 @@
+"""Policies of any origin: a run, a policy's folder, a file of another library, a function, or an object with `predict`.
+
+Nothing that a file holds is executed, unless its user allows it: a policy's folder and an ONNX file hold numbers, a zip
+of Stable-Baselines3 is a pickle and a TorchScript file is a program. `module:function` names code on the command line.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+import zipfile
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import read_bytes
+from guiderail.models.common.registry import did_you_mean
+from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
+from guiderail.tools.environments import check_environment, import_modules, make_environment
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
+
+PRETRAINED = "pretrained:"  # prefix of a policy that comes with the package
+PRETRAINED_FOLDER = Path(__file__).parents[1] / "pretrained"
+ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
+"""Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
+
+# Algorithm that reads a zip of Stable-Baselines3, by the module of the policy's class; the zip does not name its own.
+_SB3_ALGORITHMS = {
+    "stable_baselines3.common.policies": ("stable_baselines3", "PPO"),  # A2C and TRPO have the same policy
+    "stable_baselines3.sac.policies": ("stable_baselines3", "SAC"),
+    "stable_baselines3.td3.policies": ("stable_baselines3", "TD3"),  # DDPG has the same policy
+    "sb3_contrib.tqc.policies": ("sb3_contrib", "TQC"),
+    "sb3_contrib.crossq.policies": ("sb3_contrib", "CrossQ"),
+    "sb3_contrib.common.recurrent.policies": ("sb3_contrib", "RecurrentPPO"),
+    "sb3_contrib.ars.policies": ("sb3_contrib", "ARS"),
+}
+# Entries that only training needs; without them a zip of another version of Python or NumPy can be read.
+_SB3_UNUSED: dict[str, Any] = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": None, "buffer_size": 1}
+
+
+class ForeignPolicy(Callback):
+    """Policy of another library, as a function from an observation to an action.
+
+    Attributes:
+        observation_shape: Shape of the observation that it takes; None if unknown.
+        action_shape: Shape of the action that it returns; None if unknown.
+    """
+
+    def __init__(
+        self,
+        act: Callable[[np.ndarray], Any],
+        *,
+        observation_shape: tuple[int, ...] | None = None,
+        action_shape: tuple[int, ...] | None = None,
+        errors: tuple[type[Exception], ...] = (),
+    ):
+        """Construct the policy.
+
+        Args:
+            act: Function from an observation to an action; a leading dimension of 1 of the action is removed.
+            observation_shape: Shape of the observation, if it is known.
+            action_shape: Shape of the action, if it is known.
+            errors: Exceptions of `act` for an observation of a wrong shape.
+        """
+        self.observation_shape, self.action_shape = observation_shape, action_shape
+        self._act, self._errors = act, errors
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action for an observation.
+
+        Raises:
+            ValueError: If the observation has another shape than the policy takes.
+        """
+        if self.observation_shape not in (None, np.shape(observation)):
+            raise ValueError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
+        try:
+            action = np.asarray(self._act(observation))
+        except self._errors as error:
+            raise ValueError(f"the policy failed: {' '.join(str(error).split())[:200]}") from error
+        return action[0] if action.ndim == 2 and len(action) == 1 else action
+
+
+class PredictPolicy(ForeignPolicy):
+    """Policy with a `predict` method, such as a model of Stable-Baselines3, acting deterministically.
+
+    The internal state of a recurrent policy is passed from call to call and reset at the start of an episode.
+    """
+
+    def __init__(self, model: Any):
+        """Construct the policy of `model`, whose `predict` returns an action, or an action and a state."""
+        shapes = (getattr(getattr(model, f"{kind}_space", None), "shape", None) for kind in ("observation", "action"))
+        observation_shape, action_shape = shapes
+        super().__init__(self._predict, observation_shape=observation_shape, action_shape=action_shape)
+        self.model = model
+        parameters = inspect.signature(model.predict).parameters
+        self._options = {"deterministic": True} if "deterministic" in parameters else {}
+        self._has_state = {"state", "episode_start"} <= parameters.keys()
+        self.on_episode_start()
+
+    def on_episode_start(self) -> None:
+        """Reset the internal state of a recurrent policy."""
+        self._state: Any = None
+        self._is_start = True
+
+    def _predict(self, observation: np.ndarray) -> Any:
+        if not self._has_state:
+            result = self.model.predict(observation, **self._options)
+            return result[0] if isinstance(result, tuple) else result
+        start = np.array([self._is_start])
+        action, self._state = self.model.predict(observation, self._state, start, **self._options)
+        self._is_start = False
+        return action
+
+
+def as_policy(given: Any) -> PolicyFn:
+    """Return a policy as a function from an observation to an action.
+
+    Args:
+        given: A function, or an object with a `predict` method.
+
+    Raises:
+        InputError: If it is neither.
+    """
+    if isinstance(given, Policy | Callback) and callable(given):
+        return given
+    if callable(getattr(given, "predict", None)):
+        return PredictPolicy(given)
+    if callable(given):
+        return given
+    raise InputError(
+        f"{brief(given)} is no policy: give the folder of a run, a function from an observation to an action, or an "
+        "object with a predict method"
+    )
+
+
+def is_policy_file(source: str | Path) -> bool:
+    """Return True if a source names a file or a function, and not a folder, a task or a baseline policy."""
+    return Path(source).suffix in ENDINGS or _function_of(str(source)) is not None
+
+
+def load_policy(source: str | Path, *, allow_code: bool = False) -> PolicyFn:
+    """Return the policy of a folder, a file or `module:function`.
+
+    Args:
+        source: Folder with `policy.safetensors`; .zip of Stable-Baselines3; .onnx; TorchScript (.pt, .ts,
+            .torchscript); or `module:function`, where a module is a module's name or a file (.py), and a function any
+            policy that `as_policy` takes, or a class of such policies.
+        allow_code: Read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
+
+    Raises:
+        InputError: If the file is missing, damaged or can execute code, or its package is not installed.
+    """
+    if (function := _function_of(str(source))) is not None:
+        return _load_function(*function)
+    path = Path(source)
+    if path.suffix not in ENDINGS:
+        return Policy.load(path)
+    if not path.is_file():
+        raise InputError(f"there is no file {path}: give the file of a policy")
+    if path.suffix == ".onnx":
+        return _load_onnx(path)
+    if not allow_code:
+        kind = "is a pickle, which can execute code when it is read" if path.suffix == ".zip" else "is a program"
+        raise InputError(f"{path} {kind}: give --allow-code if you trust its origin")
+    return _load_sb3(path) if path.suffix == ".zip" else _load_torchscript(path)
+
+
+def _function_of(source: str) -> tuple[str, str] | None:
+    """Return module and name of `module:function`; None for another source."""
+    module, separator, name = source.rpartition(":")
+    is_name = bool(separator) and name.isidentifier() and bool(module) and not source.startswith(PRETRAINED)
+    return (module, name) if is_name else None
+
+
+def _load_function(module: str, name: str) -> PolicyFn:
+    (imported,) = import_modules([module])
+    loaded = sys.modules.get(f"guiderail_imported_{Path(imported).stem}" if imported.endswith(".py") else imported)
+    if not hasattr(loaded, name):
+        names = [one for one in vars(loaded or object) if not one.startswith("_")]
+        raise InputError(f"{module} has no {brief(name)}: {did_you_mean(name, names)}")
+    found = getattr(loaded, name)
+    return as_policy(found() if inspect.isclass(found) else found)
+
+
+def _load_sb3(path: Path) -> PolicyFn:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            module = json.loads(archive.read("data"))["policy_class"]["__module__"]
+    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no model of Stable-Baselines3: give a file that model.save wrote") from error
+    if module not in _SB3_ALGORITHMS:
+        raise InputError(
+            f"{path} has a policy of {brief(module)}: load it in a function of yours and give FILE.py:FUNCTION"
+        )
+    package, algorithm = _SB3_ALGORITHMS[module]
+    try:
+        kind: Any = getattr(import_module(package), algorithm)
+        model = kind.load(path, device="cpu", custom_objects=_SB3_UNUSED)
+    except Exception as error:  # a pickle fails in any way
+        text = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"{path} cannot be read ({type(error).__name__}: {text}): save it with the installed versions"
+        ) from error
+    return PredictPolicy(model)
+
+
+def _load_torchscript(path: Path) -> PolicyFn:
+    import torch
+
+    try:
+        module = torch.jit.load(path, map_location="cpu")
+    except RuntimeError as error:
+        raise InputError(f"{path} is no TorchScript file: write it with torch.jit.script(module).save(...)") from error
+    module.eval()
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            return module(torch.as_tensor(observation, dtype=torch.float32)[None]).numpy()
+
+    return ForeignPolicy(act, errors=(RuntimeError,))
+
+
+def _load_onnx(path: Path) -> PolicyFn:
+    if find_spec("onnxruntime") is None:
+        raise InputError(f"reading {path} needs ONNX Runtime: pip install 'guiderail[onnx]'")
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a fork has no threads of its parent
+    content = read_bytes(path, "policy", MAX_WEIGHTS_SIZE)
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's exceptions have no common base class
+        raise InputError(f"{path} is no ONNX file that can be read: export it again") from error
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    if len(inputs) != 1 or inputs[0].type != "tensor(float)":
+        raise InputError(f"{path} has the inputs {[one.name for one in inputs]}: a policy has one, of float32")
+    name, shape = inputs[0].name, inputs[0].shape
+    is_batched = not (shape and isinstance(shape[0], int) and shape[0] > 1) and len(shape) > 1
+    observation_shape = tuple(shape[1:] if is_batched else shape)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        values = np.asarray(observation, np.float32)
+        return session.run([outputs[0].name], {name: values[None] if is_batched else values})[0]
+
+    is_known = all(isinstance(size, int) for size in observation_shape)
+    return ForeignPolicy(act, observation_shape=observation_shape if is_known else None, errors=(Exception,))
+
+
+def pretrained_names() -> list[str]:
+    """Return the names of the policies that come with the package."""
+    return sorted(file.parent.name for file in PRETRAINED_FOLDER.glob("*/config.yaml"))
+
+
+def find_run(source: str | Path) -> Path:
+    """Return the folder of a run; that of `pretrained:NAME` is in the package.
+
+    Raises:
+        InputError: If no pretrained policy has the name.
+    """
+    if not str(source).startswith(PRETRAINED):
+        return Path(source)
+    name = str(source).removeprefix(PRETRAINED)
+    if name not in pretrained_names():
+        raise InputError(f"there is no pretrained policy {brief(name)}: {did_you_mean(name, pretrained_names())}")
+    return PRETRAINED_FOLDER / name
+
+
+def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
+    """Return a policy for an environment that may differ from the one it learned in.
+
+    Args:
+        policy: Policy.
+        env: Environment.
+        learned_in: Options of the environment that it learned in, for the message.
+
+    Raises:
+        InputError: If the shape of its observations or its actions is another one than the environment's.
+    """
+    if is_compatible(lambda env: policy, env):
+        return policy
+    raise InputError(_describe_mismatch(policy, env, learned_in))
+
+
+_MAX_DIFFERENCES = 5  # options that a message names
+
+
+def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
+    """Return a sentence with the shapes of policy and environment, and the options that differ or fit."""
+    sees, moves = shapes(policy, env)
+    takes = "cannot take these observations" if sees is None else f"takes observations {sees}"
+    returns = "" if moves is None else f" and returns actions {moves}"
+    task, options = _task_options(env)
+    changed = [
+        f"{name}={brief(value)} instead of {brief(options[name])}"
+        for name, value in (learned_in or {}).items()
+        if name in options and options[name] != value
+    ][:_MAX_DIFFERENCES]
+    hint = f"; it learned with {', '.join(changed)}: change --env" if changed else ": change --env"
+    if not changed and task and (fitting := fitting_options(task, options, policy)):
+        hint = f"; it fits with {' or '.join(f'--env {one}' for one in fitting)}"
+    return (
+        f"the policy {takes}{returns}, and this environment has observations {env.observation_space.shape} and actions "
+        f"{env.action_space.shape}{hint}"
+    )
+
+
+def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
+    """Return the shapes of a policy's observation and action; None for one that is unknown."""
+    if isinstance(policy, Policy):
+        return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
+    sees, moves = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
+    seen = sees or env.observation_space.shape or ()
+    if moves is None:
+        try:
+            moves = np.shape(policy(np.zeros(seen, np.float32)))
+        except (IndexError, ValueError):
+            return sees, None
+    return seen, moves
+
+
+def _task_options(env: gymnasium.Env) -> tuple[str, dict[str, Any]]:
+    """Return the name of an environment's task and all its options; empty for an environment of another origin."""
+    declaration = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
+    config = getattr(declaration, "config", None)
+    return ("", {}) if config is None else (config.task, config.options)
+
+
+_MAX_FITTING = 2  # combinations that a message names
+
+
+def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> list[str]:
+    """Return combinations of options of a task's environment with which a policy fits, the smallest change first.
+
+    Guidance, observation and difficulty are varied, because they decide the sizes of observation and action.
+
+    Args:
+        task: Name of the task.
+        options: Options of its environment.
+        policy: Policy.
+    """
+    from guiderail.diagrams.guidance.registry import possible_guidance
+    from guiderail.diagrams.tasks.registry import TASKS
+
+    kind = TASKS.get(task)
+    values = {
+        "guidance": possible_guidance(kind.provides()),
+        "observation": list(kind.observations),
+        "difficulty": list(kind.difficulties),
+    }
+    candidates = [
+        {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
+        for combination in product(*values.values())
+    ]
+    kept = {name: options[name] for name in ("station", *values) if name in options}
+    found: list[str] = []
+    for changes in sorted(candidates, key=len):
+        if changes and len(found) < _MAX_FITTING and _fits(policy, task, {**kept, **changes}):
+            found.append(" --env ".join(f"{name}={value}" for name, value in changes.items()))
+    return found
+
+
+def _fits(policy: PolicyFn, task: str, environment: Mapping[str, Any]) -> bool:
+    try:
+        env = make_environment(task, check_environment(task, environment))
+    except InputError:
+        return False
+    try:
+        return is_compatible(lambda env: policy, env)
+    finally:
+        env.close()
+
+
+def learned_policy(folder: Path, learned_in: Mapping[str, Any]) -> Callable[[gymnasium.Env], PolicyFn]:
+    """Return a function that makes the policy of a run for an environment, which may be another one."""
+    return partial(check_compatible, Policy.load(folder), learned_in=learned_in)
