@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ MAX_DESCRIPTION_SIZE = 1_000_000  # [bytes]
 
 
 class Policy:
-    """Deterministic policy: a feed-forward network with ReLU layers and a tanh output.
+    """Deterministic policy: a feed-forward network whose output is squashed by a tanh or clipped.
 
     It computes the same action as Stable-Baselines3's `predict(deterministic=True)`, in single precision, with NumPy
     alone, so that a robot's computer needs neither PyTorch nor the learner.
@@ -40,8 +41,12 @@ class Policy:
         self._layers = layers
         self.description = dict(description)
         activation = self.description.setdefault("activation", "relu")
-        if activation not in ("relu", "normalized_relu"):
+        if activation not in ("relu", "normalized_relu", "tanh"):
             raise ValueError(f"a policy has no activation {activation!r}")
+        self._squash = self.description.get("squash", "tanh")
+        if self._squash not in ("tanh", "clip"):
+            raise ValueError(f"the output of a policy is not squashed by {self._squash!r}")
+        self._activation = np.tanh if activation == "tanh" else partial(np.maximum, np.float32(0))
         self._normalizes = activation == "normalized_relu"
         try:
             self._shape = tuple(description["observation_shape"])
@@ -126,14 +131,17 @@ class Policy:
         for weight, bias in self._layers[:-1]:
             hidden = self._activate(weight @ hidden + bias)
         weight, bias = self._layers[-1]
-        squashed = np.tanh(weight @ hidden + bias)
+        output = weight @ hidden + bias
+        if self._squash == "clip":
+            return np.clip(output, self._low, self._high)
+        squashed = np.tanh(output)
         return self._low + np.float32(0.5) * (squashed + np.float32(1)) * (self._high - self._low)
 
     def _activate(self, features: np.ndarray) -> np.ndarray:
         if self._normalizes:
             features = features - features.mean()
             features = features / np.sqrt((features * features).mean() + np.float32(1e-5))
-        return np.maximum(features, np.float32(0))
+        return self._activation(features)
 
     def _features(self, observation: np.ndarray) -> np.ndarray:
         """Return the inputs of the first layer: the observation, or an averaged image in [0, 1], channel by channel."""

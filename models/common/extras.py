@@ -18,6 +18,8 @@ EXTRAS = {
     "sb3_contrib": ("sb3-contrib", "learn"),
     "mujoco": ("MuJoCo", "mujoco"),
     "ray": ("Ray", "ray"),
+    "onnxruntime": ("ONNX Runtime", "onnx"),
+    "wandb": ("Weights & Biases", "wandb"),
 }
 """Name of the software and of the extra by the name of the module."""
 

@@ -56,7 +56,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
     "pictures": _names("tools.files", "PICTURES"),
     "videos": _names("tools.files", "VIDEOS"),
     "baselines": _names("tools.evaluation.baselines", "BASELINES"),
-    "pretrained": _names("tools.evaluation.policies", "pretrained_names"),
+    "pretrained": _names("tools.pretrained", "pretrained_names"),
     "axes": lambda: [axis.name for axis in import_module("guiderail.tools.evaluation.robustness").AXES],
     "listed": lambda: [*LISTED, *LISTED["tasks"]()],
 }

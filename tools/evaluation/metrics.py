@@ -218,6 +218,30 @@ def episode_row(episode: Episode) -> dict[str, Any]:
     return row | {f"reward_{name}": value for name, value in episode.terms.items()}
 
 
+def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
+    """Return the row of an episode of an environment of another origin: what its `info` has.
+
+    Args:
+        index: Number of the episode.
+        total: Sum of the rewards.
+        infos: `info` of each step. `is_success` or `success` is the success of the episode, in any step;
+            `constraint_violation` and `contact_force` are those of the step.
+        is_terminated: True if the task ended the episode, False for a time limit.
+    """
+    success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
+    row = {
+        "episode": index,
+        "return": total,
+        "success": int(success),
+        "termination": "success" if success else "terminated" if is_terminated else "time_limit",
+        "steps": len(infos),
+    }
+    for column, name in (("max_commanded_violation", "constraint_violation"), ("peak_force", "contact_force")):
+        if values := [float(info[name]) for info in infos if name in info]:
+            row[column] = max(values)
+    return row
+
+
 WORDS = ("termination", "fault")  # columns of text; the latter on hardware only
 COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
 

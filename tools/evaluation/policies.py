@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,14 @@ import gymnasium
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.extras import require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
-from guiderail.tools.environments import check_environment, import_modules, make_environment
+from guiderail.tools.environments import beyond_defaults, changed_environment, import_modules, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
+from guiderail.tools.pretrained import PRETRAINED
 
-PRETRAINED = "pretrained:"  # prefix of a policy that comes with the package
-PRETRAINED_FOLDER = Path(__file__).parents[1] / "pretrained"
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
 """Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
 
@@ -44,7 +43,12 @@ _SB3_ALGORITHMS = {
     "sb3_contrib.ars.policies": ("sb3_contrib", "ARS"),
 }
 # Entries that only training needs; without them a zip of another version of Python or NumPy can be read.
-_SB3_UNUSED: dict[str, Any] = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": None, "buffer_size": 1}
+_SB3_UNUSED: dict[str, Any] = {
+    "learning_rate": 0.0,
+    "lr_schedule": lambda remaining: 0.0,
+    "clip_range": lambda remaining: 0.0,
+    "buffer_size": 1,
+}
 
 
 class ForeignPolicy(Callback):
@@ -202,6 +206,7 @@ def _load_sb3(path: Path) -> PolicyFn:
             f"{path} has a policy of {brief(module)}: load it in a function of yours and give FILE.py:FUNCTION"
         )
     package, algorithm = _SB3_ALGORITHMS[module]
+    require_extra(package)
     try:
         kind: Any = getattr(import_module(package), algorithm)
         model = kind.load(path, device="cpu", custom_objects=_SB3_UNUSED)
@@ -214,6 +219,7 @@ def _load_sb3(path: Path) -> PolicyFn:
 
 
 def _load_torchscript(path: Path) -> PolicyFn:
+    require_extra("torch")
     import torch
 
     try:
@@ -230,8 +236,7 @@ def _load_torchscript(path: Path) -> PolicyFn:
 
 
 def _load_onnx(path: Path) -> PolicyFn:
-    if find_spec("onnxruntime") is None:
-        raise InputError(f"reading {path} needs ONNX Runtime: pip install 'guiderail[onnx]'")
+    require_extra("onnxruntime")
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -254,25 +259,6 @@ def _load_onnx(path: Path) -> PolicyFn:
 
     is_known = all(isinstance(size, int) for size in observation_shape)
     return ForeignPolicy(act, observation_shape=observation_shape if is_known else None, errors=(Exception,))
-
-
-def pretrained_names() -> list[str]:
-    """Return the names of the policies that come with the package."""
-    return sorted(file.parent.name for file in PRETRAINED_FOLDER.glob("*/config.yaml"))
-
-
-def find_run(source: str | Path) -> Path:
-    """Return the folder of a run; that of `pretrained:NAME` is in the package.
-
-    Raises:
-        InputError: If no pretrained policy has the name.
-    """
-    if not str(source).startswith(PRETRAINED):
-        return Path(source)
-    name = str(source).removeprefix(PRETRAINED)
-    if name not in pretrained_names():
-        raise InputError(f"there is no pretrained policy {brief(name)}: {did_you_mean(name, pretrained_names())}")
-    return PRETRAINED_FOLDER / name
 
 
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
@@ -361,17 +347,17 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
         {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
         for combination in product(*values.values())
     ]
-    kept = {name: options[name] for name in ("station", *values) if name in options}
     found: list[str] = []
     for changes in sorted(candidates, key=len):
-        if changes and len(found) < _MAX_FITTING and _fits(policy, task, {**kept, **changes}):
+        if changes and len(found) < _MAX_FITTING and _fits(policy, task, options, changes):
             found.append(" --env ".join(f"{name}={value}" for name, value in changes.items()))
     return found
 
 
-def _fits(policy: PolicyFn, task: str, environment: Mapping[str, Any]) -> bool:
+def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:
     try:
-        env = make_environment(task, check_environment(task, environment))
+        known = beyond_defaults(task, options)  # options of one guidance are unknown to another
+        env = make_environment(task, changed_environment(task, known, changes))
     except InputError:
         return False
     try:

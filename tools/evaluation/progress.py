@@ -1,5 +1,6 @@
 """Progress of episodes on standard error: success, return, largest violation and remaining time."""
 
+import math
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -60,7 +61,7 @@ class EpisodeProgress:
         self._recent = [*self._recent, (float(row["success"]), float(row["return"]))]
         if self._window is not None:
             self._recent = self._recent[-self._window :]
-        self._max_violation = max(self._max_violation, float(row["max_commanded_violation"]))
+        self._max_violation = max(self._max_violation, float(row.get("max_commanded_violation", -math.inf)))
         self._bar.update(self._task, completed=self._done, status=self.status())
         now = time.monotonic()
         is_due = self._count == 1 or self._done == self._episodes or now - self._printed > INTERVAL

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.metrics import Episode, episode_row
+from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
 
@@ -96,6 +96,8 @@ def rollout(
 ) -> dict[str, Any]:
     """Run one episode and return its row; the environment's trace holds that episode afterwards.
 
+    The row of an environment of another origin, which has no trace, has fewer columns; see `outside_row`.
+
     Args:
         env: Environment.
         act: Policy; it is called as a callback too if it is one.
@@ -111,10 +113,12 @@ def rollout(
         else env.reset(seed=seed, options=None if options is None else dict(options))[0]
     )
     base: Any = env.unwrapped
+    is_own = hasattr(base, "trace")
     callbacks = (*([act] if isinstance(act, Callback) and act not in observers else []), *observers)
     for callback in callbacks:
         callback.on_episode_start()
-    total, terms = 0.0, dict.fromkeys(base.task.reward_terms, 0.0)
+    total, terms = 0.0, dict.fromkeys(base.task.reward_terms if is_own else (), 0.0)
+    infos: list[Mapping[str, Any]] = []  # of an environment of another origin
     is_over = False
     while not is_over:
         action = act(observation)
@@ -122,10 +126,16 @@ def rollout(
         transition = Transition(observation, action, float(reward), following, terminated, truncated, info)
         total += transition.reward
         terms = {name: value + float(info[name]) for name, value in terms.items()}
+        if not is_own:
+            infos.append(info)
         for callback in callbacks:
             callback.on_step(transition)
         observation, is_over = following, transition.is_last
-    row = episode_row(Episode(index, base.trace, total, terms, info))
+    row = (
+        episode_row(Episode(index, base.trace, total, terms, info))
+        if is_own
+        else outside_row(index, total, infos, is_terminated=terminated)
+    )
     for callback in callbacks:
         row |= callback.on_episode_end(row)
     return row
@@ -141,7 +151,12 @@ class Paths(EnvCallback):
 
 
 def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
-    """Start an episode with held-out conditions; `options` are further options of the reset."""
+    """Start an episode with held-out conditions; `options` are further options of the reset.
+
+    An environment of another origin has no such option: its conditions depend on the seed.
+    """
+    if not hasattr(env.unwrapped, "trace"):
+        return env.reset(seed=seed, options=options or None)[0]
     return env.reset(seed=seed, options={"held_out": True} | options)[0]
 
 

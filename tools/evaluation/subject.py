@@ -17,16 +17,15 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline
 from guiderail.tools.evaluation.cache import policy_digest
 from guiderail.tools.evaluation.policies import (
-    PRETRAINED,
     as_policy,
     check_compatible,
-    find_run,
     is_policy_file,
     learned_policy,
     load_policy,
 )
 from guiderail.tools.evaluation.scope import default_baselines
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.pretrained import PRETRAINED, find_run
 
 
 @dataclass(frozen=True)

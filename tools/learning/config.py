@@ -77,10 +77,77 @@ class OffPolicyConfig(LearnerConfig):
     layer_norm: bool = False  # normalize hidden layers before their activation
     selection_window: NonNegative = 0  # greedy successes before and after an actor that select it; 0 for the last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
+    demonstration_fraction: Fraction = 0.0  # of each batch from the demonstration_episodes (RLPD: 0.5); 0 for no mixing
+    dropout: Fraction = 0.0  # dropout probability of the critics, after which their layers are normalized (DroQ: 0.01)
+
+    def __post_init__(self) -> None:
+        if self.demonstration_fraction and not self.demonstration_episodes:
+            raise InputError("demonstration_fraction needs demonstrations: give --set demonstration_episodes=... too")
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Td3Config(OffPolicyConfig):
+    """Settings of twin delayed DDPG (TD3), by the names of Stable-Baselines3 where it has them."""
+
+    algorithm: str = "td3"
+    exploration_noise: Fraction = 0.1  # standard deviation of the noise of an exploring action
+    policy_delay: Positive = 2  # critic updates per actor update
+    target_policy_noise: Fraction = 0.2  # standard deviation of the noise of target actions
+    target_noise_clip: Fraction = 0.5  # largest noise of target actions
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CrossQConfig(OffPolicyConfig):
+    """Settings of CrossQ, which has no target critics (`tau` has no effect)."""
+
+    algorithm: str = "crossq"
+    policy_delay: Positive = 3  # critic updates per actor update
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class OnPolicyConfig(LearnerConfig):
+    """Settings of an on-policy learner, by the names of Stable-Baselines3 where it has them."""
+
+    algorithm: str = "ppo"
+    learning_rate: Rate = 3e-4
+    gamma: Factor = 0.995  # discount factor per `gamma_per`
+    gamma_per: Literal["control_step", "action"] = "control_step"
+    gae_lambda: Factor = 0.95  # weight of longer advantage estimates
+    n_steps: Annotated[Positive, Field(ge=2, le=10**6)] = 256  # transitions between two trainings
+    batch_size: BatchSize = 64  # transitions
+    net_arch: NetArch = (64, 64)  # units of the hidden layers
+
+    def __post_init__(self) -> None:
+        if self.demonstration_episodes:
+            raise InputError(f"{self.algorithm} learns from its own actions: leave demonstration_episodes out")
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PpoConfig(OnPolicyConfig):
+    """Settings of proximal policy optimization (PPO)."""
+
+    n_epochs: Positive = 10  # passes through the transitions of a training
+    clip_range: Factor = 0.2  # largest change of an action's probability
+    ent_coef: Fraction = 0.0  # weight of the entropy
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class TrpoConfig(OnPolicyConfig):
+    """Settings of trust region policy optimization (TRPO)."""
+
+    algorithm: str = "trpo"
+    target_kl: Rate = 0.01  # largest Kullback-Leibler divergence of a training
 
 
 register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
 register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
+for _name, _module, _class, _config in (
+    ("td3", "sb3_algorithms", "Td3Learner", Td3Config),
+    ("crossq", "sb3_algorithms", "CrossQLearner", CrossQConfig),
+    ("ppo", "on_policy", "PpoLearner", PpoConfig),
+    ("trpo", "on_policy", "TrpoLearner", TrpoConfig),
+):
+    register_learner(_name, DeferredLearner(f"guiderail.tools.learning.{_module}", _class, _config))
 
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
@@ -135,7 +202,7 @@ PRESETS = {
 }
 
 
-def action_gamma(config: OffPolicyConfig, action_repeat: int) -> float:
+def action_gamma(config: OffPolicyConfig | OnPolicyConfig, action_repeat: int) -> float:
     """Return the discount factor of an action that lasts `action_repeat` control steps."""
     return config.gamma**action_repeat if config.gamma_per == "control_step" else config.gamma
 

@@ -10,8 +10,7 @@ which the setting `training_step` switches off.
 import copy
 import inspect
 import json
-import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -19,6 +18,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from sb3_contrib import TQC
+from sb3_contrib.common.torch_layers import BatchRenorm
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
@@ -34,6 +34,8 @@ from guiderail.tools.learning.checkpoint import CheckpointSelection
 from guiderail.tools.learning.config import OffPolicyConfig, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error
+from guiderail.tools.learning.replay import DemonstrationReplayBuffer
+from guiderail.tools.learning.sb3_state import module_arrays, random_state, restore_modules, restore_random
 
 IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22×28×3
 
@@ -66,6 +68,27 @@ class NormalizedReLU(torch.nn.Module):
         return torch.relu(torch.nn.functional.layer_norm(features, features.shape[-1:]))
 
 
+class DroppedNormalizedReLU(NormalizedReLU):
+    """Dropout, followed by layer normalization and a rectifier (DroQ; Hiraoka et al., 2022)."""
+
+    def __init__(self, probability: float):
+        """Construct the module, which drops features with a probability while it is trained."""
+        super().__init__()
+        self.dropout = torch.nn.Dropout(probability)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """Map features (…, units) to the same shape."""
+        return super().forward(self.dropout(features))
+
+
+def _add_dropout(critic: Any, probability: float) -> None:
+    """Replace the activations of the critics by ones with dropout."""
+    for network in critic.q_networks:
+        for index, layer in enumerate(network):
+            if not isinstance(layer, torch.nn.Linear):
+                network[index] = DroppedNormalizedReLU(probability)
+
+
 def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     """Return the policy of a Stable-Baselines3 actor: linear layers with rectifiers between them, and a final tanh.
 
@@ -75,26 +98,53 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
         InputError: If the actor has other layers.
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
-    linear, between = layers[::2], layers[1::2]
-    activations = {"relu" if isinstance(layer, torch.nn.ReLU) else getattr(layer, "kind", None) for layer in between}
-    if not all(isinstance(layer, torch.nn.Linear) for layer in linear) or len(activations) != 1 or None in activations:
+    pool = getattr(actor.features_extractor, "pool", 1)
+    return export_layers(layers, actor.action_space, {"pool": pool, "squash": "tanh", **description})
+
+
+def export_layers(layers: Sequence[torch.nn.Module], space: Any, description: Mapping[str, Any]) -> Policy:
+    """Return the policy of a network's layers; one that normalizes by running statistics joins the next linear layer.
+
+    Args:
+        layers: Linear layers with one kind of activation between them.
+        space: Action space.
+        description: Entries of the policy's description.
+
+    Raises:
+        InputError: If there are other layers.
+    """
+    linear: list[tuple[torch.Tensor, torch.Tensor]] = []
+    activations: list[str | None] = []
+    scale, shift = torch.ones(1), torch.zeros(1)
+    for layer in layers:
+        if isinstance(layer, torch.nn.Linear):
+            linear.append((layer.weight * scale, layer.bias + layer.weight @ shift.expand(layer.in_features)))
+            scale, shift = torch.ones(1), torch.zeros(1)
+        elif isinstance(layer, BatchRenorm):
+            renorm: Any = layer  # its buffers have no type
+            scale = renorm.scale / (renorm.ra_var + renorm.eps).sqrt()
+            shift = renorm.bias - renorm.ra_mean * scale
+        else:
+            activations.append(_ACTIVATIONS.get(type(layer), getattr(layer, "kind", None)))
+    if len(activations) + 1 != len(linear) or len({*activations}) != 1 or None in activations:
         raise InputError(
             f"an actor of {', '.join(type(layer).__name__ for layer in layers)} can't be exported: use linear layers "
             "with one kind of rectifier between them"
         )
-    space = actor.action_space
     return Policy(
-        [(m.weight.detach().numpy().copy(), m.bias.detach().numpy().copy()) for m in linear],
+        [(weight.detach().numpy().copy(), bias.detach().numpy().copy()) for weight, bias in linear],
         {
             "format": FORMAT,
-            "pool": getattr(actor.features_extractor, "pool", 1),
+            "pool": 1,
             "action_low": space.low.tolist(),
             "action_high": space.high.tolist(),
-            "activation": activations.pop(),
-            "squash": "tanh",
+            "activation": activations[0],
             **description,
         },
     )
+
+
+_ACTIVATIONS = {torch.nn.ReLU: "relu", torch.nn.Tanh: "tanh"}
 
 
 class OffPolicyLearner(Learner):
@@ -146,12 +196,14 @@ class OffPolicyLearner(Learner):
             "policy_kwargs": networks,
             "seed": seed,
             "device": "cpu",
+            **self.algorithm_arguments(config),
         }
-        is_fast = config.training_step == "fast" and self.fast_algorithm is not None
+        is_fast = config.training_step == "fast" and self.fast_algorithm is not None and not config.dropout
         algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
         accepted = inspect.signature(algorithm).parameters  # not every algorithm has an entropy coefficient
         self.model = algorithm("MlpPolicy", env, **{k: v for k, v in arguments.items() if k in accepted})
-        self.model.replay_buffer = NStepReplayBuffer(
+        buffer = DemonstrationReplayBuffer if config.demonstration_fraction else NStepReplayBuffer
+        self.model.replay_buffer = buffer(
             self._copies * self.model.buffer_size,
             self.model.observation_space,
             self.model.action_space,
@@ -160,6 +212,11 @@ class OffPolicyLearner(Learner):
             n_steps=config.n_steps,
             gamma=self.model.gamma,
         )
+        if config.demonstration_fraction:
+            self.model.replay_buffer.fraction = config.demonstration_fraction
+        if config.dropout:
+            _add_dropout(self.model.critic, config.dropout)
+        self.model.policy.set_training_mode(False)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.random = np.random.default_rng(seed)
         self.averaged = copy.deepcopy(self.model.actor) if config.actor_ema else None
@@ -171,6 +228,10 @@ class OffPolicyLearner(Learner):
         self._constant_action: np.ndarray | None = None  # the action of a constant episode
         self._extended_action: np.ndarray | None = None
         self._extended_steps = 0  # actions for which the extended action still lasts
+
+    def algorithm_arguments(self, config: Any) -> dict[str, Any]:
+        """Return further arguments of the algorithm, from settings that a subclass adds to its `Config`."""
+        return {}
 
     def is_learning(self) -> bool:
         """Return True once there are enough transitions to learn from; until then actions are uniformly random."""
@@ -281,6 +342,8 @@ class OffPolicyLearner(Learner):
             infos * self._copies,
         )
         self.transitions += 1
+        if self.config.demonstration_fraction and self.episodes <= self.config.demonstration_episodes:
+            self.model.replay_buffer.num_demonstrated = self.model.replay_buffer.size()
 
     def learn(self) -> None:
         """Train if it is due: every `train_freq` transitions of the run, independent of the episodes' lengths."""
@@ -288,6 +351,7 @@ class OffPolicyLearner(Learner):
             return
         self.model.records_metrics = self.records_metrics
         self.model.train(self.config.gradient_steps, self.config.batch_size)
+        self.model.policy.set_training_mode(False)  # acting needs no dropout and no statistics of a batch
         if self.has_diverged():
             raise divergence_error()
         if self.averaged is not None:
@@ -295,6 +359,8 @@ class OffPolicyLearner(Learner):
             with torch.no_grad():
                 for mean, value in zip(self.averaged.parameters(), self.model.actor.parameters(), strict=True):
                     mean.lerp_(value, weight)
+                for mean, value in zip(self.averaged.buffers(), self.model.actor.buffers(), strict=True):
+                    mean.copy_(value)
 
     def metrics(self) -> Mapping[str, float]:
         """Return what the last training recorded in Stable-Baselines3's logger, such as `train/critic_loss`."""
@@ -334,12 +400,7 @@ class OffPolicyLearner(Learner):
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
-        arrays: dict[str, np.ndarray] = {}
-        for name, module in self._modules().items():
-            arrays |= {f"{name}/{key}": value.numpy() for key, value in module.state_dict().items()}
-        for name, optimizer in self._optimizers().items():
-            for index, moments in optimizer.state_dict()["state"].items():
-                arrays |= {f"optimizer/{name}/{index}/{key}": value.numpy() for key, value in moments.items()}
+        arrays = module_arrays(self._modules(), self._optimizers())
         if self._log_ent_coef() is not None:
             arrays["log_ent_coef"] = self._log_ent_coef().detach().numpy()
         selection: dict[str, Any] = {}
@@ -348,32 +409,21 @@ class OffPolicyLearner(Learner):
             arrays |= {f"selection/{key}": value.numpy() for key, value in actors.items()}
         buffer = self.model.replay_buffer
         arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in _BUFFER_ARRAYS}
-        kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
-        arrays |= {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
-        return arrays, {
+        generators, states = random_state()
+        return arrays | generators, states | {
             "transitions": self.transitions,
             "episodes": self.episodes,
             "greedy_successes": self._greedy_successes,
             "selection": selection,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
-            "numpy": [kind, *rest],
-            "python": random.getstate(),
             "exploration": self.random.bit_generator.state,
-        }
+        } | ({"demonstrated": buffer.num_demonstrated} if self.config.demonstration_fraction else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Set the state to what `state` returned; raise KeyError, ValueError or RuntimeError if it does not fit."""
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
-        for name, module in self._modules().items():
-            module.load_state_dict({k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(name + "/")})
-        for name, optimizer in self._optimizers().items():
-            moments: dict[int, dict[str, torch.Tensor]] = {}
-            for key, value in tensors.items():
-                if key.startswith(f"optimizer/{name}/"):
-                    _, _, index, moment = key.split("/")
-                    moments.setdefault(int(index), {})[moment] = value
-            optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+        restore_modules(tensors, self._modules(), self._optimizers())
         if self._log_ent_coef() is not None:
             with torch.no_grad():
                 self._log_ent_coef().copy_(tensors["log_ent_coef"])
@@ -382,16 +432,14 @@ class OffPolicyLearner(Learner):
             stored = getattr(buffer, key)
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
+        if self.config.demonstration_fraction:
+            buffer.num_demonstrated = values["demonstrated"]
         self.transitions, self.model._n_updates = values["transitions"], values["updates"]
         self.episodes, self._greedy_successes = values["episodes"], values["greedy_successes"]
         if self.selection is not None:
             actors = {key.removeprefix("selection/"): v for key, v in tensors.items() if key.startswith("selection/")}
             self.selection.restore(actors, values["selection"])
-        torch.set_rng_state(tensors["random/torch"])
-        kind, *rest = values["numpy"]
-        np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002
-        version, state, gauss = values["python"]
-        random.setstate((version, tuple(state), gauss))
+        restore_random(arrays, values)
         self.random.bit_generator.state = values["exploration"]
         self._check_restored(arrays, values)
 

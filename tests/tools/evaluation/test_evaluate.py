@@ -166,7 +166,7 @@ def won(*successes):
 
 
 def test_comparison_is_an_exact_paired_test_against_each_baseline():
-    """Of 10 discordant episodes the policy wins 9: p = (1 + 10) / 2**10."""
+    """The policy wins 9 of 10 discordant episodes: p = (1 + 10) / 2**10."""
     policy, weak, other = won(*[1] * 9, 0, 1), won(*[0] * 9, 1, 1), won(*[0] * 11)
     comparison = compare({"policy": policy, "weak": weak, "other": other})
     assert comparison.baseline == "weak"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3 import TD3
+from stable_baselines3 import DDPG
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
@@ -300,17 +300,17 @@ def test_config_refuses_invalid_numbers_of_episodes(settings):
 
 
 def test_another_algorithm_is_one_class(monkeypatch):
-    """TD3 is deterministic and has no entropy coefficient, unlike SAC and TQC."""
+    """DDPG is deterministic and has no entropy coefficient, unlike SAC and TQC."""
     monkeypatch.setattr(LEARNERS, "_entries", dict(LEARNERS._entries))
 
-    @register_learner("td3")
-    class Td3Learner(OffPolicyLearner):
-        algorithm = TD3
+    @register_learner("ddpg")
+    class DdpgLearner(OffPolicyLearner):
+        algorithm = DDPG
 
         def explore(self, observation):
             return np.clip(super().explore(observation) + 0.1 * self.random.standard_normal(2), -1, 1)
 
-    learner = make(resolve_preset("tqc_contact", "td3", SETTINGS))
+    learner = make(resolve_preset("tqc_contact", "ddpg", SETTINGS))
     learn_from_random_transitions(learner, 24)
     arrays, values = learner.state()
     again = make(learner.config, seed=9)

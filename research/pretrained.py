@@ -1,0 +1,70 @@
+"""Train and evaluate the policies that come with the package: `make pretrained`, an hour or two on two cores.
+
+    python -m research.pretrained [NAME...] [--out runs/pretrained]
+
+Each policy is learned on the arm at `difficulty="hard"` and evaluated on 100 held-out episodes with all baseline
+policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An interrupted
+training is resumed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import guiderail
+from guiderail.tools.cli.output import to_json
+from guiderail.tools.pretrained import PRETRAINED_FOLDER
+
+ARM = {"station": "arm", "difficulty": "hard"}
+POLICIES: dict[str, dict[str, Any]] = {
+    "connector": {"task": "BncConnector", "guidance": "kgrl", "episodes": 60},
+    "clamp": {"task": "GridClamp", "guidance": "sct", "episodes": 60},
+    "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100},
+}
+"""Arguments of `guiderail.train` by the name of the policy."""
+FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
+MAX_SIZE = 200_000  # of the files of one policy [bytes]
+EPISODES = 100  # held-out episodes
+
+
+def make(name: str, out: Path) -> guiderail.Evaluation:
+    """Train and evaluate a policy, and write its files into the package.
+
+    Args:
+        name: Key of `POLICIES`.
+        out: Folder of the runs.
+    """
+    folder = out / name
+    arguments = {**ARM, **POLICIES[name]}
+    if folder.exists():
+        run = guiderail.train(arguments["task"], out=folder, resume=True)
+    else:
+        run = guiderail.train(arguments.pop("task"), out=folder, **arguments)
+    evaluation = guiderail.evaluate(run.path, episodes=EPISODES)
+    text = json.dumps(json.loads(to_json({"sentence": evaluation.sentence, **evaluation})), indent=1)
+    (folder / "evaluation.json").write_text(text + "\n", encoding="utf-8")
+    size = sum((folder / file).stat().st_size for file in FILES)
+    if size > MAX_SIZE:
+        raise SystemExit(f"{name} has {size} bytes, more than {MAX_SIZE}")
+    (PRETRAINED_FOLDER / name).mkdir(exist_ok=True)
+    for file in FILES:
+        shutil.copyfile(folder / file, PRETRAINED_FOLDER / name / file)
+    return evaluation
+
+
+def main() -> None:
+    """Make the policies that are named on the command line; all of them by default."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", choices=[*POLICIES, []], help="Policies; all by default.")
+    parser.add_argument("--out", type=Path, default=Path("runs/pretrained"), help="Folder of the runs.")
+    given = parser.parse_args()
+    for name in given.names or POLICIES:
+        print(f"{name}: {make(name, given.out).sentence}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,214 @@
+"""Policies of other origin: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
+
+import math
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from onnx_file import linear_policy
+from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.evaluate import evaluate
+from guiderail.tools.evaluation.policies import (
+    PredictPolicy,
+    as_policy,
+    check_compatible,
+    is_policy_file,
+    load_policy,
+)
+from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.pretrained import find_run
+
+OBSERVATION = np.array([0.1, -0.2, 0.3], np.float32)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_environment("Bead", {})
+
+
+@pytest.mark.parametrize("kind", [SAC, TD3, DDPG, PPO, A2C, TQC, TRPO, CrossQ])
+def test_zip_of_stable_baselines3_acts_as_the_model(kind, env, tmp_path):
+    networks = {"net_arch": [8]}
+    model = kind("MlpPolicy", env, policy_kwargs=networks, seed=1, device="cpu")
+    model.save(tmp_path / "model")
+    act = check_compatible(load_policy(tmp_path / "model.zip", allow_code=True), env)
+    np.testing.assert_array_equal(act(OBSERVATION), model.predict(OBSERVATION, deterministic=True)[0])
+
+
+def test_zip_is_read_only_if_code_is_allowed(env, tmp_path, monkeypatch):
+    SAC("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "model")
+    monkeypatch.setattr(SAC, "load", lambda *_, **options: pytest.fail("the pickle is read"))
+    with pytest.raises(InputError, match=r"model.zip is a pickle, .* give --allow-code if you trust its origin"):
+        load_policy(tmp_path / "model.zip")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("none.zip", "there is no file"), ("text.zip", "no model of Stable-B"), ("text.pt", "is no TorchScript file"),
+     ("text.onnx", "is no ONNX file")],
+)  # fmt: skip
+def test_damaged_files_are_refused(name, message, tmp_path):
+    (tmp_path / f"text{Path(name).suffix}").write_text("text")
+    with pytest.raises(InputError, match=message):
+        load_policy(tmp_path / name, allow_code=True)
+
+
+class Script(torch.nn.Module):
+    """Double the first two numbers."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return 2 * observation[:, :2]
+
+
+def test_torchscript_acts_if_code_is_allowed(env, tmp_path):
+    file = tmp_path / "policy.pt"
+    torch.jit.trace(Script(), torch.zeros(1, 3)).save(file)
+    with pytest.raises(InputError, match="is a program: give --allow-code"):
+        load_policy(file)
+    act = load_policy(file, allow_code=True)
+    np.testing.assert_allclose(check_compatible(act, env)(OBSERVATION), [0.2, -0.4])
+
+
+@pytest.mark.parametrize("batch", [1, "batch", None])
+def test_onnx_acts_as_its_network(batch, env, tmp_path):
+    weight, bias = np.array([[1.0, 2.0], [0.0, 1.0], [-1.0, 0.5]], np.float32), np.array([0.1, -0.1], np.float32)
+    file = tmp_path / "policy.onnx"
+    file.write_bytes(linear_policy(weight, bias, batch))
+    act = check_compatible(load_policy(file), env)
+    np.testing.assert_allclose(act(OBSERVATION), np.tanh(OBSERVATION @ weight + bias), rtol=1e-6)
+    one, two = (evaluate(file, "Bead", 3, baselines=(), processes=processes) for processes in (1, 2))
+    assert one == two
+
+
+def test_function_of_a_file_is_a_policy(env, tmp_path):
+    file = tmp_path / "own_policies.py"
+    file.write_text(
+        "import numpy as np\n"
+        "def act(observation):\n    return -observation[:2]\n"
+        "class Model:\n    def predict(self, observation):\n        return np.full(2, 0.5)\n"
+        "number = 3\n"
+    )
+    np.testing.assert_array_equal(load_policy(f"{file}:act")(OBSERVATION), -OBSERVATION[:2])
+    np.testing.assert_array_equal(load_policy(f"{file}:Model")(OBSERVATION), [0.5, 0.5])
+    for name, message in (("acts", "has no 'acts': did you mean act"), ("number", "3 is no policy")):
+        with pytest.raises(InputError, match=message):
+            load_policy(f"{file}:{name}")
+    with pytest.raises(InputError, match="no module, file"):
+        load_policy("no_such_module:act")
+    assert evaluate(f"{file}:act", "Bead", 2, baselines=())["episodes"] == 2
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [("model.zip", True), ("lab.policies:act", True), ("runs/a.py:act", True), ("runs/connector", False),
+     ("scripted", False), ("pretrained:connector", False), ("lab/Peg", False)],
+)  # fmt: skip
+def test_is_policy_file_tells_files_from_names(source, expected):
+    assert is_policy_file(source) is expected
+
+
+class Counter:
+    """Return the number of actions in the episode, as a recurrent policy would."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert deterministic
+        count = 0 if episode_start[0] else state + 1
+        return np.full(2, count / 100), count
+
+
+def test_state_of_a_recurrent_policy_is_reset_with_the_episode(env):
+    act = as_policy(Counter())
+    seen = []
+    for _ in range(2):
+        steps = rollout(env, act, seed=0)["steps"]
+        seen.append((steps, act._state))
+    assert seen[0] == seen[1]
+    assert seen[0][1] == math.ceil(seen[0][0] / env.unwrapped.action_repeat) - 1
+
+
+def test_recurrent_model_of_sb3_contrib_is_a_policy(env, tmp_path):
+    networks = {"net_arch": [4], "lstm_hidden_size": 4}
+    RecurrentPPO("MlpLstmPolicy", env, policy_kwargs=networks, seed=0, device="cpu").save(tmp_path / "recurrent")
+    act = load_policy(tmp_path / "recurrent.zip", allow_code=True)
+    first = act(OBSERVATION)
+    assert not np.array_equal(act(OBSERVATION), first)  # its state has changed
+    act.on_episode_start()
+    np.testing.assert_array_equal(act(OBSERVATION), first)
+
+
+def test_python_model_is_evaluated_in_a_task(env):
+    model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, seed=0, device="cpu")
+    as_model = evaluate(model, "Bead", 2, baselines=())
+    as_function = evaluate(
+        lambda observation: model.predict(observation, deterministic=True)[0], "Bead", 2, baselines=()
+    )
+    assert as_model["mean_return"] == as_function["mean_return"]
+    with pytest.raises(InputError, match="is no policy: give the folder of a run"):
+        evaluate(3, "Bead", 2)
+    with pytest.raises(InputError, match=r"acts in a task: name it \(--task\)"):
+        evaluate(model)
+
+
+def test_spaces_that_differ_are_named_with_options_that_fit():
+    """The hard connector observes the center of pressure."""
+    policy = SAC("MlpPolicy", make_environment("BncConnector", {"observation": "center_of_pressure"}), device="cpu")
+    env = make_environment("BncConnector", {})
+    with pytest.raises(InputError) as error:
+        check_compatible(PredictPolicy(policy), env)
+    (sees,), (has,) = policy.observation_space.shape, env.observation_space.shape
+    assert f"takes observations ({sees},) and returns actions (2,)" in str(error.value)
+    assert f"this environment has observations ({has},) and actions (2,)" in str(error.value)
+    assert "it fits with --env difficulty=hard or --env observation=center_of_pressure" in str(error.value)
+
+
+class Pointer(gymnasium.Env):
+    """Environment of another origin: the action moves a point to the origin."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        assert not options
+        self.point, self.left = self.np_random.uniform(-1, 1, 2), 10
+        return self.point.astype(np.float32), {}
+
+    def step(self, action):
+        self.point, self.left = self.point + 0.3 * np.clip(action, -1, 1), self.left - 1
+        distance = float(np.linalg.norm(self.point))
+        info = {"success": distance < 0.1, "constraint_violation": distance - 3.0}
+        return self.point.astype(np.float32), -distance, distance < 0.1, not self.left, info
+
+
+def test_environment_of_another_origin_is_evaluated():
+    result = evaluate(lambda point: -3.0 * point, Pointer(), 6, processes=2)
+    assert result["success_rate"] == 1.0
+    assert result["baselines"] == ["zero", "uniform_random", "constant"]
+    assert -3.0 < result["max_commanded_violation"] < 0.0
+    assert result["peak_force"] is None
+    assert result["p"] < 0.05
+    assert "better than the best baseline" in result.sentence
+    assert result == evaluate(lambda point: -3.0 * point, Pointer(), 6, processes=1)
+    assert evaluate("constant", Pointer(), 2, baselines=["zero"])["baselines"] == ["zero"]
+    with pytest.raises(InputError, match="no baseline policy 'scripted'"):
+        evaluate("zero", Pointer(), 2, baselines=["scripted"])
+    with pytest.raises(InputError, match="has its options"):
+        evaluate("zero", Pointer(), 2, environment={"station": "arm"})
+
+
+def test_pretrained_name_that_does_not_exist_is_refused():
+    with pytest.raises(InputError, match="there is no pretrained policy 'toaster'"):
+        find_run("pretrained:toaster")
+
+
+def test_policy_folder_is_loaded_without_code(tmp_path):
+    description = {"observation_shape": [3], "action_low": [-1, -1], "action_high": [1, 1]}
+    Policy([(np.zeros((2, 3), np.float32), np.zeros(2, np.float32))], description).save(tmp_path)
+    np.testing.assert_array_equal(load_policy(tmp_path)(OBSERVATION), [0, 0])

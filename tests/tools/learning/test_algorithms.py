@@ -1,0 +1,182 @@
+"""Learners of further algorithms of Stable-Baselines3, demonstrations in every batch, and dropout."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.config import config_values, make_config, resolve_preset
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.off_policy import DroppedNormalizedReLU
+
+OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
+ON_POLICY = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}
+SETTINGS = {"td3": OFF_POLICY, "crossq": OFF_POLICY, "ppo": ON_POLICY, "trpo": ON_POLICY}
+ALGORITHMS = list(SETTINGS)
+OBSERVATION = np.array([0.3, -0.2, 0.9], np.float32)
+
+
+class SpacesOnlyEnv(gymnasium.Env):
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Box(-1, 1, (2,))
+
+
+def make(config, seed=0):
+    return LEARNERS.get(config.algorithm)(config, SpacesOnlyEnv(), action_repeat=1, seed=seed, max_transitions=80)
+
+
+def learn(learner, episodes, rng, length=7):
+    """Learn from random episodes; the learner's actions are returned."""
+    actions = []
+    for _ in range(episodes):
+        learner.on_episode_start()
+        seen = rng.uniform(-1, 1, 3).astype(np.float32)
+        for step in range(length):
+            action = learner.act(seen)
+            following, is_last = rng.uniform(-1, 1, 3).astype(np.float32), step == length - 1
+            learner.on_step(Transition(seen, action, float(rng.normal()), following, False, is_last, {}))
+            actions.append(action)
+            seen = following
+        learner.on_episode_end({"success": 0})
+    return np.array(actions)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
+    config = resolve_preset(None, algorithm, SETTINGS[algorithm])
+    learner = make(config)
+    before = learner.policy({"observation_shape": [3]})(OBSERVATION)
+    rng = np.random.default_rng(0)
+    learn(learner, 4, rng)
+    assert not np.array_equal(learner.policy({"observation_shape": [3]})(OBSERVATION), before)
+    arrays, values = learner.state()
+    arrays = {key: value.copy() for key, value in arrays.items()}
+    expected = learn(learner, 3, np.random.default_rng(1))
+    again = make(config, seed=9)
+    again.restore(arrays, values)
+    np.testing.assert_array_equal(learn(again, 3, np.random.default_rng(1)), expected)
+    policies = [one.policy({"observation_shape": [3]}) for one in (learner, again)]
+    np.testing.assert_array_equal(*[policy(OBSERVATION) for policy in policies])
+    assert not learner.has_diverged()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_exported_policy_acts_as_the_model(algorithm):
+    """CrossQ's normalization by running statistics is part of the exported layers."""
+    config = resolve_preset(None, algorithm, SETTINGS[algorithm])
+    learner = make(replace(config, actor_ema=0.0) if hasattr(config, "actor_ema") else config)
+    learn(learner, 5, np.random.default_rng(0))
+    expected = learner.model.predict(OBSERVATION, deterministic=True)[0]
+    np.testing.assert_allclose(learner.policy({"observation_shape": [3]})(OBSERVATION), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "crossq"])
+def test_algorithms_have_settings_of_their_own(algorithm):
+    learner = make(resolve_preset(None, algorithm, {**SETTINGS[algorithm], "policy_delay": 7}))
+    assert learner.model.policy_delay == 7
+    with pytest.raises(InputError, match="no setting 'policy_delay'"):
+        resolve_preset(None, "sac", {"policy_delay": 7})
+
+
+def test_td3_explores_with_noise_of_the_given_size():
+    for noise in (0.0, 0.5):
+        learner = make(resolve_preset(None, "td3", {**SETTINGS["td3"], "exploration_noise": noise}))
+        actions = np.array([learner.explore(OBSERVATION) for _ in range(300)])
+        np.testing.assert_allclose(actions.std(axis=0), noise, atol=0.06)
+        assert np.abs(actions).max() <= 1.0
+
+
+def test_on_policy_settings_reach_the_algorithm():
+    ppo = make(make_config("ppo", {"n_epochs": 3, "clip_range": 0.1, "n_steps": 32, "gae_lambda": 0.8}))
+    assert (ppo.model.n_epochs, ppo.model.clip_range(1.0), ppo.model.gae_lambda) == (3, 0.1, 0.8)
+    assert make(make_config("trpo", {"target_kl": 0.02})).model.target_kl == 0.02
+    with pytest.raises(InputError, match="ppo learns from its own actions: leave demonstration_episodes out"):
+        make_config("ppo", {"demonstration_episodes": 3})
+    with pytest.raises(InputError, match="preset tqc_fast has settings that ppo does not have"):
+        resolve_preset("tqc_fast", "ppo")
+
+
+def test_on_policy_learner_bootstraps_a_time_limit():
+    """By hand: with γ = 1 and λ = 1, the return of a truncated step is its reward plus the next state's value."""
+    learner = make(make_config("ppo", {"n_steps": 8, "gamma": 1.0, "gae_lambda": 1.0, "net_arch": "4"}))
+    following = np.full(3, 0.5, np.float32)
+    value = float(learner._value(following))
+    for truncated, terminated, expected in ((True, False, 2.0 + value), (False, True, 2.0)):
+        learner.on_episode_start()
+        action = learner.act(OBSERVATION)
+        learner.on_step(Transition(OBSERVATION, action, 2.0, following, terminated, truncated, {}))
+        buffer = learner.model.rollout_buffer
+        assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
+
+
+def test_on_policy_learner_leaves_a_failed_simulation_out():
+    learner = make(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
+    learner.on_episode_start()
+    failure = {"simulation_failure": "diverged"}
+    learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 0.0, OBSERVATION, False, True, failure))
+    assert learner.model.rollout_buffer.pos == 0
+
+
+def demonstrated(fraction, **more):
+    settings = {"net_arch": "4", "batch_size": 8, "learning_starts": 50, "demonstration_episodes": 2, **more}
+    return make(resolve_preset(None, "tqc", {**settings, "demonstration_fraction": fraction}))
+
+
+def fill(learner, episodes, length=5):
+    for episode in range(episodes):
+        learner.on_episode_start()
+        for _ in range(length):
+            learner.store(
+                Transition(np.full(3, episode, np.float32), np.zeros(2), episode, OBSERVATION, False, False, {})
+            )
+
+
+@pytest.mark.parametrize("fraction", [0.25, 0.5, 0.75])
+def test_every_batch_has_its_fraction_of_demonstrations(fraction):
+    learner = demonstrated(fraction)
+    fill(learner, 5)
+    assert learner.model.replay_buffer.num_demonstrated == 10
+    for part in learner.model.replay_buffer.sample(10 * 8).rewards.view(10, 8):  # as the fast step divides it
+        assert (part < 2).float().mean() == fraction
+    arrays, values = learner.state()
+    again = demonstrated(fraction)
+    again.restore(arrays, values)
+    assert again.model.replay_buffer.num_demonstrated == 10
+
+
+def test_demonstrations_are_not_overwritten():
+    learner = demonstrated(0.5, buffer_size=15)
+    fill(learner, 7)
+    rewards = learner.model.replay_buffer.rewards[:, 0]
+    np.testing.assert_array_equal(rewards[:10], [0.0] * 5 + [1.0] * 5)
+    np.testing.assert_array_equal(rewards[10:15], [6.0] * 5)
+
+
+def test_demonstration_fraction_needs_demonstrations():
+    with pytest.raises(InputError, match="needs demonstrations: give --set demonstration_episodes"):
+        resolve_preset(None, "tqc", {"demonstration_fraction": 0.5})
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
+def test_dropout_is_applied_to_the_critics_in_training_only(algorithm):
+    config = resolve_preset(None, algorithm, {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "dropout": 0.5})
+    learner = make(config)
+    learn(learner, 4, np.random.default_rng(0))
+    critic = learner.model.critic
+    assert any(isinstance(layer, DroppedNormalizedReLU) for layer in critic.q_networks[0])
+    batch = torch.zeros(1, 3), torch.zeros(1, 2)
+    first, second = (critic(*batch)[0].detach().numpy() for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    critic.set_training_mode(True)
+    assert not np.array_equal(critic(*batch)[0].detach().numpy(), critic(*batch)[0].detach().numpy())
+
+
+def test_configuration_of_a_run_holds_the_new_settings():
+    values = config_values(resolve_preset(None, "td3"))
+    assert values["exploration_noise"] == 0.1
+    assert make_config("td3", {k: v for k, v in values.items() if k != "algorithm"}) == resolve_preset(None, "td3")

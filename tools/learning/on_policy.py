@@ -1,0 +1,171 @@
+"""On-policy learners: PPO of Stable-Baselines3 and TRPO of sb3-contrib, trained by their own steps.
+
+They learn from the transitions since the last training only. A checkpoint holds those that wait for the next one.
+"""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from sb3_contrib import TRPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
+from torch.nn.utils import parameters_to_vector
+
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
+from guiderail.tools.learning.learner import Learner, divergence_error
+from guiderail.tools.learning.off_policy import export_layers
+from guiderail.tools.learning.sb3_state import module_arrays, random_state, restore_modules, restore_random
+
+_BUFFER_ARRAYS = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
+
+
+class OnPolicyLearner(Learner):
+    """Learner of an on-policy algorithm with the interface of Stable-Baselines3.
+
+    Attributes:
+        algorithm: Class of the algorithm; a subclass names it.
+        own_settings: Names of settings that the algorithm takes as arguments of the same name.
+        model: Instance of the algorithm.
+        transitions: Number of transitions so far.
+    """
+
+    Config = OnPolicyConfig
+    algorithm: ClassVar[type]
+    own_settings: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(
+        self,
+        config: OnPolicyConfig,
+        env: gymnasium.Env,
+        *,
+        action_repeat: int,
+        seed: int,
+        max_transitions: int,
+        symmetry: Symmetry | None = None,
+    ):
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used.
+
+        Raises:
+            InputError: If observations are images.
+        """
+        if len(env.observation_space.shape or ()) != 1:
+            raise InputError(f"{config.algorithm} takes no images: give another --observation, or the algorithm tqc")
+        self.config = config
+        algorithm: Any = self.algorithm
+        self.model = algorithm(
+            "MlpPolicy",
+            env,
+            learning_rate=config.learning_rate,
+            n_steps=config.n_steps,
+            batch_size=min(config.batch_size, config.n_steps),
+            gamma=action_gamma(config, action_repeat),
+            gae_lambda=config.gae_lambda,
+            policy_kwargs={"net_arch": list(config.net_arch)},
+            seed=seed,
+            device="cpu",
+            **{name: getattr(config, name) for name in self.own_settings},
+        )
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
+        self.model.policy.set_training_mode(False)
+        self.transitions = 0
+        self._is_start = True
+        self._sampled: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # action, value, log. probability
+
+    def on_episode_start(self) -> None:
+        """Start an episode, so that no advantage is estimated across its start."""
+        self._is_start = True
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return a sampled action, clipped to the action space."""
+        policy, space = self.model.policy, self.model.action_space
+        with torch.no_grad():
+            self._sampled = policy(policy.obs_to_tensor(observation)[0])
+        return np.clip(self._sampled[0][0].numpy(), space.low, space.high)
+
+    def on_step(self, transition: Transition) -> None:
+        """Store a transition and train if the buffer is full; one in which the simulation failed is left out."""
+        if "simulation_failure" in transition.info or self._sampled is None:
+            self._is_start = True
+            return
+        action, value, log_prob = self._sampled
+        reward = transition.reward
+        if transition.truncated and not transition.terminated:  # bootstrapped, as a time limit does not end the task
+            reward += self.model.gamma * float(self._value(transition.next_observation))
+        buffer = self.model.rollout_buffer
+        starts = np.array([self._is_start])
+        buffer.add(transition.observation[None], action.numpy(), np.array([reward]), starts, value, log_prob)
+        self._sampled, self._is_start = None, transition.is_last
+        self.transitions += 1
+        if buffer.full:
+            last_value = self._value(transition.next_observation)
+            buffer.compute_returns_and_advantage(last_value, np.array([transition.is_last]))
+            self.model.train()
+            self.model.policy.set_training_mode(False)
+            buffer.reset()
+            if self.has_diverged():
+                raise divergence_error()
+
+    def _value(self, observation: np.ndarray) -> torch.Tensor:
+        policy = self.model.policy
+        with torch.no_grad():
+            return policy.predict_values(policy.obs_to_tensor(observation)[0]).flatten()
+
+    def metrics(self) -> Mapping[str, float]:
+        """Return what the last training recorded in Stable-Baselines3's logger."""
+        recorded = dict(self.model.logger.name_to_value)
+        self.model.logger.dump()
+        return recorded
+
+    def policy(self, description: Mapping[str, Any]) -> Policy:
+        """Return the policy of the most probable actions; `description` holds further entries of its description."""
+        network = self.model.policy
+        layers = [*network.mlp_extractor.policy_net, network.action_net]
+        return export_layers(layers, network.action_space, {"squash": "clip", **description})
+
+    def has_diverged(self) -> bool:
+        """Return True if a parameter is NaN or infinite."""
+        return not bool(torch.isfinite(parameters_to_vector(self.model.policy.parameters())).all())
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
+        policy, buffer = self.model.policy, self.model.rollout_buffer
+        arrays = module_arrays({"policy": policy}, {"policy": policy.optimizer})
+        arrays |= {f"buffer/{name}": getattr(buffer, name)[: buffer.pos] for name in _BUFFER_ARRAYS if buffer.pos}
+        generators, states = random_state()
+        values = {"transitions": self.transitions, "updates": self.model._n_updates, "buffer": buffer.pos}
+        return arrays | generators, values | states
+
+    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Set the state to what `state` returned; raise KeyError, ValueError or RuntimeError if it does not fit."""
+        tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
+        policy, buffer = self.model.policy, self.model.rollout_buffer
+        restore_modules(tensors, {"policy": policy}, {"policy": policy.optimizer})
+        buffer.reset()
+        buffer.pos = values["buffer"]
+        for name in _BUFFER_ARRAYS if buffer.pos else ():
+            getattr(buffer, name)[: buffer.pos] = arrays[f"buffer/{name}"]
+        self.transitions, self.model._n_updates = values["transitions"], values["updates"]
+        restore_random(arrays, values)
+
+
+class PpoLearner(OnPolicyLearner):
+    """Learner of proximal policy optimization (PPO; Schulman et al., 2017)."""
+
+    Config = PpoConfig
+    algorithm = PPO
+    own_settings = ("n_epochs", "clip_range", "ent_coef")
+
+
+class TrpoLearner(OnPolicyLearner):
+    """Learner of trust region policy optimization (TRPO; Schulman et al., 2015)."""
+
+    Config = TrpoConfig
+    algorithm = TRPO
+    own_settings = ("target_kl",)
