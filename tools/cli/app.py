@@ -183,9 +183,9 @@ Baselines = Annotated[
     ),
 ]
 PolicyTask = Annotated[str | None, option("Task that a POLICY without a run acts in: {tasks}.", choices="tasks")]
-AllowCode = Annotated[
+TrustPolicy = Annotated[
     bool,
-    option("Read a policy's file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--allow-code"),
+    option("Read a policy's file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--trust-policy"),
 ]
 Processes = Annotated[
     int | None,

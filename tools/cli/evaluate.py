@@ -23,7 +23,7 @@ def evaluate(
     ] = False,
     seed: cli.Seed = 1_000_000,
     task: cli.PolicyTask = None,
-    allow_code: cli.AllowCode = False,
+    trust_policy: cli.TrustPolicy = False,
     processes: cli.Processes = None,
     policy: Annotated[
         str | None,
@@ -92,7 +92,7 @@ def evaluate(
         save=save,
         signal=signal,
         processes=processes,
-        allow_code=allow_code,
+        trust_policy=trust_policy,
     )
     result = dict(evaluation)
     for skipped in result.pop("skipped_baselines"):
@@ -155,7 +155,7 @@ def robustness(
     env: cli.Env = None,
     baselines: cli.Baselines = None,
     processes: cli.Processes = None,
-    allow_code: cli.AllowCode = False,
+    trust_policy: cli.TrustPolicy = False,
     imports: cli.TaskImports = None,
     out: Annotated[
         Path | None,
@@ -186,7 +186,7 @@ def robustness(
         out=out,
         say=print_message,
         processes=processes,
-        allow_code=allow_code,
+        trust_policy=trust_policy,
     )
     if as_json:
         typer.echo(to_json({"table": str(result["table"]), "picture": str(result["picture"]), "rows": result["rows"]}))

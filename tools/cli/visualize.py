@@ -25,7 +25,7 @@ def visualize(
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
     policy: cli.Baseline = "scripted",
     task: cli.PolicyTask = None,
-    allow_code: cli.AllowCode = False,
+    trust_policy: cli.TrustPolicy = False,
     episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
@@ -42,7 +42,7 @@ def visualize(
     from guiderail.tools.visualization.replay import default_page, write_page
 
     environment = cli.parse_environment(env, station=station)
-    episode = _episode(subject, policy, environment, seed, imports, task, allow_code)
+    episode = _episode(subject, policy, environment, seed, imports, task, trust_policy)
     if image is not None:
         check_picture(image)
     if video is not None:
@@ -67,7 +67,7 @@ def _episode(
     seed: int,
     imports: Sequence[str] | None,
     task: str | None,
-    allow_code: bool,
+    trust_policy: bool,
 ) -> Any:
     """Return the specification of an episode: of a run or another policy, or of a task with a baseline policy."""
     from guiderail.tools.visualization.episode_spec import EpisodeSpec
@@ -77,7 +77,7 @@ def _episode(
         name, task = policy, name
     elif task is not None:
         task = cli.find_task(task)[0]
-    return EpisodeSpec.of_policy(name, environment, seed, task=task, allow_code=allow_code)
+    return EpisodeSpec.of_policy(name, environment, seed, task=task, trust_policy=trust_policy)
 
 
 @cli.command("report studies --out report.html")

@@ -198,7 +198,7 @@ def evaluate(
     environment: Mapping[str, Any] | None = None,
     seed: int = HELD_OUT_SEED,
     processes: int | None = None,
-    allow_code: bool = False,
+    trust_policy: bool = False,
     resample_offsets: bool = False,
     save: Path | None = None,
     signal: str = "commanded",
@@ -222,7 +222,7 @@ def evaluate(
         seed: Seed of the first; episode i has seed + i.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it, see
             `evaluate_policies` for policies with a memory.
-        allow_code: Read a policy's file that can execute code: a zip of Stable-Baselines3 or TorchScript.
+        trust_policy: Read a policy's file that can execute code: a zip of Stable-Baselines3 or TorchScript.
         resample_offsets: Whether what is hidden and constant in a run is sampled again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved: "commanded", which a primitive should learn under impedance control because the
@@ -246,7 +246,7 @@ def evaluate(
     _check_saved(save, signal)
     check_seed(seed)
     check_processes(processes)
-    subject = find_subject(policy, env, environment or {}, allow_code=allow_code)
+    subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
     config, folder = subject.config, subject.folder
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
     if config is None:

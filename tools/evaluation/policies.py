@@ -25,8 +25,9 @@ from guiderail.models.common.extras import require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
-from guiderail.tools.environments import beyond_defaults, changed_environment, import_modules, make_environment
+from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
+from guiderail.tools.imports import import_modules
 from guiderail.tools.pretrained import PRETRAINED
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
@@ -151,14 +152,14 @@ def is_policy_file(source: str | Path) -> bool:
     return Path(source).suffix in ENDINGS or _function_of(str(source)) is not None
 
 
-def load_policy(source: str | Path, *, allow_code: bool = False) -> PolicyFn:
+def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     """Return the policy of a folder, a file or `module:function`.
 
     Args:
         source: Folder with `policy.safetensors`; .zip of Stable-Baselines3; .onnx; TorchScript (.pt, .ts,
             .torchscript); or `module:function`, where a module is a module's name or a file (.py), and a function any
             policy that `as_policy` takes, or a class of such policies.
-        allow_code: Read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
+        trust_policy: Read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
 
     Raises:
         InputError: If the file is missing, damaged or can execute code, or its package is not installed.
@@ -172,9 +173,9 @@ def load_policy(source: str | Path, *, allow_code: bool = False) -> PolicyFn:
         raise InputError(f"there is no file {path}: give the file of a policy")
     if path.suffix == ".onnx":
         return _load_onnx(path)
-    if not allow_code:
+    if not trust_policy:
         kind = "is a pickle, which can execute code when it is read" if path.suffix == ".zip" else "is a program"
-        raise InputError(f"{path} {kind}: give --allow-code if you trust its origin")
+        raise InputError(f"{path} {kind}: give --trust-policy if you trust its origin")
     return _load_sb3(path) if path.suffix == ".zip" else _load_torchscript(path)
 
 

@@ -266,7 +266,7 @@ def robustness(
     out: Path | None = None,
     say: Callable[[str], None] = lambda sentence: None,
     processes: int | None = None,
-    allow_code: bool = False,
+    trust_policy: bool = False,
 ) -> dict[str, Any]:
     """Evaluate policies along each axis, the rest of the environment being as in training.
 
@@ -287,7 +287,7 @@ def robustness(
             need it.
         say: Called with a sentence on what the runs differ in and on each point left out.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
-        allow_code: Read a policy's file that can execute code.
+        trust_policy: Read a policy's file that can execute code.
 
     Returns:
         `table` and `picture`, the files; `rows`, those of the table; `policies`, the names of the policies.
@@ -298,7 +298,7 @@ def robustness(
     if episodes < 1:
         raise InputError(f"robustness needs at least one episode at each point, not {episodes}")
     check_processes(processes)
-    subjects = [find_subject(policy, task, environment, allow_code=allow_code) for policy in policies]
+    subjects = [find_subject(policy, task, environment, trust_policy=trust_policy) for policy in policies]
     compared = _actors(subjects, dict(environment or {}), say)
     first, folder = compared[0], subjects[0].folder if subjects[0].is_stored else None
     if out is None and (len(policies) > 1 or folder is None):

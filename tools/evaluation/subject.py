@@ -51,7 +51,7 @@ class Subject:
 
 
 def find_subject(
-    policy: Any, env: Any, environment: Mapping[str, Any] | None = None, *, allow_code: bool = False
+    policy: Any, env: Any, environment: Mapping[str, Any] | None = None, *, trust_policy: bool = False
 ) -> Subject:
     """Return a policy that is evaluated or shown.
 
@@ -60,7 +60,7 @@ def find_subject(
             or the name of a baseline policy.
         env: Name of the task, or an environment, that a policy without a run acts in; None for a run.
         environment: Options of the task's environment that differ from the defaults; unused for a run.
-        allow_code: Read a policy's file that can execute code.
+        trust_policy: Read a policy's file that can execute code.
 
     Raises:
         InputError: If there is no such policy or task, or a policy without a run has no task.
@@ -84,7 +84,7 @@ def find_subject(
         return Subject("policy", config, partial(check_compatible, act), digest=unknown)
     source = find_run(policy)
     if is_policy_file(policy) or source.is_dir():
-        make_policy = partial(check_compatible, load_policy(source, allow_code=allow_code))
+        make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
         return Subject(source.name.replace(":", "."), config, make_policy, digest=_digest(source))
     return Subject(str(policy), config, make_baselines(config, {}, [str(policy)])[str(policy)])
 

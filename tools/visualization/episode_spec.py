@@ -48,7 +48,7 @@ class EpisodeSpec:
         seed: int = HELD_OUT_SEED,
         *,
         task: str | None = None,
-        allow_code: bool = False,
+        trust_policy: bool = False,
     ) -> EpisodeSpec:
         """Return an episode of a policy of any origin; one of a run acts deterministically.
 
@@ -57,12 +57,12 @@ class EpisodeSpec:
             environment: Options of the environment that differ from the run's, or from the task's defaults.
             seed: Seed of the episode.
             task: Task of a policy without a run.
-            allow_code: Read a policy's file that can execute code.
+            trust_policy: Read a policy's file that can execute code.
 
         Raises:
             InputError: If there is no such policy, or its actions mean something else with another guidance.
         """
-        subject = find_subject(policy, task, environment, allow_code=allow_code)
+        subject = find_subject(policy, task, environment, trust_policy=trust_policy)
         config, folder = subject.config, subject.folder
         assert config is not None
         changed = changed_environment(config.task, config.environment, environment or {})

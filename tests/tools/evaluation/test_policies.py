@@ -38,14 +38,14 @@ def test_zip_of_stable_baselines3_acts_as_the_model(kind, env, tmp_path):
     networks = {"net_arch": [8]}
     model = kind("MlpPolicy", env, policy_kwargs=networks, seed=1, device="cpu")
     model.save(tmp_path / "model")
-    act = check_compatible(load_policy(tmp_path / "model.zip", allow_code=True), env)
+    act = check_compatible(load_policy(tmp_path / "model.zip", trust_policy=True), env)
     np.testing.assert_array_equal(act(OBSERVATION), model.predict(OBSERVATION, deterministic=True)[0])
 
 
 def test_zip_is_read_only_if_code_is_allowed(env, tmp_path, monkeypatch):
     SAC("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "model")
     monkeypatch.setattr(SAC, "load", lambda *_, **options: pytest.fail("the pickle is read"))
-    with pytest.raises(InputError, match=r"model.zip is a pickle, .* give --allow-code if you trust its origin"):
+    with pytest.raises(InputError, match=r"model.zip is a pickle, .* give --trust-policy if you trust its origin"):
         load_policy(tmp_path / "model.zip")
 
 
@@ -57,7 +57,7 @@ def test_zip_is_read_only_if_code_is_allowed(env, tmp_path, monkeypatch):
 def test_damaged_files_are_refused(name, message, tmp_path):
     (tmp_path / f"text{Path(name).suffix}").write_text("text")
     with pytest.raises(InputError, match=message):
-        load_policy(tmp_path / name, allow_code=True)
+        load_policy(tmp_path / name, trust_policy=True)
 
 
 class Script(torch.nn.Module):
@@ -70,9 +70,9 @@ class Script(torch.nn.Module):
 def test_torchscript_acts_if_code_is_allowed(env, tmp_path):
     file = tmp_path / "policy.pt"
     torch.jit.trace(Script(), torch.zeros(1, 3)).save(file)
-    with pytest.raises(InputError, match="is a program: give --allow-code"):
+    with pytest.raises(InputError, match="is a program: give --trust-policy"):
         load_policy(file)
-    act = load_policy(file, allow_code=True)
+    act = load_policy(file, trust_policy=True)
     np.testing.assert_allclose(check_compatible(act, env)(OBSERVATION), [0.2, -0.4])
 
 
@@ -136,7 +136,7 @@ def test_state_of_a_recurrent_policy_is_reset_with_the_episode(env):
 def test_recurrent_model_of_sb3_contrib_is_a_policy(env, tmp_path):
     networks = {"net_arch": [4], "lstm_hidden_size": 4}
     RecurrentPPO("MlpLstmPolicy", env, policy_kwargs=networks, seed=0, device="cpu").save(tmp_path / "recurrent")
-    act = load_policy(tmp_path / "recurrent.zip", allow_code=True)
+    act = load_policy(tmp_path / "recurrent.zip", trust_policy=True)
     first = act(OBSERVATION)
     assert not np.array_equal(act(OBSERVATION), first)  # its state has changed
     act.on_episode_start()
