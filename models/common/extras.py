@@ -1,5 +1,7 @@
 """Optional dependencies: which extra of this package installs a module that is missing."""
 
+from importlib.util import find_spec
+
 from guiderail.models.common.errors import InputError
 
 EXTRAS = {
@@ -38,12 +40,15 @@ def explain_missing(error: ImportError) -> MissingExtraError | None:
 
 
 def require_extra(module: str) -> None:
-    """Import a module of an extra.
+    """Refuse to go on without a module of an extra; it is not imported, because importing takes time.
 
     Raises:
         MissingExtraError: If it is not installed.
     """
     try:
-        __import__(module)
-    except ModuleNotFoundError as error:
-        raise (explain_missing(error) or error) from error
+        is_installed = find_spec(module) is not None
+    except (ImportError, ValueError):
+        is_installed = False
+    if not is_installed:
+        error = ModuleNotFoundError(f"No module named {module!r}", name=module)
+        raise (explain_missing(error) or error)

@@ -40,7 +40,7 @@ def trained(bead_run):
         (["train", "Pooring", "--out", "new"], "did you mean Pouring?"),
         (["train", "Bead", "--out", "new", "--guidance", "magic"], "kmp or skgrl"),
         (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, safe_residual"),
-        (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "sac, tqc"),
+        (["train", "Bead", "--out", "new", "--algorithm", "dqn"], "sac, td3, tqc"),
         (["train", "Bead", "--out", "new", "--preset", "tqc_contct"], "did you mean tqc_contact?"),
         (["train", "Bead", "--out", "new", "--fixture-offset", "per_episode"], "no option 'fixture_offset'"),
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
