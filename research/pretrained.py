@@ -21,9 +21,9 @@ from guiderail.tools.pretrained import PRETRAINED_FOLDER
 
 ARM = {"station": "arm", "difficulty": "hard"}
 POLICIES: dict[str, dict[str, Any]] = {
-    "connector": {"task": "BncConnector", "guidance": "kgrl", "episodes": 60},
-    "clamp": {"task": "GridClamp", "guidance": "sct", "episodes": 60},
-    "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100},
+    "connector": {"task": "BncConnector", "guidance": "kgrl", "episodes": 60, **ARM},
+    "clamp": {"task": "GridClamp", "guidance": "sct", "episodes": 60, **ARM},
+    "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100, "difficulty": "hard"},
 }
 """Arguments of `guiderail.train` by the name of the policy."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
@@ -39,7 +39,7 @@ def make(name: str, out: Path) -> guiderail.Evaluation:
         out: Folder of the runs.
     """
     folder = out / name
-    arguments = {**ARM, **POLICIES[name]}
+    arguments = dict(POLICIES[name])
     if folder.exists():
         run = guiderail.train(arguments["task"], out=folder, resume=True)
     else:
