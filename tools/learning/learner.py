@@ -7,6 +7,7 @@ algorithm of Stable-Baselines3) that is registered by `register_learner` or by a
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
@@ -19,11 +20,12 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.extras import require_extra
 from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Callback
 
-LOG_FORMATS = ("tensorboard", "csv", "json", "log", "stdout")
+LOG_FORMATS = ("tensorboard", "wandb", "csv", "json", "log", "stdout")
 # Name in the log of each column of an episode's row that is logged.
 LOGGED_COLUMNS = {
     "return": "rollout/return",
@@ -194,6 +196,8 @@ def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
             raise InputError(f"there is no log format {brief(name)}: {did_you_mean(name, LOG_FORMATS)}")
     if "tensorboard" in names and find_spec("tensorboard") is None:
         raise InputError("the log format tensorboard needs TensorBoard: pip install 'guiderail[tensorboard]'")
+    if "wandb" in names:
+        require_extra("wandb")
     return names
 
 
@@ -219,7 +223,11 @@ class LearningLog:
             # A resumed run must not overwrite the files of its first part.
             suffix = f"-from-{row['episode']}" if row["episode"] else ""
             self._folder.mkdir(parents=True, exist_ok=True)
-            outputs = [make_output_format(name, str(self._folder), suffix) for name in self._formats]
+            folder = str(self._folder.resolve())
+            outputs = [
+                _make_wandb_output(folder) if name == "wandb" else make_output_format(name, folder, suffix)
+                for name in self._formats
+            ]
             self._logger = Logger(str(self._folder), outputs)
         for column, name in LOGGED_COLUMNS.items():
             if column in row:
@@ -232,3 +240,25 @@ class LearningLog:
         """Close the files."""
         if self._logger is not None:
             self._logger.close()
+
+
+def _make_wandb_output(folder: str) -> Any:
+    """Return an output format of Stable-Baselines3's logger that writes to Weights & Biases; a run resumes its own."""
+    import wandb
+    from stable_baselines3.common.logger import KVWriter
+
+    identifier = hashlib.blake2b(folder.encode(), digest_size=8).hexdigest()
+    run = wandb.init(project="guiderail", name=Path(folder).parent.name, id=identifier, dir=folder, resume="allow")
+
+    class WandbOutput(KVWriter):
+        """Output format that logs the values of an entry at its number of control steps."""
+
+        def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+            """Log the values."""
+            run.log(dict(key_values), step=step)  # the logger clears its own dictionary
+
+        def close(self) -> None:
+            """Finish the run."""
+            run.finish()
+
+    return WandbOutput()

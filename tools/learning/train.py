@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
+from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
@@ -85,6 +87,7 @@ def train(
     preset: str | None = None,
     settings: Mapping[str, Any] | None = None,
     log: str | Sequence[str] = (),
+    callbacks: Any = None,
     resume: bool = False,
     **options: Any,
 ) -> Run:
@@ -99,7 +102,10 @@ def train(
         algorithm: Registered name of the learner; None for the preset's or the task's.
         preset: Name of the learner's preset; None for the task's.
         settings: Settings of the learner by name, in place of the preset's.
-        log: Formats of a learning log in the folder's `logs/`: tensorboard, csv, json, log or stdout; none by default.
+        log: Formats of a learning log in the folder's `logs/`: tensorboard, wandb, csv, json, log or stdout; none by
+            default.
+        callbacks: Callback of Stable-Baselines3, or a list of them; one that returns False ends the training after the
+            episode.
         resume: Continue a run that was stopped, with the result of an undisturbed one.
         **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
 
@@ -113,7 +119,8 @@ def train(
     environment = options if guidance is None else {"guidance": guidance, **options}
     return start_or_resume(
         name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
-        episodes=episodes, seed=seed, log=log, resume=resume, imports=imports,
+        episodes=episodes, seed=seed, log=log, resume=resume, imports=imports, sb3_callbacks=callbacks,
+        find_demonstrator=partial(make_baseline, name="scripted"),
     )  # fmt: skip
 
 
@@ -131,6 +138,7 @@ def start_or_resume(
     imports: Sequence[str] = (),
     step_log: bool | None = None,
     log: str | Sequence[str] = (),
+    sb3_callbacks: Any = None,
     make_supervisor: Callable[[], Supervisor] | None = None,
     find_demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
 ) -> Run:
@@ -142,6 +150,7 @@ def start_or_resume(
     - `environment`: options of the environment by name.
     - `imports`: modules or files (.py) that register the task, the learner, …
     - `step_log`: whether every control step is written to the step log.
+    - `sb3_callbacks`: callbacks of Stable-Baselines3.
     - `make_supervisor`: constructs the supervisor of a run with a human in the loop.
     - `find_demonstrator`: returns the policy of the learner's `demonstration_episodes` for a task's name, or raises an
       InputError if there is none.
@@ -170,7 +179,7 @@ def start_or_resume(
     with EpisodeProgress(config.episodes, name=config.task) as progress:
         run_training(
             folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervisor=supervisor,
-            log=formats,
+            log=formats, sb3_callbacks=sb3_callbacks,
         )  # fmt: skip
     _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)
     return Run(out, draw_pictures(out))

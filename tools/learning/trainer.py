@@ -35,6 +35,7 @@ def run_training(
     demonstrator: Demonstrator | None = None,
     supervisor: Supervisor | None = None,
     log: Sequence[str] = (),
+    sb3_callbacks: Any = None,
 ) -> list[dict[str, Any]]:
     """Train a run to its last episode and write its folder.
 
@@ -50,7 +51,9 @@ def run_training(
         demonstrator: Policy, for an environment, that acts in the learner's `demonstration_episodes`; it has no memory
             of earlier episodes. Off-policy learners learn from demonstrations (Vecerik et al., 2017).
         supervisor: Supervisor of a run that is configured `human_in_the_loop`.
-        log: Formats of the learning log: tensorboard, csv, json, log or stdout.
+        log: Formats of the learning log: tensorboard, wandb, csv, json, log or stdout.
+        sb3_callbacks: Callback of Stable-Baselines3, or a list of them; one that returns False ends the training after
+            the episode.
 
     Returns:
         The rows of `episodes.csv`.
@@ -87,7 +90,14 @@ def run_training(
     if not resume:
         folder.refuse_existing()
     is_new_folder = not folder.path.exists()
+    callbacks = None
     try:
+        if sb3_callbacks is not None:
+            from guiderail.tools.learning.sb3_callbacks import Sb3Callbacks
+
+            if config.learner.pipelined:
+                raise InputError("callbacks need the model in this process: leave the setting pipelined out")
+            callbacks = Sb3Callbacks(sb3_callbacks, learner)
         with folder.locked():
             if config.learner.pipelined:
                 child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
@@ -96,7 +106,9 @@ def run_training(
             if not resume:
                 folder.create(config)
             try:
-                return _train(folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log)
+                return _train(
+                    folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log, callbacks
+                )
             except InputError:
                 # The user corrects the error and tries again; a folder with a configuration only would be in the way.
                 # The folder of a learner that diverged is kept.
@@ -104,6 +116,8 @@ def run_training(
                     folder.remove_unstarted(remove_folder=is_new_folder)
                 raise
     finally:
+        if callbacks is not None:
+            callbacks.close()
         learning_log.close()
         learner.close()
         env.close()
@@ -119,6 +133,7 @@ def _train(
     demonstrator: Demonstrator | None,
     supervisor: Supervisor | None,
     learning_log: LearningLog,
+    sb3_callbacks: Any = None,
 ) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     if resume:
@@ -136,6 +151,7 @@ def _train(
 
     step_log = StepLog(env, folder.steps)
     callbacks: list[Callback] = [step_log] if config.step_log else []
+    callbacks += [] if sb3_callbacks is None else [sb3_callbacks]
     num_demonstrated = 0 if demonstrator is None else config.learner.demonstration_episodes
     training_time, saving_time, last_saving_time = 0.0, 0.0, 0.0
     for episode in range(len(rows), config.episodes):
@@ -162,12 +178,15 @@ def _train(
             report(row)
         learning_log.record(rows, learner.metrics)
         saving_time_with_next = step_log.seconds + saving_time + last_saving_time
-        if saving_time_with_next <= MAX_SAVING_FRACTION * training_time or episode + 1 in (1, config.episodes):
+        is_last = episode + 1 == config.episodes or (sb3_callbacks is not None and sb3_callbacks.is_stopped)
+        if saving_time_with_next <= MAX_SAVING_FRACTION * training_time or episode == 0 or is_last:
             started = time.perf_counter()
             _save(folder, rows, learner, env, supervised)
             last_saving_time = time.perf_counter() - started
             saving_time += last_saving_time
         learner.submit_episode()
+        if is_last:
+            break
     learner.finish()
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)

@@ -1,7 +1,10 @@
 """Learning log of a run, in the formats of Stable-Baselines3's logger."""
 
+import sys
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -9,6 +12,7 @@ import pytest
 
 import guiderail.tools.learning.learner as learner_module
 from guiderail.models.common.errors import InputError
+from guiderail.tools.learning.learner import LearningLog, check_log_formats
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.trainer import run_training
 from oracles.same_runs import differences
@@ -61,3 +65,36 @@ def test_log_format_is_refused_when_unknown_or_not_installed(monkeypatch, bead_c
 def test_tensorboard_log_is_written(bead_config, tmp_path):
     run_training(RunFolder(tmp_path), replace(bead_config, episodes=1), log=["tensorboard"])
     assert list((tmp_path / "logs").glob("events.out.tfevents.*"))
+
+
+def test_wandb_logs_the_values_of_each_episode(tmp_path, monkeypatch):
+    """A stand-in for the package records what would be sent."""
+    sent, runs = [], []
+
+    class Run:
+        def log(self, values, step):
+            sent.append((step, values))
+
+        def finish(self):
+            runs.append("finished")
+
+    def init(**options):
+        runs.append(options)
+        return Run()
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init, __spec__=ModuleSpec("wandb", None)))
+    log = LearningLog(tmp_path / "run" / "logs", "wandb")
+    rows = [{"episode": 0, "steps": 7, "return": 1.5}, {"episode": 1, "steps": 5, "return": 2.5}]
+    log.record(rows[:1], lambda: {"train/critic_loss": 0.1})
+    log.record(rows, dict)
+    log.close()
+    assert sent == [(7, {"rollout/return": 1.5, "train/critic_loss": 0.1}), (12, {"rollout/return": 2.5})]
+    assert runs[0]["name"] == "run"
+    assert runs[0]["resume"] == "allow"
+    assert runs[-1] == "finished"
+
+
+def test_wandb_is_refused_without_its_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(InputError, match=r"Weights & Biases.*guiderail\[wandb\]"):
+        check_log_formats("wandb")

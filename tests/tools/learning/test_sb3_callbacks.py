@@ -1,0 +1,64 @@
+"""Callbacks of Stable-Baselines3 in a training run."""
+
+from dataclasses import replace
+
+import pytest
+from stable_baselines3 import TD3
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.trainer import run_training
+
+
+class Recorder(BaseCallback):
+    """Record the calls, and stop after some transitions."""
+
+    def __init__(self, last=10**9):
+        super().__init__()
+        self.calls, self.seen, self.last = [], [], last
+
+    def _on_training_start(self):
+        self.calls.append("training start")
+
+    def _on_rollout_start(self):
+        self.calls.append("start")
+
+    def _on_step(self):
+        self.seen.append((self.num_timesteps, self.locals["rewards"][0], self.locals["infos"][0]["is_success"]))
+        return self.num_timesteps < self.last
+
+    def _on_rollout_end(self):
+        self.calls.append("end")
+
+    def _on_training_end(self):
+        self.calls.append("training end")
+
+
+def test_callbacks_see_every_transition_and_the_model(bead_config, tmp_path):
+    recorder, saved = Recorder(), CheckpointCallback(5, str(tmp_path / "models"))
+    config = replace(bead_config, episodes=3, learner=replace(bead_config.learner, algorithm="sac"))
+    rows = run_training(RunFolder(tmp_path / "run"), config, sb3_callbacks=[recorder, saved])
+    assert recorder.calls == ["training start", *["start", "end"] * 3, "training end"]
+    assert [count for count, _, _ in recorder.seen] == list(range(1, len(recorder.seen) + 1))
+    assert sum(reward for _, reward, _ in recorder.seen) == pytest.approx(sum(row["return"] for row in rows))
+    assert recorder.model.policy is not None
+    assert len(list((tmp_path / "models").glob("*.zip"))) == len(recorder.seen) // 5
+    plain = run_training(RunFolder(tmp_path / "plain"), config)
+    assert [row["return"] for row in plain] == [row["return"] for row in rows]
+
+
+def test_callback_that_returns_false_ends_the_training(bead_config, tmp_path):
+    recorder = Recorder(last=1)
+    rows = run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=recorder)
+    assert len(rows) == 1
+    assert (tmp_path / "run" / "policy.safetensors").is_file()
+    resumed = run_training(RunFolder(tmp_path / "run"), bead_config, resume=True)
+    assert len(resumed) == bead_config.episodes
+
+
+def test_callbacks_of_another_kind_are_refused(bead_config, tmp_path):
+    for wrong, message in ((lambda: True, "is no callback"), ([TD3], "is no callback")):
+        with pytest.raises(InputError, match=message):
+            run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=wrong)
+    assert not (tmp_path / "run").exists()
