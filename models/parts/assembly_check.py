@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.parts.convex_decomposition import to_arrays, to_manifold
-from guiderail.models.parts.mesh_file import Part, require_module
+from guiderail.models.parts.mesh_file import Part
+from guiderail.models.parts.solids import require_module, to_arrays
+from guiderail.models.parts.surface_distance import SurfaceLocator, sample_surface
 
 MAX_WALL_SLOPE = 0.5  # largest component along the axis of the normal of a wall
 MAX_RESTING_OVERLAP = 2e-6  # overlap of faces that rest on each other, by rounding [m]
-_SAMPLES = 4000  # points on the walls of a part
+_SAMPLES = 12000  # points on the walls of a part
+_SLIVER = 1e-13  # twice the area of a triangle below which its normal is a rounding error [m²]
 
 
 @dataclass(frozen=True)
@@ -42,16 +44,13 @@ def make_solids(part: Part) -> list[Any]:
     Raises:
         InputError: If a body has faces that cross each other.
     """
-    solids = []
-    for vertices, triangles in part.bodies:
-        solid = to_manifold(vertices, triangles)
+    for solid in part.solids:
         if solid.is_empty():
             raise InputError(
                 f"{part.path.name} has faces that cross each other (manifold3d: {solid.status()}): unite its bodies "
                 "in the CAD model and export it again"
             )
-        solids.append(solid)
-    return solids
+    return part.solids
 
 
 def move_solid(solid: Any, height: float, angle: float) -> Any:
@@ -84,20 +83,6 @@ def compute_center_of_mass(part: Part) -> np.ndarray:
     return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()
 
 
-def check_target(plug: Part, socket: Part) -> None:
-    """Check that the parts do not overlap with the plug at its target.
-
-    Raises:
-        InputError: If they do, with the depth and the position.
-    """
-    thickness, where = measure_overlap(make_solids(plug), make_solids(socket))
-    if thickness > MAX_RESTING_OVERLAP:
-        raise InputError(
-            f"the parts overlap at the target by about {1e3 * thickness:.2g} mm, around {np.round(1e3 * where, 1)} mm "
-            "in the target frame: draw them assembled in one frame, or place the plug with --plug-pose"
-        )
-
-
 def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> InsertionMotion:
     """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] at the end.
 
@@ -115,47 +100,37 @@ def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> I
 
 def measure_side_clearance(plug: Part, socket: Part) -> float:
     """Return the smallest distance between walls along the axis at the target [m]; infinite without such walls."""
-    trimesh = require_module("trimesh")
-    meshes = [_walls(part) for part in (plug, socket)]
+    walls = [_walls(part) for part in (plug, socket)]
     least = np.inf
-    for one, other in (meshes, meshes[::-1]):
-        if not len(one.faces) or not len(other.faces):
+    for (vertices, triangles), other in (walls, walls[::-1]):
+        if not len(triangles) or not len(other[1]):
             continue
-        count = min(_SAMPLES, 40 * len(one.faces))
-        points, faces = trimesh.sample.sample_surface(one, count, seed=0)
-        points = np.concatenate([points, one.vertices])
-        normals = np.concatenate([one.face_normals[faces], one.vertex_normals])
+        points, faces = sample_surface(vertices, triangles, _SAMPLES)
+        nearest, distance, face = SurfaceLocator(*other).find_nearest(points)
         # Only walls that face each other: the distance to the back of a wall or past a corner does not count.
-        nearest, distance, face = find_nearest_on_surface(points, other.triangles)
-        facing = np.einsum("ij,ij->i", normals, other.face_normals[face]) < -0.7
+        normals, other_normals = _normals(vertices, triangles)[faces], _normals(*other)[face]
+        facing = np.einsum("ij,ij->i", normals, other_normals) < -0.7
         towards = np.einsum("ij,ij->i", normals, nearest - points) > -1e-9
         if (facing & towards).any():
             least = min(least, float(distance[facing & towards].min()))
     return least
 
 
-def _walls(part: Part) -> Any:
-    trimesh = require_module("trimesh")
-    mesh = trimesh.util.concatenate([trimesh.Trimesh(v, t, process=False) for v, t in part.bodies])
-    walls = np.flatnonzero(np.abs(mesh.face_normals[:, 2]) < MAX_WALL_SLOPE)
-    return mesh.submesh([walls], append=True, only_watertight=False)
+def _walls(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) [m] and triangles (T, 3) of the walls of a part."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in part.bodies)])
+    triangles = np.concatenate([t + start for (_, t), start in zip(part.bodies, starts, strict=False)])
+    corners = part.corners[triangles]
+    is_large = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > _SLIVER
+    is_wall = np.abs(_normals(part.corners, triangles)[:, 2]) < MAX_WALL_SLOPE
+    return part.corners, triangles[is_large & is_wall]
 
 
-def find_nearest_on_surface(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nearest points (P, 3) on triangles (T, 3, 3), their distances (P,) and triangles (P,)."""
-    trimesh = require_module("trimesh")
-    nearest, distances, faces = np.zeros_like(points), np.full(len(points), np.inf), np.zeros(len(points), int)
-    chunk = max(1, 400_000 // max(len(triangles), 1))
-    for start in range(0, len(points), chunk):
-        block = points[start : start + chunk]
-        pairs = np.repeat(block, len(triangles), axis=0)
-        closest = trimesh.triangles.closest_point(np.tile(triangles, (len(block), 1, 1)), pairs)
-        separation = np.linalg.norm(closest - pairs, axis=1).reshape(len(block), -1)
-        best = separation.argmin(axis=1)
-        rows = slice(start, start + len(block))
-        nearest[rows] = closest.reshape(len(block), -1, 3)[np.arange(len(block)), best]
-        distances[rows], faces[rows] = separation.min(axis=1), best
-    return nearest, distances, faces
+def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the unit normals (T, 3) of triangles; zero for triangles without area."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
 def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list[tuple[float, float]]:

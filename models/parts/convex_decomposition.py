@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.parts.mesh_file import require_module
+from guiderail.models.parts.solids import require_module, to_arrays
 
 MAX_PIECES = 150
 _SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding error
@@ -20,20 +20,6 @@ _MAX_PLANES = 6  # planes tried at each cut
 _SMALLEST_FACE = 2e-4  # [mm²] Drake computes the plane of each face, and fails at 5e-5
 _DIGITS = 9  # digits of meters in an OBJ file; a face may only be flat before it is rounded
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
-
-
-def to_manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
-    """Return a `manifold3d.Manifold` in millimeters from vertices (V, 3) [m] and triangles (T, 3)."""
-    manifold3d = require_module("manifold3d")
-    mesh = manifold3d.Mesh64(np.ascontiguousarray(vertices * _SCALE), np.ascontiguousarray(triangles, dtype=np.uint64))
-    mesh.merge()
-    return manifold3d.Manifold(mesh)
-
-
-def to_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) [m] and triangles (T, 3) of a solid."""
-    mesh = solid.to_mesh64()
-    return np.asarray(mesh.vert_properties)[:, :3] / _SCALE, np.asarray(mesh.tri_verts).astype(int)
 
 
 def cut_into_convex_pieces(solid: Any, most: int = MAX_PIECES) -> list[Any] | None:

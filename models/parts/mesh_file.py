@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,50 +11,52 @@ import numpy as np
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.objects.sdf import ContactMaterial, at, collision, convex_mesh, mesh, model, visual
 from guiderail.models.objects.triangle_mesh import TriangleMesh
+from guiderail.models.parts.repair import Repair, close_surface
+from guiderail.models.parts.solids import require_module, to_manifold
 
-ENDINGS = (".stl", ".obj", ".glb", ".step", ".stp")
+ENDINGS = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 """Length of one unit of a file [m]."""
 
 SMALLEST, LARGEST = 1e-3, 0.5  # bounds of the longest side of a part that an arm inserts [m]
 MAX_FILE_SIZE = 200_000_000  # [bytes]
-MAX_TRIANGLES = 500_000  # of a file; checking a million takes two minutes
+MAX_TRIANGLES = 2_000_000  # of a file
+NOTHING_REPAIRED = Repair()
 _KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """A solid of one or several bodies.
 
     Attributes:
         path: Mesh file.
         bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, counter-clockwise as seen from outside.
+        repair: What was changed to make it a solid.
     """
 
     path: Path
     bodies: tuple[tuple[np.ndarray, np.ndarray], ...]
+    repair: Repair = NOTHING_REPAIRED
+
+    @cached_property
+    def solids(self) -> list[Any]:
+        """Bodies as `manifold3d` solids, empty where faces cross each other."""
+        return [to_manifold(vertices, triangles) for vertices, triangles in self.bodies]
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Vertices of all bodies (V, 3) [m]."""
+        return np.concatenate([vertices for vertices, _ in self.bodies])
 
     @property
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner of the bounding box, (2, 3) [m]."""
-        points = np.concatenate([vertices for vertices, _ in self.bodies])
-        return np.stack([points.min(axis=0), points.max(axis=0)])
+        return np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
 
     def transform(self, rotation: np.ndarray, translation: np.ndarray) -> "Part":
         """Return the part with every point p at R p + t; rotation (3, 3), translation (3,) [m]."""
-        return Part(self.path, tuple((v @ rotation.T + translation, t) for v, t in self.bodies))
-
-
-def require_module(module: str) -> Any:
-    """Import an optional library for meshes.
-
-    Raises:
-        InputError: If it is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError:
-        raise InputError(f"meshes need {module}, which is not installed: pip install 'guiderail[onboard]'") from None
+        return Part(self.path, tuple((v @ rotation.T + translation, t) for v, t in self.bodies), self.repair)
 
 
 def find_unit(path: Path, given: str | None) -> str | None:
@@ -75,12 +77,11 @@ def load_part(path: Path, unit: str) -> Part:
     """Read a mesh file.
 
     Args:
-        path: STL, OBJ or GLB file, or a STEP file if cascadio is installed.
+        path: STL, OBJ, PLY or GLB file, or a STEP file if cascadio is installed.
         unit: Unit of the file's numbers, one of `UNITS`.
 
     Raises:
-        InputError: If the file can't be read, or the part is not watertight, hollow, inside out, or of a size that no
-            arm inserts.
+        InputError: If the file can't be read, or the part can't be made a solid, or is of a size that no arm inserts.
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
@@ -109,15 +110,11 @@ def load_part(path: Path, unit: str) -> Part:
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    mesh.update_faces(mesh.nondegenerate_faces())
-    if not len(mesh.faces):
+    if not (mesh.area > 0.0):
         raise InputError(f"{path} holds triangles without an area only: export the part as a mesh")
-    bodies = []
-    parts = mesh.split(only_watertight=False, repair=False)
-    for body in parts:
-        _check_body(path, body, parts)
-        bodies.append((np.asarray(body.vertices) * UNITS[unit], np.asarray(body.faces)))
-    return Part(path, tuple(bodies))
+    vertices, triangles = np.asarray(mesh.vertices) * UNITS[unit], np.asarray(mesh.faces)
+    bodies, repair = close_surface(path.name, vertices, triangles)
+    return Part(path, tuple(bodies), repair)
 
 
 def _read(path: Path) -> Any:
@@ -128,38 +125,6 @@ def _read(path: Path) -> Any:
         return trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # a parser may raise anything for a damaged file
         raise InputError(f"{path} can't be read as a mesh ({brief(str(error))}): export it again") from error
-
-
-def _encloses(outer: Any, inner: Any) -> bool:
-    """Return True if the bounding box of a body with outward faces encloses that of another body."""
-    (low, high), (inner_low, inner_high) = outer.bounds, inner.bounds
-    return bool(outer.volume > 0.0 and (low < inner_low).all() and (inner_high < high).all())
-
-
-def _check_body(path: Path, body: Any, bodies: Sequence[Any]) -> None:
-    edges = np.sort(body.edges, axis=1)
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    if not body.is_watertight:
-        open_edges = int((counts == 1).sum())
-        where = body.bounds.mean(axis=0).round(3).tolist()
-        what = f"{open_edges} open edges" if open_edges else "edges that more than two triangles share"
-        raise InputError(
-            f"{path.name} is not watertight ({what}, in the body around {where}): close it in the CAD model, or "
-            "repair it with MeshLab or Blender's 3D-print toolbox, and export it again"
-        )
-    if not body.is_winding_consistent:
-        raise InputError(
-            f"{path.name} has triangles that face different ways: recalculate its normals outwards, and export it again"
-        )
-    if body.volume <= 0.0 and any(_encloses(other, body) for other in bodies):
-        raise InputError(
-            f"{path.name} has a closed cavity, around {body.bounds.mean(axis=0).round(3).tolist()}: fill it in the CAD "
-            "model, as nothing touches there, and export it again"
-        )
-    if body.volume <= 0.0:
-        raise InputError(
-            f"{path.name} is inside out, its triangles face inwards: flip its normals, and export it again"
-        )
 
 
 class Surface(Protocol):
@@ -196,7 +161,8 @@ def part_sdf(
     Args:
         name: Name of the model and its link.
         visual_file: OBJ file of the visual geometry.
-        surfaces: Collision geometry; a compliant mesh is convex, a rigid one may be any mesh.
+        surfaces: Collision geometry; a compliant OBJ mesh is convex, a compliant VTK mesh
+            has tetrahedra, and a rigid mesh may be any.
         mass: Mass [kg].
         center: Center of mass (3,) [m].
         gyration: Radius of gyration [m].
@@ -204,7 +170,8 @@ def part_sdf(
     """
     contents = visual("visual", at(), mesh(visual_file), color)
     for number, surface in enumerate(surfaces):
-        geometry = mesh(surface.file) if surface.modulus is None else convex_mesh(surface.file)
+        is_convex = surface.modulus is not None and surface.file.endswith(".obj")
+        geometry = convex_mesh(surface.file) if is_convex else mesh(surface.file)
         material = ContactMaterial(surface.friction, surface.modulus, dissipation=surface.dissipation)
         contents += collision(f"piece_{number}", at(), geometry, material)
     return model(name, mass, center, gyration, contents, source="guiderail from task.yaml")

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids, move_solid
-from guiderail.models.parts.mesh_file import Part, require_module
+from guiderail.models.parts.mesh_file import Part
+from guiderail.models.parts.solids import require_module
 
 # Map of (x, y) of each candidate, in the order of `diagrams.tasks.bnc_connector.rewards.sides_of_the_rim`.
 SYMMETRIES = {

@@ -115,7 +115,7 @@ def validate_template(
 
 @command("create-task plug.stl socket.stl --unit mm --out ./peg", "create-task")
 def create_task(
-    plug: Annotated[Path, argument("Mesh of the part in the tool: .stl, .obj, .glb, .step.", "PLUG")],
+    plug: Annotated[Path, argument("Mesh of the part in the tool: .stl, .obj, .ply, .glb, .step.", "PLUG")],
     socket: Annotated[Path, argument("Mesh of the part in the world.", "SOCKET")],
     out: Annotated[Path, option("Folder of the task; it must not exist.")],
     unit: Annotated[str | None, option("Unit of the meshes: mm, cm, m or inch.")] = None,
@@ -127,6 +127,7 @@ def create_task(
     turn: Annotated[
         float, option("Rotation of the plug at the bottom [degrees]; its mesh is drawn in the turned pose.")
     ] = 0.0,
+    shrink: Annotated[float, option("Distance by which the plug's surface is moved inwards [mm].")] = 0.0,
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,
     friction: Annotated[float, option("Friction coefficient of all surfaces.")] = 0.2,
     scenario: Annotated[list[Path] | None, option("Drake model directives of the surroundings; repeatable.")] = None,
@@ -150,6 +151,7 @@ def create_task(
         axis=axis,
         center=None if center is None else cli.parse_floats(center, 3, "--center"),
         turn=turn,
+        shrink=1e-3 * shrink,
         force_limit=force_limit,
         friction=friction,
         scenario=scenario or (),

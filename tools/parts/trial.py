@@ -21,18 +21,20 @@ from guiderail.diagrams.tasks.part.task import PartInsertion, write_workcell
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
-from guiderail.models.parts.assembly_check import find_nearest_on_surface
 from guiderail.models.parts.demonstrator import (
     NUM_DEMONSTRATIONS,
     demonstrator_motions,
     plan_search,
     plan_straight_insertion,
 )
+from guiderail.models.parts.surface_distance import SurfaceLocator
 from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_poses import pose_to_transform
 
 _VERTICES = 8  # number of vertices of a contact surface, those of the highest pressure, for which depth is measured
+_AT_REST = 1.0  # time at the end of a motion in which the plug does not move [s]
+_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # distance of the command below the plug [m], and its duration [s]
 _INTERVAL = 4  # simulator steps between two measurements of depth
 
 
@@ -45,6 +47,7 @@ class Trial:
         pose: Final pose of the plug in the socket, position and rotation vector (6,) [m, rad].
         peak_force: Largest contact force [N].
         penetration: Largest penetration of the parts [m], without snapping pieces.
+        resting_penetration: The same at the end of the motion, while the plug is pushed at rest [m].
         snap: Largest penetration of snapping pieces [m].
         real_time_factor: Simulated time per CPU time.
         recording: Poses, wrench and force at the control steps.
@@ -54,6 +57,7 @@ class Trial:
     pose: np.ndarray
     peak_force: float
     penetration: float
+    resting_penetration: float
     snap: float
     real_time_factor: float
     recording: Recording
@@ -67,20 +71,25 @@ class Depths:
 
     Attributes:
         deepest: Largest penetration so far [m], without snapping pieces.
+        deepest_at_rest: The same while the plug is at rest [m].
         deepest_snap: Largest penetration of snapping pieces so far [m].
         seconds: CPU time of the measurements [s].
     """
 
-    def __init__(self, station: GantryStation, surfaces: dict[str, np.ndarray], snapping: set[str]):
+    def __init__(
+        self, station: GantryStation, surfaces: dict[str, SurfaceLocator], snapping: set[str], rest_from: float
+    ):
         """Construct the measurement.
 
         Args:
             station: Station with the parts.
-            surfaces: Triangles (T, 3, 3) [m] of each compliant body by name, in its own frame.
+            surfaces: Surface [m] of each compliant body by name, in its own frame.
             snapping: Names of geometries that overlap on purpose.
+            rest_from: Time from which the plug is at rest, apart from the push [s].
         """
         self._station, self._surfaces, self._snapping = station, surfaces, snapping
-        self.deepest = self.deepest_snap = 0.0
+        self._rest_from = rest_from
+        self.deepest = self.deepest_at_rest = self.deepest_snap = 0.0
         self.seconds = 0.0
 
     def monitor(self, root_context: Any) -> EventStatus:
@@ -104,11 +113,13 @@ class Depths:
                 X_BW = body.EvalPoseInWorld(context).inverse()
                 inside = X_BW.multiply(points.T).T
                 snaps = any(inspector.GetName(one).split("::")[-1] in self._snapping for one in ids)
-                depth = float(find_nearest_on_surface(inside, self._surfaces[body.name()])[1].max())
+                depth = float(self._surfaces[body.name()].find_nearest(inside.reshape(-1, 3))[1].max())
                 if snaps:
                     self.deepest_snap = max(self.deepest_snap, depth)
                 else:
                     self.deepest = max(self.deepest, depth)
+                    if root_context.get_time() >= self._rest_from:
+                        self.deepest_at_rest = max(self.deepest_at_rest, depth)
         self.seconds += time.process_time() - start
         return EventStatus.DidNothing()
 
@@ -141,22 +152,33 @@ def insert(
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {
-        name: triangles_of(folder / part.visual)
+        name: _locator(folder / part.visual)
         for name, part in ((PLUG, file.plug), (SOCKET, file.socket))
         if part.pieces[0].modulus is not None
     }
-    depths = Depths(station, compliant, set(snapping))
+    depths = Depths(station, compliant, set(snapping), times[-1] - _AT_REST)
     driven.start(poses[0])
-    if measure_depth:
-        steps = [0]
+    steps, blocked = 0, 0
 
-        def monitor(root_context: Any) -> EventStatus:
-            steps[0] += 1
-            return depths.monitor(root_context) if steps[0] % _INTERVAL == 0 else EventStatus.DidNothing()
+    def monitor(root_context: Any) -> EventStatus:
+        nonlocal steps, blocked
+        steps += 1
+        if steps % _INTERVAL:
+            return EventStatus.DidNothing()
+        if measure_depth:
+            depths.monitor(root_context)
+        now = root_context.get_time()
+        # A plug that stays above the target although the command is far below it is blocked: the rest would be slow.
+        below = _plug_pose(driven)[2] - np.interp(now, times, poses[:, 2])
+        blocked = blocked + 1 if below > _BLOCKED else 0
+        if blocked * _INTERVAL * station.plant.time_step() < _BLOCKED_TIME:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(station, "blocked")
 
-        driven.simulator.set_monitor(monitor)
+    driven.simulator.set_monitor(monitor)
     start = time.process_time()
     recording = driven.run()
+    driven.simulator.clear_monitor()  # Drake never frees the diagram, which would keep the surfaces
     spent = time.process_time() - start - depths.seconds
     pose = _plug_pose(driven)
     return Trial(
@@ -164,6 +186,7 @@ def insert(
         pose=pose,
         peak_force=float(recording["contact_force"].max()),
         penetration=depths.deepest,
+        resting_penetration=depths.deepest_at_rest,
         snap=depths.deepest_snap,
         real_time_factor=float(times[-1] / max(spent, 1e-9)),
         recording=recording,
@@ -195,6 +218,11 @@ def triangles_of(path: Path) -> np.ndarray:
     return np.array(vertices)[np.array(corners)]
 
 
+def _locator(path: Path) -> SurfaceLocator:
+    triangles = triangles_of(path)
+    return SurfaceLocator(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+
+
 _SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}
 _SCALE = 10.0  # enlarges parts of some centimeters, which are too close to the page's camera
 
@@ -209,6 +237,8 @@ def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) ->
     for name, part in (("plug", file.plug), ("socket", file.socket)):
         _show(meshcat, f"/{name}/seen", folder / part.visual, _SOLID[name])
         for piece in part.pieces:
+            if not piece.file.endswith(".obj"):
+                continue  # Meshcat shows no tetrahedra
             color = Rgba(*rng.uniform(0.25, 0.95, 3), 1.0)
             _show(meshcat, f"/{name}/contact/{Path(piece.file).stem}", folder / piece.file, color)
         meshcat.SetProperty(f"/{name}/contact", "visible", False)
@@ -229,7 +259,14 @@ def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
     meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), color)
 
 
+DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are no longer checked [s]
 MAX_SESSIONS = 3  # sessions of five attempts, until five attempts have seated the plug
+
+
+def demonstration_time(file: PartTaskFile) -> float:
+    """Return the duration of a demonstration [s]."""
+    numbers = file.motion
+    return float(plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)[0][-1])
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
@@ -237,12 +274,15 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
     numbers = file.motion
     script = plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
+    start = time.process_time()
     seated: list[np.ndarray] = []
     others: list[np.ndarray] = []
     for seed in range(MAX_SESSIONS):
         for motion in demonstrator_motions(seed, script, numbers.rim - numbers.press - 1e-3, times):
-            if len(seated) < NUM_DEMONSTRATIONS:
-                (seated if _seats(folder, file, times, motion) else others).append(motion)
+            if len(seated) >= NUM_DEMONSTRATIONS:
+                break
+            in_time = time.process_time() - start < DEMONSTRATION_SECONDS
+            (seated if in_time and _seats(folder, file, times, motion) else others).append(motion)
     chosen = (seated + others)[:NUM_DEMONSTRATIONS]
     Demonstrations([times] * len(chosen), chosen, NAMES).save(folder / file.demonstrations.file)
     return len(seated)

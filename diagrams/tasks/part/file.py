@@ -26,13 +26,35 @@ from guiderail.models.primitives import LinearConstraints
 FILE_NAME = "task.yaml"
 FILE_FORMAT = "guiderail task 1"
 NAMESPACE = "parts"
+HARD: dict[str, Any] = {
+    "fixture_offset": "per_episode",
+    "offset_range": (2.6 * MM, 3.0 * MM),
+    "bound": 3.5 * MM,
+    "force_limit": 20.0,
+    "observation": "center_of_pressure",
+    "action_repeat": 5,
+}
+"""Options of difficulty="hard" that `create-task --calibrate` replaces by measured ones."""
+
+AUTOMATE: dict[str, Any] = {
+    "fixture_offset": "per_episode",
+    "offset_shape": "square",
+    "offset_range": (0.0, 2.0 * MM),
+    "fixture_turn": 5.0,
+    "bound": 3.5 * MM,
+    "observation": "center_of_pressure",
+    "action_repeat": 5,
+}
+"""Options of difficulty="automate": AutoMate's uncertainty, ±2 mm along x and y and ±5° about the axis."""
 _LARGEST = float(np.finfo(float).max)
 
 
 class Piece(Options):
     """Collision mesh."""
 
-    file: str = Field(description="OBJ file next to this file, in the target frame [m]")
+    file: str = Field(
+        description="OBJ file, or VTK file of tetrahedra if compliant, next to this file, in the target frame [m]"
+    )
     modulus: Number | None = Field(
         None, gt=0, description="hydroelastic modulus of a compliant convex mesh [Pa]; default: rigid"
     )
@@ -177,6 +199,15 @@ class Recommended(Options):
     )
 
 
+class SearchNumbers(Options):
+    """Response of a plug on the rim, measured by create-task, which the scripted search uses."""
+
+    lever_sign: int = Field(
+        -1, ge=-1, le=1, description="1 if the center of pressure lies towards the socket's axis, -1 if away from it"
+    )
+    reach: Number = Field(2.0 * MM, gt=0, le=20 * MM, description="displacement of the command at an action of 1 [m]")
+
+
 class PartTaskFile(Options):
     """Content of `task.yaml`."""
 
@@ -201,6 +232,8 @@ class PartTaskFile(Options):
     sides: tuple[str, ...] = Field((), description="symmetries of both parts: see models/parts/symmetry.py")
     rim_sides: tuple[str, ...] = Field((), description="symmetries that nearly hold for a plug on the rim")
     recommended: Recommended = Recommended.model_validate({})
+    search: SearchNumbers = SearchNumbers.model_validate({})
+    hard: dict[str, Any] = Field(HARD, description="options of the environment with difficulty=hard")
     measured: dict[str, Any] = Field({}, description="measurements of create-task, for information only")
 
     @field_validator("time_step")

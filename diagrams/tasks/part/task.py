@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache, cached_property
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.envs.options import Number
+from guiderail.diagrams.envs.options import STANDARD, Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
@@ -25,13 +25,14 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import (
 )
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, ForceOptions
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, reference_of_file
-from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, task_folder_digest
+from guiderail.diagrams.tasks.part.file import AUTOMATE, Bounds, PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
-from guiderail.diagrams.tasks.task import Threshold
+from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.objects.insertion import COLLISION_FORCE, HISTORY_VARIANCE
+from guiderail.models.objects.insertion import COLLISION_FORCE, COMMAND_SCALE, HISTORY_VARIANCE, LEVER_SCALE
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
@@ -42,11 +43,30 @@ if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
 COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
+
+# Indices into the observation [time, pose, wrench, center of pressure, command].
+Z, CENTER_OF_PRESSURE, COMMAND = 3, slice(13, 15), slice(15, 17)
+STEP = 0.5 * MM  # displacement of the command per action of the scripted search [m]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
 class PartOptions(FixtureOffsetOptions, ForceOptions):
     """Options of a task of two meshes."""
+
+    offset_shape: Literal["ring", "square"] = Field(
+        "ring",
+        description="region of the fixture's offset: a ring with the radii offset_range, or the square of |x|, |y| up "
+        "to its greatest value",
+    )
+    fixture_turn: Number = Field(
+        0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
+    )
+    bound: Number | None = Field(
+        None,
+        ge=0.5 * MM,
+        le=6.0 * MM,
+        description="bound of a command's |x| and |y| [m], instead of the constant ones of task.yaml",
+    )
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
@@ -54,6 +74,41 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
     force_limit: Number = Field(
         COLLISION_FORCE, ge=1, le=60, description="force that ends an episode as a collision [N]"
     )
+
+
+class PartUncertainty(BncUncertainty):
+    """Sampler of the socket's offset: as the connector's, or uniform in a square, sampled in each episode."""
+
+    def __init__(self, options: PartOptions):
+        super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
+        self.is_square = options.offset_shape == "square"
+
+    def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not self.is_square:
+            return super()._draw_episode(rng, run)
+        side = self.offset_range[1]
+        return self._turned(rng.uniform(-side, side, 2), rng), np.zeros(2)
+
+
+def scripted_search(file: PartTaskFile, observation: np.ndarray) -> np.ndarray:
+    """Return an action (2,) that moves the command one step towards the socket's axis, as the center of pressure shows.
+
+    Once the plug has dropped in, the command is constant. The last command is part of the observation.
+
+    Args:
+        file: Task file.
+        observation: Observation with the center of pressure.
+
+    Raises:
+        InputError: If the observation has no center of pressure.
+    """
+    if len(observation) < COMMAND.stop:
+        raise InputError('this policy needs the center of pressure: choose observation="center_of_pressure"')
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+    height, length = 0.5 * file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
+    if height > file.motion.rim - STEP and length > 0.0:
+        command = command + file.search.lever_sign * STEP * lever / max(length, MM)
+    return np.clip(command / file.search.reach, -1.0, 1.0)
 
 
 class PartInsertion(DemonstratedInsertion):
@@ -78,7 +133,7 @@ class PartInsertion(DemonstratedInsertion):
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
-        self.offsets = BncUncertainty(self.options.fixture_offset, offset_range=self.options.offset_range)
+        self.offsets = PartUncertainty(self.options)
         self.collision = Threshold("contact_force", self.options.force_limit)
         self.num_steps = self.reference().num_steps
 
@@ -96,8 +151,19 @@ class PartInsertion(DemonstratedInsertion):
         return reference_of_file(self.folder / source.file, source.components, source.floor)
 
     def constraints(self) -> LinearConstraints:
-        """Return the folder's bounds."""
-        return self.file.bounds.constraints(self.reference().num_steps)
+        """Return the folder's bounds, with those of x and y replaced by the option `bound`."""
+        bounds, limit = self.file.bounds, self.options.bound
+        if limit is not None:
+            if bounds.phases is not None:
+                raise InputError("bound replaces constant bounds, and those of task.yaml change between phases")
+            both = (-limit, -limit, *bounds.lower[2:]), (limit, limit, *bounds.upper[2:])
+            bounds = Bounds(lower=both[0], upper=both[1], phases=None)
+        return bounds.constraints(self.reference().num_steps)
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return the scripted search by the center of pressure."""
+        return {"scripted_search": partial(scripted_search, cls.file)}
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
@@ -219,7 +285,15 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         **file.recommended.environment,
     }
     learner = file.recommended.learner
-    members = {"folder": folder, "file": file, "defaults": defaults, "learner": learner, "__module__": __name__}
+    difficulties = {STANDARD: {}, "hard": file.hard, "automate": AUTOMATE}
+    members = {
+        "difficulties": difficulties,
+        "folder": folder,
+        "file": file,
+        "defaults": defaults,
+        "learner": learner,
+        "__module__": __name__,
+    }
     task = type(f"PartInsertion({folder})", (PartInsertion,), members)
     task.__doc__ = f"Insert {file.plug.source or 'a plug'} into {file.socket.source or 'a socket'}."
     return cast(type[PartInsertion], task)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from guiderail.models.parts.assembly_check import make_solids
-from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces, to_arrays
+from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
 from guiderail.models.parts.mesh_file import load_part
+from guiderail.models.parts.solids import to_arrays
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")

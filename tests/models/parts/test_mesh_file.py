@@ -1,4 +1,4 @@
-"""A faulty mesh is refused in one sentence with the remedy."""
+"""A faulty mesh is repaired and reported, or refused in one sentence with the remedy."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -42,22 +42,58 @@ def one_flipped(mesh):
     return trimesh.Trimesh(mesh.vertices, faces, process=False)
 
 
-@pytest.mark.parametrize("ending", ["stl", "obj"])
-def test_load_part_returns_metres(ending, tmp_path):
-    box().export(tmp_path / f"part.{ending}")
-    part = load_part(tmp_path / f"part.{ending}", "mm")
-    np.testing.assert_allclose(np.ptp(part.bounds, axis=0), [0.01, 0.01, 0.02])
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "glb"])
+def test_load_part_returns_meters(ending, tmp_path):
+    scale, unit = (1e-3, "m") if ending == "glb" else (1.0, "mm")
+    box().apply_scale(scale).export(tmp_path / f"part.{ending}")
+    part = load_part(tmp_path / f"part.{ending}", unit)
+    np.testing.assert_allclose(np.ptp(part.bounds, axis=0), [0.01, 0.01, 0.02], rtol=1e-6)
     assert len(part.bodies) == 1
+    assert str(part.repair) == ""
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words", "bodies"),
+    [
+        (inside_out, "turned 1 body right side out", 1),
+        (inside_out_next_to_another, "turned 1 body right side out", 2),
+        (hollow, "filled 1 closed cavity", 1),
+        (one_flipped, "closed 3 edges; surface moved by at most 0.0000 mm", 1),
+    ],
+)
+def test_load_part_repairs_and_reports(spoil, words, bodies, tmp_path):
+    spoil(box()).export(tmp_path / "part.stl")
+    part = load_part(tmp_path / "part.stl", "mm")
+    assert str(part.repair) == words
+    assert len(part.bodies) == bodies
+    for vertices, triangles in part.bodies:
+        solid = trimesh.Trimesh(vertices, triangles, process=False)
+        assert solid.is_watertight
+        assert solid.volume == pytest.approx(2e-6)
+
+
+def test_load_part_keeps_slivers_that_close_a_seam(tmp_path):
+    """A T-junction is closed by a triangle without area, which must not be removed."""
+    mesh = box()
+    a, b, c = mesh.faces[0]
+    middle = len(mesh.vertices)
+    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
+    faces = np.vstack([mesh.faces[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "part.obj")
+    part = load_part(tmp_path / "part.obj", "mm")
+    assert part.repair.closed_edges == 0
+    assert trimesh.Trimesh(*part.bodies[0], process=False).volume == pytest.approx(2e-6)
+
+
+def test_load_part_refuses_a_hole(tmp_path):
+    hole(box()).export(tmp_path / "part.stl")
+    with pytest.raises(InputError, match=r"\(3 open edges.*close it"):
+        load_part(tmp_path / "part.stl", "mm")
 
 
 @pytest.mark.parametrize(
     ("spoil", "unit", "message"),
     [
-        (hole, "mm", r"not watertight \(3 open edges.*close it"),
-        (inside_out, "mm", "inside out.*flip its normals"),
-        (inside_out_next_to_another, "mm", "inside out.*flip its normals"),
-        (hollow, "mm", "has a closed cavity, around .*fill it"),
-        (one_flipped, "mm", "face different ways.*recalculate"),
         (lambda mesh: mesh, "m", "would be 20 m long with --unit m: is its unit mm or cm"),
         (lambda mesh: mesh.apply_scale(1e30), "mm", "would be 2e.28 m long"),
         (lambda mesh: mesh.apply_scale(1e-30), "mm", "would be 2e-32 m long|holds no triangles"),
@@ -65,7 +101,7 @@ def test_load_part_returns_metres(ending, tmp_path):
         (lambda mesh: trimesh.Trimesh([[0, 0, 0], [9, 0, 0]], [[0, 0, 1]], process=False), "mm", "without an area"),
     ],
 )
-def test_load_part_names_the_remedy_when_a_mesh_is_faulty(spoil, unit, message, tmp_path):
+def test_load_part_names_the_remedy_when_a_mesh_is_unusable(spoil, unit, message, tmp_path):
     spoil(box()).export(tmp_path / "part.stl")
     with pytest.raises(InputError, match=message):
         load_part(tmp_path / "part.stl", unit)

@@ -15,7 +15,8 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as writing
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
-from guiderail.tools.parts.create_task import ask_unit, create_task, rank
+from guiderail.tools.parts.contact import rank
+from guiderail.tools.parts.create_task import ask_unit, create_task
 from guiderail.tools.visualization import replay
 
 pytest.importorskip("trimesh")
@@ -88,14 +89,16 @@ def test_unit_is_asked_for_on_standard_error(tmp_path, monkeypatch, capsys):
 
 
 def test_rank_prefers_seating_then_shallow_then_fast_contacts():
-    allowed = 1e-4
+    def key(seats, deepest, speed):
+        return rank(SimpleNamespace(aligned=SimpleNamespace(success=seats), deepest=deepest, speed=speed), 1e-4)
+
     tried = {
-        "fast": rank(True, 0.9e-4, allowed, 3.0),
-        "shallow and slow": rank(True, 0.2e-4, allowed, 2.5),
-        "a little too deep": rank(True, 1.1e-4, allowed, 2.1),
-        "far too deep, and fast": rank(True, 2.3e-4, allowed, 4.4),
-        "not too deep, and unbearably slow": rank(True, 1.05e-4, allowed, 1.4),
-        "does not seat": rank(False, 0.1e-4, allowed, 9.0),
+        "fast": key(True, 0.9e-4, 3.0),
+        "shallow and slow": key(True, 0.2e-4, 2.5),
+        "a little too deep": key(True, 1.1e-4, 2.1),
+        "far too deep, and fast": key(True, 2.3e-4, 4.4),
+        "not too deep, and unbearably slow": key(True, 1.05e-4, 1.4),
+        "does not seat": key(False, 0.1e-4, 9.0),
     }
     assert sorted(tried, key=tried.get, reverse=True) == list(tried)
 
@@ -212,6 +215,7 @@ def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
         (("--unit", "mm", "--force-limit", "10001"), "--force-limit is positive"),
         (("--unit", "mm", "--out", tmp_path / ("n" * 300)), "check it"),
         (("--unit", "mm", "--out", folder), "already exists"),
+        (("--unit", "mm", "--shrink", "9"), "--shrink is from 0 to 0.5 mm, not 9"),
         (("--unit", "mm", "--friction", "5"), "friction must be at most 2, not 5"),
         (("--unit", "mm", "--scenario", tmp_path / "none.yaml"), "there is no scenario"),
     ):

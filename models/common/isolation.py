@@ -1,0 +1,65 @@
+"""Functions run in a process of their own, because compiled libraries may abort or never return."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+from collections.abc import Callable
+from typing import Any
+
+_WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # wall time allowed per CPU time, and in addition [s]
+
+
+class IsolatedError(Exception):
+    """The isolated function raised, aborted, or exceeded its time limit; the message gives the reason."""
+
+
+def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int) -> Any:
+    """Return `function(*arguments)`, computed in a forked process; the result is pickled.
+
+    Args:
+        function: Function; it needs no import in the child process, which is a copy of this one.
+        arguments: Its arguments, which are not pickled.
+        cpu_seconds: Limit of its CPU time [s].
+
+    Raises:
+        IsolatedError: If the function raised, or its process aborted or exceeded the limit.
+    """
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(sender, function, arguments, cpu_seconds))
+    process.start()
+    sender.close()
+    try:
+        if not receiver.poll(_WALL_FACTOR * cpu_seconds + _WALL_SLACK):
+            raise IsolatedError(f"it took more than {cpu_seconds} s")
+        is_result, value = receiver.recv()
+    except EOFError:
+        process.join()
+        if process.exitcode in (-24, -9):  # SIGXCPU, SIGKILL
+            raise IsolatedError(f"it took more than {cpu_seconds} s of CPU time") from None
+        raise IsolatedError(f"the library aborted (exit status {process.exitcode})") from None
+    finally:
+        process.kill()
+        process.join()
+        receiver.close()
+    if not is_result:
+        raise IsolatedError(value)
+    return value
+
+
+def _child(sender: Any, function: Callable[..., Any], arguments: tuple[Any, ...], cpu_seconds: int) -> None:
+    used = int(sum(os.times()[:2])) + 1
+    resource.setrlimit(resource.RLIMIT_CPU, (used + cpu_seconds, used + cpu_seconds + 1))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(devnull, 1)  # compiled libraries print their progress and their aborts
+    os.dup2(devnull, 2)
+    try:
+        sender.send((True, function(*arguments)))
+    except BaseException as error:
+        sender.send((False, f"{type(error).__name__}: {error}"))
+    finally:
+        sender.close()
+        os._exit(0)

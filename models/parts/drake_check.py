@@ -1,0 +1,104 @@
+"""Pieces that Drake accepts: it throws at degenerate meshes, and at some of them it aborts its process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.parts.pieces import Piece, piece_text
+from guiderail.models.parts.solids import require_module, to_arrays
+
+_GRIDS = (6, 5)  # digits of meters to which a refused convex piece is rounded, one after the other
+_NEGLIGIBLE = 1e-4  # part of the volume of all pieces below which a refused piece is left out
+_SECONDS = 20  # CPU time of a check [s]
+
+
+def accepted_pieces(pieces: Sequence[Piece]) -> list[Piece] | None:
+    """Return pieces that Drake accepts, the refused ones rounded to a grid or left out if negligible.
+
+    Returns:
+        The pieces; None if one can be neither rounded nor left out.
+    """
+    bad = _refused(pieces)
+    if not bad:
+        return list(pieces)
+    if any(pieces[number].suffix != ".obj" for number in bad):
+        return None
+    total, accepted = sum(map(_hull_volume, pieces)), []
+    for number, piece in enumerate(pieces):
+        if number not in bad:
+            accepted.append(piece)
+            continue
+        for rounded in _rounded(piece):
+            if not _refused([rounded]):
+                accepted.append(rounded)
+                break
+        else:
+            if _hull_volume(piece) > _NEGLIGIBLE * total:
+                return None
+    return accepted
+
+
+def _hull_volume(piece: Piece) -> float:
+    return float(_hull(piece.points).volume()) if piece.suffix == ".obj" else 0.0
+
+
+def _hull(points: np.ndarray) -> Any:
+    return require_module("manifold3d").Manifold.hull_points(np.ascontiguousarray(1e3 * points))
+
+
+def _rounded(piece: Piece) -> list[Piece]:
+    """Return the piece with vertices on coarser and coarser grids, as long as they span a volume."""
+    hulls = [_hull(np.unique(np.round(piece.points, digits), axis=0)) for digits in _GRIDS]
+    arrays = [to_arrays(hull) for hull in hulls if not hull.is_empty()]
+    return [replace(piece, points=points, cells=cells) for points, cells in arrays]
+
+
+def _refused(pieces: Sequence[Piece]) -> set[int]:
+    """Return the indices of the pieces that Drake refuses; an abort ends a child process only."""
+    try:
+        return set(run_isolated(_try_each, pieces, cpu_seconds=_SECONDS))
+    except IsolatedError:
+        if len(pieces) == 1:
+            return {0}
+        half = len(pieces) // 2
+        return _refused(pieces[:half]) | {half + number for number in _refused(pieces[half:])}
+
+
+def _try_each(pieces: Sequence[Piece]) -> list[int]:
+    from pydrake.geometry import (
+        AddCompliantHydroelasticProperties,
+        AddContactMaterial,
+        Convex,
+        GeometryInstance,
+        Mesh,
+        ProximityProperties,
+        SceneGraph,
+    )
+    from pydrake.math import RigidTransform
+    from pydrake.multibody.plant import CoulombFriction
+
+    refused = []
+    with TemporaryDirectory() as folder:
+        for number, piece in enumerate(pieces):
+            file = Path(folder) / f"{number}{piece.suffix}"
+            file.write_text(piece_text(piece), encoding="utf-8")
+            properties = ProximityProperties()
+            AddContactMaterial(1.0, None, CoulombFriction(0.2, 0.2), properties)
+            AddCompliantHydroelasticProperties(0.01, 1e9, properties)
+            shape = Convex(str(file)) if piece.suffix == ".obj" else Mesh(str(file))
+            instance = GeometryInstance(RigidTransform(), shape, "piece")
+            instance.set_proximity_properties(properties)
+            graph = SceneGraph()
+            source = graph.RegisterSource("check")
+            try:
+                graph.RegisterAnchoredGeometry(source, instance)
+            except RuntimeError:
+                refused.append(number)
+    return refused

@@ -1,0 +1,198 @@
+"""From two drawn parts to contact geometry: united, decimated, cropped, and cut into convex pieces or tetrahedra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.parts.assembly_check import InsertionMotion, make_solids
+from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
+from guiderail.models.parts.drake_check import accepted_pieces
+from guiderail.models.parts.mesh_file import Part
+from guiderail.models.parts.pieces import Piece
+from guiderail.models.parts.simplification import as_hull_if_near, count_simplified, crop_to_contact, simplify
+from guiderail.models.parts.solids import require_module, to_arrays
+from guiderail.models.parts.surface_distance import SurfaceLocator, measure_deviation
+from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
+
+MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
+NO_CLEARANCE_TOLERANCE = 2e-5  # the same without walls that face each other [m]
+MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [m]
+_THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
+MAX_YAW = 0.1  # rotation of the plug about its axis in a search, which widens the margin [rad]
+CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
+EARLY = 0.2  # fraction of the tolerance that `decimate` may use
+_LATE = 0.7  # fraction of the rest that is tried first, as the measured deviation exceeds that of `manifold3d`
+
+KINDS = ("convex", "tetrahedra")
+"""Kinds of pieces of a compliant part; the second is tried if nothing else seats the plug."""
+
+Arrays = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class ContactSurface:
+    """Surface of a part as it is simulated.
+
+    Attributes:
+        bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, the snapping ones last.
+        snapping: Number of the snapping bodies.
+        visual: Vertices and triangles of the whole part, decimated but not cropped.
+        deviation: Largest measured distance from the drawing within what can touch [m].
+        volume: Volume of the part [m³].
+    """
+
+    bodies: tuple[Arrays, ...]
+    snapping: int
+    visual: Arrays
+    deviation: float
+    volume: float
+
+    @property
+    def num_triangles(self) -> int:
+        """Number of triangles of all bodies."""
+        return sum(len(triangles) for _, triangles in self.bodies)
+
+
+def choose_tolerance(clearance: float) -> float:
+    """Return the deviation that decimation aims at [m]: a tenth of the clearance [m], within bounds."""
+    if not np.isfinite(clearance):
+        return NO_CLEARANCE_TOLERANCE
+    return float(np.clip(0.1 * clearance, MIN_TOLERANCE, MAX_TOLERANCE))
+
+
+def decimate(part: Part, tolerance: float) -> tuple[Part, float]:
+    """Return a part with fewer triangles and its deviation [m], at most `EARLY` of the `tolerance` [m]."""
+    simpler = [simplify(solid, 1e3 * EARLY * tolerance) for solid in make_solids(part)]
+    bodies = tuple(to_arrays(solid) for solid, _ in simpler)
+    return Part(part.path, bodies, part.repair), 1e-3 * max(deviation for _, deviation in simpler)
+
+
+def prepare_surfaces(
+    plug: Part, socket: Part, motion: InsertionMotion, tolerance: float, moved: float, snapping: frozenset[int]
+) -> tuple[ContactSurface, ContactSurface]:
+    """Return the contact surfaces of both parts.
+
+    Args:
+        plug: Plug at its target, in the target frame, decimated by `decimate`.
+        socket: Socket, likewise.
+        motion: Motion of the plug.
+        tolerance: Largest deviation of the result from the drawing [m].
+        moved: Deviation of the given parts from the drawing [m].
+        snapping: Indices of bodies of the plug that deflect; they are neither united nor cropped.
+    """
+    plug_solids, socket_solids = make_solids(plug), make_solids(socket)
+    rigid = _unite([solid for number, solid in enumerate(plug_solids) if number not in snapping])
+    fixed = _unite(socket_solids)
+    radius = float(np.hypot(*plug.corners[:, :2].T).max())
+    margin = 1e3 * (MARGIN + MAX_YAW * radius)
+    left = 1e3 * (tolerance - moved)
+    surfaces = []
+    for part, whole, other, extra in (
+        (plug, rigid, fixed, [plug_solids[number] for number in sorted(snapping)]),
+        (socket, fixed, rigid, []),
+    ):
+        lean = whole
+        if not snapping:  # a deflected body touches what a rigid one would not
+            cropped = crop_to_contact(whole, other, margin, motion.turn, is_plug=part is plug)
+            # Cropping adds edges, too: the leaner one is used.
+            lean = min(whole, cropped, key=lambda solid: count_simplified(solid, _LATE * left))
+        bodies = [_reduce(one, left) for one in lean.decompose()] + [simplify(one, left) for one in extra]
+        surfaces.append(
+            ContactSurface(
+                bodies=tuple(to_arrays(solid) for solid, _ in bodies),
+                snapping=len(extra),
+                visual=_join([to_arrays(solid) for solid in (whole, *extra)]),
+                deviation=moved + 1e-3 * max(deviation for _, deviation in bodies),
+                volume=1e-9 * sum(solid.volume() for solid in (whole, *extra)),
+            )
+        )
+    return surfaces[0], surfaces[1]
+
+
+def _unite(solids: Sequence[Any]) -> Any:
+    manifold3d = require_module("manifold3d")
+    return solids[0] if len(solids) == 1 else manifold3d.Manifold.batch_boolean(list(solids), manifold3d.OpType.Add)
+
+
+def _reduce(solid: Any, tolerance: float) -> tuple[Any, float]:
+    """Return a solid with few triangles, its hull if that is near, and the deviation [mm]."""
+    simpler, moved = simplify(solid, tolerance, _LATE)
+    hull, filled = as_hull_if_near(simpler, tolerance - moved)
+    return hull, moved + filled
+
+
+def _join(surfaces: Sequence[Arrays]) -> Arrays:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
+    triangles = [t + start for (_, t), start in zip(surfaces, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(triangles)
+
+
+def join_bodies(surface: ContactSurface) -> Arrays:
+    """Return vertices (V, 3) [m] and triangles (T, 3) of all bodies of a surface."""
+    return _join(surface.bodies)
+
+
+def make_compliant(
+    kind: str, surfaces: dict[str, ContactSurface], tolerance: float, say: Callable[[str], None]
+) -> Iterator[tuple[str, list[Piece]]]:
+    """Yield the compliant geometries to try: name of the part and its pieces, the leaner part first.
+
+    Args:
+        kind: One of `KINDS`.
+        surfaces: Surfaces by name; only these parts may be compliant.
+        tolerance: Largest deviation [m].
+        say: Called with a sentence on each part that does not decompose or that Drake refuses.
+    """
+    order = sorted(surfaces, key=lambda name: surfaces[name].num_triangles)
+    failure, make, seconds = {
+        "convex": ("too intricate for convex pieces", _cut_bodies, CUT_SECONDS),
+        "tetrahedra": ("no tetrahedra", _mesh_bodies, TETRAHEDRA_SECONDS),
+    }[kind]
+    for name in order:
+        try:
+            pieces = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
+        except IsolatedError as error:
+            say(f"{name}: {failure} ({error})")
+            continue
+        accepted = None if pieces is None else accepted_pieces(pieces)
+        if accepted is None:
+            say(f"{name}: {failure if pieces is None else 'Drake refuses a piece'}")
+            continue
+        yield name, accepted
+
+
+def _cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
+    """Return convex pieces of all bodies; None if there are too many or they deviate."""
+    from guiderail.models.parts.solids import to_manifold
+
+    manifold3d = require_module("manifold3d")
+    pieces: list[Piece] = []
+    for number, arrays in enumerate(surface.bodies):
+        solid = to_manifold(*arrays)
+        cut = cut_into_convex_pieces(solid)
+        if cut is None:
+            return None
+        joint = manifold3d.Manifold.batch_boolean(cut, manifold3d.OpType.Add)
+        added = to_arrays(joint - solid)[0]  # the other way round, seams between pieces would count
+        if len(added) and float(SurfaceLocator(*arrays).find_nearest(added)[1].max()) > 2.0 * tolerance:
+            return None
+        pieces += [
+            Piece(number, ".obj", *to_arrays(one)) for one in cut if 2.0 * one.volume() > _THINNEST * one.surface_area()
+        ]
+    return pieces
+
+
+def _mesh_bodies(surface: ContactSurface, tolerance: float) -> list[Piece]:
+    """Return tetrahedra of each body."""
+    pieces = []
+    for number, arrays in enumerate(surface.bodies):
+        points, cells = tetrahedralize(*arrays, 2.0 * tolerance)
+        if measure_deviation(boundary_of(points, cells), arrays) > 4.0 * tolerance:
+            raise ValueError("their boundary deviates from the part")
+        pieces.append(Piece(number, ".vtk", *add_interior_points(points, cells)))
+    return pieces

@@ -1,0 +1,158 @@
+"""Closed solids from meshes as CAD programs export them: slivers, open seams, doubled faces, cavities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.parts.solids import require_module, to_arrays, to_manifold
+from guiderail.models.parts.surface_distance import measure_distance
+from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
+
+MAX_MOVED = 1e-4  # largest distance by which a repair may move a surface, beyond which it closes a real hole [m]
+_ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
+_CPU_SECONDS = 30
+_NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
+
+
+@dataclass(frozen=True)
+class Repair:
+    """Changes of a mesh that made it a solid.
+
+    Attributes:
+        closed_edges: Number of edges that did not join exactly two triangles.
+        moved: Largest distance of the new surface from the old one [m].
+        cavities: Number of filled closed cavities.
+        inverted: Number of bodies whose faces pointed inwards.
+    """
+
+    closed_edges: int = 0
+    moved: float = 0.0
+    cavities: int = 0
+    inverted: int = 0
+
+    def __str__(self) -> str:
+        changes = []
+        if self.closed_edges:
+            changes.append(f"closed {self.closed_edges} edges")
+        if self.cavities:
+            changes.append(f"filled {self.cavities} closed {'cavity' if self.cavities == 1 else 'cavities'}")
+        if self.inverted:
+            changes.append(f"turned {self.inverted} {'body' if self.inverted == 1 else 'bodies'} right side out")
+        if self.closed_edges:
+            changes.append(f"surface moved by at most {1e3 * self.moved:.4f} mm")
+        return "; ".join(changes)
+
+
+def close_surface(
+    name: str, vertices: np.ndarray, triangles: np.ndarray
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], Repair]:
+    """Return the bodies of a mesh as closed surfaces with outward faces, and what was repaired.
+
+    Triangles of no area must not be removed before: they close T-junctions.
+
+    Args:
+        name: Name of the file, for error messages.
+        vertices: Vertices (V, 3) [m]; equal points are one vertex.
+        triangles: Triangles (T, 3).
+
+    Raises:
+        InputError: If the mesh cannot be closed, or only by moving its surface by more than `MAX_MOVED`.
+    """
+    open_edges, where = find_open_edges(vertices, triangles)
+    solid = to_manifold(vertices, triangles)
+    closed = _is_solid(solid)
+    if not closed:
+        solid = _without_doubled_faces(vertices, triangles)
+    if not _is_solid(solid):
+        solid = _wrap(name, vertices, triangles, open_edges, where)
+    moved = 0.0
+    if open_edges or not closed:
+        moved = measure_distance(to_arrays(solid), (vertices, triangles))
+        if moved > MAX_MOVED:
+            raise InputError(
+                f"{name} has a hole around {np.round(where, 4).tolist()} ({open_edges} open edges), which a repair "
+                f"would close by moving the surface by {1e3 * moved:.2g} mm: close it in the CAD model, and export it "
+                "again"
+            )
+    bodies, cavities, inverted = _outward_bodies(solid)
+    if not bodies:
+        raise InputError(f"{name} encloses no volume: export the part as a solid")
+    changed = open_edges if open_edges or closed else 1
+    return bodies, Repair(changed, moved, cavities, inverted)
+
+
+def find_open_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the number of edges without exactly one opposite, and their center (3,) [m]."""
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    keys, inverse = np.unique(low * len(vertices) + high, return_inverse=True)
+    signs = np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    uses = np.bincount(inverse, minlength=len(keys))
+    balance = np.bincount(inverse, weights=signs, minlength=len(keys))
+    open_ = (balance != 0) | (uses % 2 != 0)
+    corners = np.column_stack([keys // len(vertices), keys % len(vertices)])[open_]
+    return int(open_.sum()), vertices[corners].reshape(-1, 3).mean(axis=0) if len(corners) else np.zeros(3)
+
+
+def _is_solid(solid: Any) -> bool:
+    return bool(solid.status() == require_module("manifold3d").Error.NoError and not solid.is_empty())
+
+
+def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
+    """Return the solid of a mesh without doubled faces and with consistent normals; it may be empty."""
+    trimesh = require_module("trimesh")
+    mesh = trimesh.Trimesh(vertices, triangles, process=False)
+    mesh.merge_vertices(digits_vertex=8)
+    mesh.update_faces(mesh.unique_faces())
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+    return to_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def _wrap(name: str, vertices: np.ndarray, triangles: np.ndarray, open_edges: int, where: np.ndarray) -> Any:
+    """Return the solid of any triangles, crossing ones included: the boundary of their tetrahedral mesh."""
+    if find_spec("pytetwild") is None or find_spec("pyvista") is None:
+        raise InputError(
+            f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}): close it in the "
+            "CAD model, and export it again, or pip install 'guiderail[repair]', which closes small gaps"
+        )
+    try:
+        points, tetrahedra = run_isolated(tetrahedralize, vertices, triangles, _ENVELOPE, cpu_seconds=_CPU_SECONDS)
+        solid = to_manifold(*boundary_of(points, tetrahedra))
+    except (IsolatedError, ValueError) as error:
+        raise InputError(
+            f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}), and the repair "
+            f"failed ({error}): close it in the CAD model, and export it again"
+        ) from error
+    if not _is_solid(solid):
+        raise InputError(
+            f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}), and its repair "
+            "still has open edges: close it in the CAD model, and export it again"
+        )
+    return solid
+
+
+def _outward_bodies(solid: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, int]:
+    """Return the bodies of a solid with outward faces, and the numbers of cavities and of inverted bodies."""
+    parts = solid.decompose()
+    largest = max(abs(part.volume()) for part in parts)
+    parts = [part for part in parts if abs(part.volume()) > _NEGLIGIBLE * largest]
+    outer = [np.array(part.bounding_box()) for part in parts if part.volume() > 0.0]
+    bodies, cavities, inverted = [], 0, 0
+    for part in parts:
+        vertices, triangles = to_arrays(part)
+        if part.volume() < 0.0:
+            box = np.array(part.bounding_box())
+            if any((one[:3] < box[:3]).all() and (box[3:] < one[3:]).all() for one in outer):
+                cavities += 1
+                continue
+            triangles, inverted = triangles[:, ::-1], inverted + 1
+        bodies.append((vertices, triangles))
+    return bodies, cavities, inverted

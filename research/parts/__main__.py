@@ -1,0 +1,95 @@
+"""Command line of the benchmark of parts."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from guiderail.models.common.errors import InputError
+from research.command import Parser, print_result, run_program
+from research.parts.campaign import finish, learn, prepare
+from research.parts.pairs import Pair, find_pairs
+from research.parts.table import summarize, write_tables
+
+DIFFICULTIES = ("standard", "hard", "automate")
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program."""
+    parser = Parser(
+        "parts",
+        "Create a task of every pair of meshes below a folder, insert it aligned, and with --learn train and evaluate "
+        "a policy. Each finished step is stored, and the same command resumes.",
+        "--meshes assets --out parts --processes 2 --learn hard",
+    )
+    parser.add_argument("--meshes", type=Path, required=True, help="folder with the meshes; nothing is written to it")
+    parser.add_out("parts_benchmark")
+    parser.add_argument("--unit", default="m", help="unit of the meshes (default: m)")
+    parser.add_argument("--pairs", help="names of pairs, separated by commas (default: all)")
+    parser.add_argument("--every", type=int, default=1, help="only every so many pairs of those prepared are learned")
+    parser.add_argument("--learn", help=f"difficulties that are learned, of {', '.join(DIFFICULTIES)}; with commas")
+    parser.add_argument("--calibrate", action="store_true", help="measure difficulty=hard for each part")
+    parser.add_argument("--episodes", type=int, default=150, help="training episodes (default: 150)")
+    parser.add_argument("--held-out", type=int, default=100, help="evaluated episodes (default: 100)")
+    parser.add_argument("--seeds", type=int, default=1, help="seeds of the training (default: 1)")
+    parser.add_argument("--cpu", type=float, default=120.0, help="CPU time of a preparation [s] (default: 120)")
+    parser.add_argument("--timeout", type=float, default=900.0, help="wall time of one command [s] (default: 900)")
+    parser.add_argument("--processes", type=int, default=1, help="pairs at a time (default: 1)")
+    parser.add_json()
+    given = parser.parse_args(arguments)
+    difficulties = given.learn.split(",") if given.learn else []
+    for name in difficulties:
+        if name not in DIFFICULTIES:
+            raise InputError(f"--learn takes {', '.join(DIFFICULTIES)}, not {name!r}")
+    pairs = find_pairs(given.meshes, given.unit)
+    if given.pairs:
+        wanted = given.pairs.split(",")
+        missing = sorted(set(wanted) - {pair.name for pair in pairs})
+        if missing:
+            raise InputError(f"{given.meshes} has no pair {missing[0]!r}")
+        pairs = [pair for pair in pairs if pair.name in wanted]
+    out = given.out.resolve()
+    for folder in ("tasks", "runs", "logs", "steps"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    options = ("--calibrate",) if given.calibrate else ()
+    rows: dict[str, dict[str, Any]] = {}
+
+    def prepare_pair(pair: Pair) -> None:
+        rows[pair.name] = finish(out / "steps" / f"{pair.name}.json", lambda: prepare(pair, out, given.cpu))
+        row = rows[pair.name]
+        print(f"{pair.name}: {row.get('error') or row['real_time_factor']}", file=sys.stderr, flush=True)
+
+    def learn_pair(pair: Pair) -> None:
+        shrink = rows[pair.name]["shrink_mm"]
+        for difficulty in difficulties:
+            for seed in range(given.seeds):
+                found = finish(
+                    out / "steps" / f"{pair.name}-{difficulty}-{seed}.json",
+                    lambda d=difficulty, s=seed: learn(  # type: ignore[misc]
+                        pair,
+                        out,
+                        d,
+                        s,
+                        given.episodes,
+                        given.held_out,
+                        given.timeout,
+                        shrink,
+                        options,
+                    ),
+                )
+                rows[pair.name] = {**rows[pair.name], f"{difficulty}-{seed}": found}
+                print(f"{pair.name} {difficulty}: {found.get('error') or found['success_rate']}", file=sys.stderr)
+        write_tables(out, rows)
+
+    with ThreadPoolExecutor(given.processes) as pool:
+        list(pool.map(prepare_pair, pairs))
+        write_tables(out, rows)
+        chosen = [pair for pair in pairs if "error" not in rows[pair.name]][:: given.every]
+        list(pool.map(learn_pair, chosen if difficulties else []))
+    print_result(summarize(rows), as_json=given.json)
+
+
+if __name__ == "__main__":
+    run_program(main)

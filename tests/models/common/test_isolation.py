@@ -1,0 +1,29 @@
+"""A function in a process of its own returns its result, or the reason for which it has none."""
+
+import os
+
+import pytest
+
+from guiderail.models.common.isolation import IsolatedError, run_isolated
+
+
+def fail():
+    raise ValueError("no volume")
+
+
+def spin():
+    while True:
+        pass
+
+
+def test_run_isolated_returns_the_result():
+    assert run_isolated(lambda a, b: a + b, [1], [2], cpu_seconds=5) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [(fail, "ValueError: no volume"), (os.abort, "aborted"), (spin, "more than 1 s of CPU time")],
+)
+def test_run_isolated_gives_the_reason_when_a_function_fails(function, words):
+    with pytest.raises(IsolatedError, match=words):
+        run_isolated(function, cpu_seconds=1)

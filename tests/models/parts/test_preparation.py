@@ -1,0 +1,79 @@
+"""Contact geometry deviates from the drawing by no more than it says, and nothing that can touch is cropped."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.parts.assembly_check import make_solids, measure_side_clearance, plan_motion
+from guiderail.models.parts.drake_check import accepted_pieces
+from guiderail.models.parts.mesh_file import load_part
+from guiderail.models.parts.pieces import Piece
+from guiderail.models.parts.preparation import choose_tolerance, decimate, make_compliant, prepare_surfaces
+from guiderail.models.parts.simplification import crop_to_contact, simplify
+from guiderail.models.parts.solids import to_arrays
+from guiderail.models.parts.surface_distance import SurfaceLocator, measure_deviation
+
+pytest.importorskip("trimesh")
+pytest.importorskip("manifold3d")
+pytest.importorskip("igl")
+
+import manifold3d
+import trimesh
+
+from oracles.parts import PARTS
+
+
+def test_surface_locator_agrees_with_brute_force():
+    mesh = trimesh.creation.torus(2.0, 0.5)
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    nearest, distances, faces = SurfaceLocator(mesh.vertices, mesh.faces).find_nearest(points)
+    for point, near, distance, face in zip(points, nearest, distances, faces, strict=True):
+        every = trimesh.triangles.closest_point(mesh.triangles, np.tile(point, (len(mesh.faces), 1)))
+        assert distance == pytest.approx(np.linalg.norm(every - point, axis=1).min(), rel=1e-9)
+        np.testing.assert_allclose(near, every[face], atol=1e-9)
+
+
+@pytest.mark.parametrize("tolerance", [0.05, 0.01, 0.001])
+def test_simplify_deviates_by_no_more_than_the_tolerance(tolerance):
+    solid = manifold3d.Manifold.cylinder(20.0, 4.0, 4.0, 720)
+    simpler, deviation = simplify(solid, tolerance)
+    assert deviation <= tolerance
+    assert 1e3 * measure_deviation(to_arrays(solid), to_arrays(simpler), 10000) <= 1.2 * tolerance
+    if tolerance > 0.005:
+        assert simpler.num_tri() < 0.3 * solid.num_tri()
+
+
+def test_crop_keeps_the_hole_and_leaves_out_what_cannot_touch():
+    plate = manifold3d.Manifold.cube((200.0, 200.0, 20.0), True).translate((0, 0, -10.0))
+    socket = plate - manifold3d.Manifold.cylinder(20.0, 5.0, 5.0, 32).translate((0, 0, -15.0))
+    plug = manifold3d.Manifold.cylinder(300.0, 4.9, 4.9, 32).translate((0, 0, -15.0))
+    fixed = crop_to_contact(socket, plug, 4.0, 0.0, is_plug=False)
+    held = crop_to_contact(plug, socket, 4.0, 0.0, is_plug=True)
+    near = manifold3d.Manifold.cylinder(30.0, 8.5, 8.5, 64).translate((0, 0, -18.5))
+    assert ((socket ^ near) - fixed).volume() < 1e-6 * socket.volume()
+    assert fixed.volume() < 0.05 * socket.volume()
+    assert held.bounding_box()[5] < 40.0  # whole slabs
+
+
+@pytest.mark.parametrize("name", ["keyed_peg", "snap_fit"])
+def test_prepared_surfaces_report_their_deviation(name, tmp_path):
+    parts = [load_part(path, "mm") for path in PARTS[name]().write(tmp_path)]
+    motion, tolerance = plan_motion(*parts, 0.0), choose_tolerance(measure_side_clearance(*parts))
+    lean = [decimate(part, tolerance) for part in parts]
+    snapping = frozenset({1, 2}) if name == "snap_fit" else frozenset()
+    surfaces = prepare_surfaces(lean[0][0], lean[1][0], motion, tolerance, max(d for _, d in lean), snapping)
+    assert max(surface.deviation for surface in surfaces) <= tolerance * (1.0 + 1e-9)
+    assert surfaces[0].snapping == len(snapping)
+    for part, surface in zip(parts, surfaces, strict=True):
+        assert surface.volume == pytest.approx(1e-9 * sum(one.volume() for one in make_solids(part)), rel=1e-3)
+    for _, pieces in make_compliant("convex", {"plug": surfaces[0]}, tolerance, lambda line: None):
+        assert {piece.body for piece in pieces} == set(range(len(surfaces[0].bodies)))
+
+
+def test_pieces_that_abort_drake_are_left_out_or_refused():
+    cube, triangles = to_arrays(manifold3d.Manifold.cube((10.0, 10.0, 10.0)))
+    good, flat = Piece(0, ".obj", cube, triangles), Piece(0, ".obj", cube * [1.0, 1.0, 1e-9], triangles)
+    assert accepted_pieces([good]) == [good]
+    accepted = accepted_pieces([good, flat])
+    assert accepted is not None
+    assert accepted[0] is good
+    assert accepted_pieces([Piece(0, ".vtk", cube, np.array([[0, 1, 2, 2]]))]) is None

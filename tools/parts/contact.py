@@ -1,0 +1,265 @@
+"""Choice of a task's contact geometry and of its settings, from the measured depth of scripted insertions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.stations.station import PLANT_PERIOD
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.common.units import MM
+from guiderail.models.parts.mesh_file import obj_text
+from guiderail.models.parts.pieces import Piece, piece_text
+from guiderail.models.parts.preparation import KINDS, ContactSurface, join_bodies, make_compliant
+
+MODULUS = 2e9  # first modulus of the compliant part [Pa]
+MAX_MODULUS = 5e10
+SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
+PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded depth below the target; the first that seats the plug is used
+MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug
+MIN_SPEED = 2.0  # real-time factor below which less penetration does not count
+MAX_TRIALS = 5  # settings tried for each compliant part
+MIN_TIME_STEP = 0.0025  # [s]
+TRIAL_SECONDS = 20.0  # CPU time of the trials of a part from which no more are made [s]
+CHECK_SECONDS = 20  # CPU time in which Drake must have made the contact geometry [s]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact geometry and settings.
+
+    Attributes:
+        compliant: Name of the compliant part, "plug" or "socket".
+        pieces: Its pieces.
+        snapping: Indices of its bodies that snap.
+        modulus: Modulus of the bodies that do not snap [Pa].
+        snap_modulus: Modulus of the snapping bodies [Pa].
+        time_step: Time step of the simulation [s]; the default if None.
+    """
+
+    compliant: str
+    pieces: tuple[Piece, ...]
+    snapping: frozenset[int] = frozenset()
+    modulus: float = MODULUS
+    snap_modulus: float = MODULUS
+    time_step: float | None = None
+
+    @property
+    def files(self) -> list[tuple[str, float]]:
+        """File name and modulus [Pa] of each piece."""
+        return [
+            (
+                f"{self.compliant}_{number}{piece.suffix}",
+                self.snap_modulus if piece.body in self.snapping else self.modulus,
+            )
+            for number, piece in enumerate(self.pieces)
+        ]
+
+    @property
+    def snapping_pieces(self) -> frozenset[str]:
+        """Names of the snapping geometries."""
+        return frozenset(f"piece_{i}" for i, piece in enumerate(self.pieces) if piece.body in self.snapping)
+
+    def describe(self) -> str:
+        """Return the geometry and the settings as text."""
+        kind = "convex pieces" if all(piece.suffix == ".obj" for piece in self.pieces) else "tetrahedral meshes"
+        step = f", {1e3 * self.time_step:g} ms a step" if self.time_step else ""
+        return f"{self.compliant} compliant, {len(self.pieces)} {kind}, {self.modulus:.0e} Pa{step}"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Contact with its trials.
+
+    Attributes:
+        contact: Contact geometry and settings.
+        push: Commanded depth below the target [m].
+        aligned: Trial with the socket in place.
+        deepest: Largest penetration, also with the plug pushed on the rim [m].
+        speed: Smallest real-time factor of the trials.
+        misaligned: Trials at `MISALIGNMENTS`.
+        seconds: CPU time of cutting, meshing and checking geometry, before any trial [s].
+    """
+
+    contact: Contact
+    push: float
+    aligned: Any
+    deepest: float
+    speed: float
+    misaligned: tuple[Any, ...] = ()
+    seconds: float = 0.0
+
+
+MakeFile = Callable[[Contact, float], Any]
+"""Function that returns the task file for a contact and a push [m]."""
+
+
+def choose_contact(
+    folder: Path,
+    surfaces: dict[str, ContactSurface],
+    make_file: MakeFile,
+    tolerance: float,
+    clearance: float,
+    say: Callable[[str], None],
+) -> Choice:
+    """Return the best contact by `rank`; its files are in the folder.
+
+    Args:
+        folder: Folder of the task.
+        surfaces: Contact surfaces of plug and socket.
+        make_file: See `MakeFile`.
+        tolerance: Largest deviation of pieces [m].
+        clearance: Clearance between the walls [m].
+        say: Called with a sentence on each result.
+
+    Raises:
+        InputError: If no part can be made compliant, or Drake accepts none of the geometries.
+    """
+    allowed = 0.5 * clearance if np.isfinite(clearance) and clearance > 0.0 else 5e-5
+    snapping = surfaces["plug"].snapping
+    usable = {name: surface for name, surface in surfaces.items() if name == "plug" or not snapping}
+    choices: list[Choice] = []
+    reasons: list[str] = []
+
+    def report(reason: str) -> None:
+        reasons.append(reason)
+        say(reason)
+
+    seconds, start = 0.0, _cpu_time()
+    for kind in KINDS:
+        for name, pieces in make_compliant(kind, usable, tolerance, report):
+            number = len(surfaces[name].bodies)
+            snapped = frozenset(range(number - snapping, number)) if name == "plug" else frozenset()
+            contact = Contact(name, tuple(pieces), snapped)
+            refusal = _refusal_of_drake(folder, contact, surfaces, make_file)
+            seconds += _cpu_time() - start
+            if refusal:
+                report(f"{name}: Drake refuses its contact geometry ({refusal})")
+            else:
+                choices += _adapt_settings(folder, contact, surfaces, make_file, allowed, say)
+                if all(rank(max(choices, key=lambda one: rank(one, allowed)), allowed)[:3]):
+                    break
+            start = _cpu_time()
+        if any(choice.aligned.success for choice in choices):
+            break
+    if not choices:
+        raise InputError(
+            f"these parts can't be simulated ({'; '.join(reasons)}): remove details without contact, such as threads "
+            "and lettering, and export them again"
+        )
+    best = max(choices, key=lambda one: rank(one, allowed))
+    _write_pieces(folder, best.contact, surfaces)
+    return replace(best, seconds=seconds)
+
+
+def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
+    """Return a sort key, larger is better: the fastest without deep penetration, else the least penetration.
+
+    Args:
+        choice: Contact with its trials.
+        allowed: Largest allowed penetration [m]; a speed below `MIN_SPEED` counts more.
+    """
+    seats = bool(choice.aligned.success)
+    is_shallow = seats and choice.deepest <= allowed
+    return seats, is_shallow, choice.speed >= MIN_SPEED, choice.speed if is_shallow else -choice.deepest
+
+
+def _refusal_of_drake(
+    folder: Path, contact: Contact, surfaces: dict[str, ContactSurface], make_file: MakeFile
+) -> str | None:
+    """Return the reason for which Drake cannot use the geometry, or None; an abort ends only a child process."""
+    _write_pieces(folder, contact, surfaces)
+    try:
+        run_isolated(_make_station, folder, make_file(contact, PUSHES[0]), cpu_seconds=CHECK_SECONDS)
+    except IsolatedError as error:
+        return str(error)
+    return None
+
+
+def _make_station(folder: Path, file: Any) -> None:
+    from guiderail.diagrams.stations.gantry import GantryStation
+    from guiderail.diagrams.tasks.part.task import write_workcell
+
+    GantryStation(write_workcell(folder, file)).CreateDefaultContext()
+
+
+def _adapt_settings(
+    folder: Path,
+    contact: Contact,
+    surfaces: dict[str, ContactSurface],
+    make_file: MakeFile,
+    allowed: float,
+    say: Callable[[str], None],
+) -> list[Choice]:
+    """Return the choices tried, each with settings that follow from the depth measured in the one before.
+
+    Depth that remains while the plug is pushed needs a larger modulus. Depth that passes is the overshoot of a step,
+    which is proportional to the time step. The dissipation is that of `Piece`: less would eject the plug.
+    """
+    choices: list[Choice] = []
+    start = _cpu_time()
+    for _ in range(MAX_TRIALS):
+        choice = _try_contact(folder, contact, surfaces, make_file)
+        choices.append(choice)
+        trials = (choice.aligned, *choice.misaligned)
+        resting = max(trial.resting_penetration for trial in trials)
+        say(
+            f"{contact.describe()}: {'seats' if choice.aligned.success else 'does not seat'}, "
+            f"{choice.aligned.peak_force:.1f} N, penetration {1e3 * choice.deepest:.3f} mm, {choice.speed:.1f} × real "
+            "time"
+        )
+        if choice.aligned.success and choice.deepest <= allowed:
+            break
+        step = contact.time_step or PLANT_PERIOD
+        if choice.aligned.success and resting > 0.7 * allowed and contact.modulus < MAX_MODULUS:
+            factor = float(np.clip(2.0 * resting / allowed, 2.0, 10.0))
+            contact = replace(contact, modulus=min(contact.modulus * factor, MAX_MODULUS))
+        elif step > MIN_TIME_STEP and choice.speed > 2.0 * MIN_SPEED:
+            contact = replace(contact, time_step=0.5 * step)
+        else:
+            break
+        if _cpu_time() - start > TRIAL_SECONDS:
+            break
+    return choices
+
+
+def _cpu_time() -> float:
+    """Return the CPU time of this process and of its finished children [s]."""
+    return sum(os.times()[:4])
+
+
+def _try_contact(folder: Path, contact: Contact, surfaces: dict[str, ContactSurface], make_file: MakeFile) -> Choice:
+    """Return the trials over snap moduli and push depths with the first that seats the plug; else the last ones."""
+    from guiderail.tools.parts.trial import insert
+
+    for soft in SNAP_MODULI if contact.snapping else (contact.modulus,):
+        contact = replace(contact, snap_modulus=soft)
+        _write_pieces(folder, contact, surfaces)
+        for push in PUSHES if contact.snapping else PUSHES[:1]:
+            file = make_file(contact, push)
+            aligned = insert(folder, file, snapping=contact.snapping_pieces)
+            if aligned.success:
+                # Penetration is largest on the rim, where edges meet.
+                misaligned = tuple(
+                    insert(folder, file, offset=xy, snapping=contact.snapping_pieces) for xy in MISALIGNMENTS
+                )
+                trials = (aligned, *misaligned)
+                deepest = max(trial.penetration for trial in trials)
+                return Choice(contact, push, aligned, deepest, min(t.real_time_factor for t in trials), misaligned)
+    return Choice(contact, push, aligned, aligned.penetration, aligned.real_time_factor)
+
+
+def _write_pieces(folder: Path, contact: Contact, surfaces: dict[str, ContactSurface]) -> None:
+    for name in surfaces:
+        for old in [*folder.glob(f"{name}_*.obj"), *folder.glob(f"{name}_*.vtk")]:
+            old.unlink()
+        if name != contact.compliant:
+            (folder / f"{name}_surface.obj").write_text(obj_text(*join_bodies(surfaces[name])), encoding="utf-8")
+    for (file, _), piece in zip(contact.files, contact.pieces, strict=True):
+        (folder / file).write_text(piece_text(piece), encoding="utf-8")
