@@ -5,15 +5,18 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 from guiderail.models.control.joint_status import Heartbeat, JointStatus
+from guiderail.models.control.motion_limits import MotionLimits
 from guiderail.models.robots.robot import Robot
 from guiderail.systems.torque_safety_limiter import SafetyLimits
 
@@ -102,6 +105,64 @@ class Driver(ABC):
     def __str__(self) -> str:
         """Return where the robot is listened to, for messages."""
         return self.url or self.name
+
+
+@dataclass(frozen=True)
+class RobotImpedance:
+    """Impedance at the tool center that a robot's own controller runs.
+
+    Attributes:
+        X_FlangeTool: Pose of the tool center on the flange.
+        stiffness: Stiffness in the axes of the robot's base, (6, 6) [N/m, Nm/rad], force first.
+        damping: Damping, likewise (6, 6) [Ns/m, Nms/rad].
+        max_wrench: Largest magnitude of each component of the impedance's wrench in the axes of the base,
+            (6,) [N, Nm].
+        posture: Joint positions that the nullspace is drawn to, (n,) [rad].
+        mass: Mass of tool and workpiece [kg].
+        center_of_mass: Their center of mass in the flange's frame, (3,) [m].
+        inertia: Their inertia about the center of mass in the flange's axes, (3, 3) [kg m²].
+    """
+
+    X_FlangeTool: RigidTransform
+    stiffness: np.ndarray
+    damping: np.ndarray
+    max_wrench: np.ndarray
+    posture: np.ndarray
+    mass: float
+    center_of_mass: np.ndarray
+    inertia: np.ndarray
+
+
+class PoseDriver(Driver):
+    """Connection to a robot whose own program runs the impedance controller and follows desired poses.
+
+    A driver implements `read`, `configure`, `write_pose`, `stop` and `recover`.
+
+    Attributes:
+        motion_limits: Limits of the desired poses that the robot accepts.
+    """
+
+    motion_limits: ClassVar[MotionLimits]
+
+    @abstractmethod
+    def configure(self, impedance: RobotImpedance) -> None:
+        """Set the impedance, tool and payload before the first pose."""
+
+    @abstractmethod
+    def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
+        """Send the desired pose of the tool center in the robot's base frame; `time` is the time of the command [s]."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Bring the arm to rest by the robot's own means; repeated calls have no effect."""
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Clear the robot's error, after the user has confirmed."""
+
+    def write(self, torque: np.ndarray, time: float) -> None:
+        """Raise an error, because the robot accepts poses."""
+        raise InputError(f"the driver {self.name} accepts poses, not torques")
 
 
 DRIVERS: Registry[type[Driver]] = Registry(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +102,31 @@ def mujoco_model(
     for surface in fixture:
         _add_surface(mujoco, spec, fixture_body, surface, {"contype": 0, "conaffinity": masks[surface.pair]}, contact)
     return spec.compile()
+
+
+def mujoco_parts(
+    fixture: list[Surface], workpiece: list[Surface], contact: MujocoContact
+) -> tuple[ET.Element, ET.Element, list[ET.Element]]:
+    """Return MJCF elements of fixture and workpiece for another model, and the assets that they need.
+
+    Their contact masks leave the first bit, MuJoCo's default, to the other model.
+    """
+    mujoco = mujoco_engine()
+    pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
+    masks = {pair: 2 << bit for bit, pair in enumerate(pairs)}
+    spec = mujoco.MjSpec()
+    spec.option.timestep = contact.time_step
+    for name, surfaces, side in ((FIXTURE, fixture, "conaffinity"), (WORKPIECE, workpiece, "contype")):
+        body = spec.worldbody.add_body(
+            name=name, mass=1e-3, inertia=[1e-7] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
+        )
+        for surface in surfaces:
+            bits = {"contype": 0, "conaffinity": 0} | {side: masks[surface.pair]}
+            _add_surface(mujoco, spec, body, surface, bits, contact)
+    spec.compile()
+    root = ET.fromstring(spec.to_xml())
+    bodies = {body.get("name"): body for body in root.iter("body")}
+    return bodies[FIXTURE], bodies[WORKPIECE], list(root.findall("asset/*"))
 
 
 def _add_gantry(mujoco: Any, spec: Any, tool: Any, impedance: Impedance) -> None:

@@ -1,0 +1,1 @@
+"""Drivers of robots that speak the Franka Control Interface."""

@@ -1,0 +1,155 @@
+"""Driver on the Franka Control Interface: Cartesian impedance in a compiled loop at 1 kHz, desired poses from here.
+
+The client is franky 2 (MIT license). It runs libfranka's loop in a thread without Python's lock, has a Cartesian
+impedance that follows references of any rate with bounded errors, forces and torque rates, and ends a torque motion by
+damping. pylibfranka, Franka's own binding, would leave the loop at 1 kHz to Python.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.hardware.driver import PoseDriver, RobotImpedance, register_driver
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import JointStatus
+from guiderail.models.control.motion_limits import FRANKA_LIMITS
+
+DYNAMICS_SHARE = 0.2  # share of the robot's motion limits that commands may use
+MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
+POSTURE_STIFFNESS = 5.0  # stiffness of the nullspace's posture [Nm/rad]
+STOP_TIME = 0.5  # longest duration of a stop by damping [s]
+FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold as a multiple of the bounded force
+TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # of external joint torques [Nm]; libfranka's examples
+
+
+@register_driver("fci")
+class FciDriver(PoseDriver):
+    """Franka Emika Panda or FR3 on the Franka Control Interface.
+
+    The external torque of the interface is that of the arm on its surroundings. After a reflex the status is malformed
+    until `recover` has cleared the error, so the station stops.
+    """
+
+    name = "panda"
+    torque_reflex_limits = TORQUE_THRESHOLD
+    has_command_timeout = False
+    hold_off = 0.0
+    motion_limits = FRANKA_LIMITS.scaled(DYNAMICS_SHARE)
+
+    def __init__(self, url: str = "", *, client: Any = None):
+        """Connect to the robot.
+
+        Args:
+            url: Host name or address of the robot.
+            client: Module franky, or a double of it.
+
+        Raises:
+            InputError: If franky is not installed, no host is named, or the robot does not answer.
+        """
+        super().__init__(url)
+        self._franky = franky = client or _import_franky()
+        if not url:
+            raise InputError("the driver fci needs the robot's host: give --robot-url")
+        try:
+            self._robot = franky.Robot(url, realtime_config=franky.RealtimeConfig.Ignore)
+        except Exception as error:  # the client raises exceptions of its own, without a common base class
+            raise InputError(f"no robot answers at {url}: {error}") from None
+        self._motion: Any = None
+        self._impedance: RobotImpedance | None = None
+
+    def configure(self, impedance: RobotImpedance) -> None:
+        """Set tool center, payload and collision thresholds, and the impedance of the next motion.
+
+        Raises:
+            InputError: If the robot refuses them.
+        """
+        robot = self._robot
+        X_NP = RigidTransform(_matrix(robot.state.F_T_NE)).InvertAndCompose(impedance.X_FlangeTool)
+        force = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3]))
+        torque = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[3:]))
+        try:
+            robot.set_ee(_flat(X_NP))
+            robot.set_load(impedance.mass, impedance.center_of_mass.tolist(), impedance.inertia.ravel("F").tolist())
+            robot.set_collision_behavior(list(TORQUE_THRESHOLD), [force] * 3 + [torque] * 3)
+        except Exception as error:
+            raise InputError(f"the robot at {self.url} refuses its configuration: {error}") from None
+        self._impedance = impedance
+
+    def read(self) -> JointStatus | None:
+        """Return the newest status."""
+        if self.error:
+            return JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
+        state = self._robot.state
+        q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
+        return JointStatus(state.time.to_sec(), q, v, -external)
+
+    @property
+    def error(self) -> str:
+        """Reason of a reflex of the robot, empty if there is none."""
+        return str(self._robot.state.current_errors) if self._robot.has_errors else ""
+
+    def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
+        """Make the impedance follow a pose of the tool center in the robot's base frame."""
+        del time
+        franky, impedance = self._franky, self._impedance
+        if impedance is None:
+            raise InputError("the driver fci is used before it is configured")
+        reference = franky.CartesianReference(target=franky.Affine(X_BaseTool.GetAsMatrix4()))
+        if self._motion is None:
+            self._motion = self._make_motion(impedance)
+            self._motion.set_reference(reference)
+            self._robot.move(self._motion, asynchronous=True)
+        else:
+            self._motion.set_reference(reference)
+
+    def _make_motion(self, impedance: RobotImpedance) -> Any:
+        franky = self._franky
+        limits = impedance.max_wrench
+        motion = franky.CartesianImpedanceTrackingMotion(
+            # A bounded error bounds the spring's wrench; the bound of the force includes damping.
+            translational_error_clip=limits[:3] / np.diag(impedance.stiffness)[:3],
+            rotational_error_clip=limits[3:] / np.diag(impedance.stiffness)[3:],
+            force_constraints=limits.tolist(),
+            max_delta_tau=MAX_TORQUE_STEP,
+            posture_task=franky.PostureTask(impedance.posture, POSTURE_STIFFNESS),
+        )
+        gains = franky.CartesianImpedanceGains()
+        gains.stiffness, gains.damping = impedance.stiffness, impedance.damping
+        motion.set_gains(gains)
+        return motion
+
+    def stop(self) -> None:
+        """Damp the arm to rest by the robot's own loop; the brakes hold it afterwards."""
+        if self._motion is not None:
+            self._motion = None
+            self._robot.move(self._franky.TorqueStopMotion(max_duration=STOP_TIME), asynchronous=True)
+
+    def recover(self) -> None:
+        """Clear the error of a reflex; the arm does not move.
+
+        Raises:
+            InputError: If the error persists.
+        """
+        self._motion = None
+        if not self._robot.recover_from_errors():
+            raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
+
+
+def _import_franky() -> Any:
+    try:
+        return importlib.import_module("franky")
+    except ImportError:
+        raise InputError('the driver fci needs franky: pip install "guiderail[fci]"') from None
+
+
+def _matrix(column_major: Any) -> np.ndarray:
+    """Return the matrix (4, 4) of a transformation in a state, which is an Affine or 16 numbers by column."""
+    return np.array(getattr(column_major, "matrix", None) or np.reshape(column_major, (4, 4), order="F"), dtype=float)
+
+
+def _flat(X: RigidTransform) -> list[float]:
+    return X.GetAsMatrix4().ravel(order="F").tolist()

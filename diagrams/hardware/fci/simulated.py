@@ -1,0 +1,129 @@
+"""Rehearsal robot: the protocol's simulator franky-sim with a task's tool, workpiece and fixture in its world.
+
+franky-sim simulates an FR3 in MuJoCo and answers libfranka's network protocol. It estimates no external wrench and does
+not check commands for discontinuities or collisions. The first is added here from the simulated contact; the second is
+tested where commands are made (`PoseMotionLimiter`).
+"""
+
+from __future__ import annotations
+
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from franky_sim import SimulationServer
+from franky_sim.mujoco_simulator import FrankaMujocoRobot, MujocoSimulator
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.stations.arm import ArmControllerPlant
+from guiderail.diagrams.stations.mujoco import MujocoContact, mujoco_parts
+from guiderail.diagrams.stations.workcell import ConvexWorkcell, MovableWorkcell
+
+ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # names in the simulator's model; flange from the seventh link [m]
+FILTER_TIME = 0.005  # time constant of the external torque's low-pass filter [s]
+
+
+class RehearsalRobot(FrankaMujocoRobot):
+    """Robot that reports the external torques of the simulated contact.
+
+    Args:
+        positions: Initial joint positions (7,) [rad].
+    """
+
+    def __init__(self, positions: Sequence[float]):
+        super().__init__(initial_q=positions)
+        self._external = np.zeros(7)
+
+    def _post_step(self) -> None:
+        # Joint limits and friction are constraints too, but a task reaches none of them.
+        contact = self._data.qfrc_constraint[self._dof_addrs]
+        self._external += 0.001 / FILTER_TIME * (contact - self._external)
+        super()._post_step()
+
+    @property
+    def state(self) -> Any:
+        """State message, with the external torque of the arm on its surroundings."""
+        state = super().state
+        return state.replace(tau_ext_hat_filtered=tuple(-self._external))
+
+
+class RehearsalSimulator(MujocoSimulator):
+    """Simulated FR3 with a task's parts: the workpiece on the flange, and the fixture in the world."""
+
+    def __init__(self, workcell: MovableWorkcell, fixture_offset: RigidTransform = RigidTransform()):  # noqa: B008
+        """Construct the simulator.
+
+        Args:
+            workcell: Workcell of the task, described by convex solids as well.
+            fixture_offset: Pose of the actual target in the nominal target.
+        """
+        super().__init__()
+        assert isinstance(workcell, ConvexWorkcell)
+        self.model_of_arm = ArmControllerPlant(workcell, "panda")
+        plant = self.model_of_arm.plant
+        context = plant.CreateDefaultContext()
+        X_FlangeTool = self.model_of_arm.arm.tool_center.CalcPose(context, plant.GetFrameByName("panda_flange"))
+        X_WFixture = workcell.X_WT @ fixture_offset @ workcell.X_FT.inverse()
+        fixture, workpiece, assets = mujoco_parts(
+            workcell.fixture_surfaces(), workcell.workpiece_surfaces(), MujocoContact()
+        )
+        self._parts = ((fixture, X_WFixture), (workpiece, RigidTransform([0, 0, FLANGE_HEIGHT]) @ X_FlangeTool))
+        self._assets = assets
+        self._arm: RehearsalRobot | None = None
+
+    def add_arm(self, pose: np.ndarray) -> RehearsalRobot:
+        """Add the robot with its tool center at a pose (6,) in the target frame, and the task's parts."""
+        positions = self.model_of_arm.solve(pose, self.model_of_arm.posture)
+        self.add_robot(initial_q=tuple(positions))
+        self._arm = self._robots[0] = RehearsalRobot(positions)
+        root = self.scene
+        option = root.find("option")
+        assert option is not None
+        option.attrib.update(cone="elliptic", impratio="10", ccd_tolerance="1e-9", ccd_iterations="100")
+        asset = root.find("asset")
+        assert asset is not None
+        asset.extend(self._assets)
+        last = next(body for body in self.worldbody.iter("body") if body.get("name") == ROBOT + "fr3_link7")
+        for (element, X), parent in zip(self._parts, (self.worldbody, last), strict=True):
+            element.set("pos", " ".join(map(str, X.translation())))
+            element.set("quat", " ".join(map(str, X.rotation().ToQuaternion().wxyz())))
+            parent.append(element)
+        # The tool takes the place of the hand, which the simulator needs for its gripper.
+        for body in last.iter("body"):
+            if body.get("name", "").startswith((ROBOT + "hand", ROBOT + "left", ROBOT + "right")):
+                for geometry in body.findall("geom"):
+                    geometry.attrib.update(contype="0", conaffinity="0")
+        return self._arm
+
+
+def serve(
+    simulator: RehearsalSimulator,
+    pose: np.ndarray,
+    seconds: float,
+    host: str = "127.0.0.1",
+    on_ready: Callable[[str], None] = print,
+) -> None:
+    """Simulate the robot and answer libfranka's protocol by the wall clock.
+
+    A machine that is too slow for 1 kHz slows the robot's clock down, as the simulator waits for nothing.
+
+    Args:
+        simulator: The simulator.
+        pose: Initial pose of the tool center, (6,).
+        seconds: Simulated time to run [s].
+        host: Address to listen at, of this machine.
+        on_ready: Function that is called with the address when clients can connect.
+    """
+    with simulator:
+        simulator.add_arm(pose)
+        with SimulationServer(simulator, [host]) as server:
+            on_ready(host)
+            start = time.monotonic()
+            for step in range(1, round(1000 * seconds) + 1):
+                server.run_once(realtime=False)
+                time.sleep(max(0.0, start + 0.001 * step - time.monotonic()))
+                start = max(start, time.monotonic() - 0.001 * step)  # no haste after a delay
+

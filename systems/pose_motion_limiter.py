@@ -1,0 +1,117 @@
+"""Limiter of velocity, acceleration and jerk of a desired pose."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from ruckig import InputParameter, Result, Ruckig, Trajectory
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.control.motion_limits import MotionLimits
+from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+
+POSE_AXES = [5, 4, 3]  # indices of Rx, Ry, Rz in a pose, in the order of SciPy's extrinsic angles "xyz"
+
+
+class PoseMotionLimiter(LeafSystem):
+    """Follow a desired pose with limited velocity, acceleration and jerk, starting from the measured pose at rest.
+
+    While the blend factor is zero the output is the measured pose. When it becomes positive, the output starts there
+    and moves to the desired pose on the time-optimal trajectory within the limits (Berscheid and Kröger, "Jerk-limited
+    Real-time Trajectory Generation with Arbitrary Target States", RSS 2021), computed again in each period. The
+    orientation is a rotation vector from the orientation at the start (`MotionLimits.rotation_vector_limits`). Each
+    axis has a share of 1/√3 of the limit, so that the norms are within the limits. A desired pose that is not finite,
+    or that is half a turn or more from the start, is ignored: the output comes to rest at the last valid one.
+
+    .. pydrake_system::
+
+        name: PoseMotionLimiter
+        input_ports:
+        - desired_pose
+        - pose
+        - blend_factor
+        output_ports:
+        - limited_pose
+
+    ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians.
+    ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`.
+
+    Args:
+        limits: Limits of the motion.
+        period: Sampling period [s], positive.
+
+    Raises:
+        InputError: If the period is out of range.
+    """
+
+    def __init__(self, limits: MotionLimits, *, period: float):
+        super().__init__()
+        check_period(period)
+        self._period = period
+        per_axis = zip(limits.linear, limits.rotation_vector_limits(), strict=True)
+        self._limits = [np.repeat([linear, angular], 3) / np.sqrt(3.0) for linear, angular in per_axis]
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
+        self._pose_port = self.DeclareVectorInputPort("pose", 6)
+        self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
+        # [position and rotation vector; velocity; acceleration; last valid target; quaternion at the start]
+        self._state = self.DeclareDiscreteState(28)
+        self._next_state = declare_cache(
+            self,
+            "next_state",
+            self._calc_next_state,
+            prerequisites_of_calc={
+                self._desired_pose_port.ticket(),
+                self._pose_port.ticket(),
+                self._blend_factor_port.ticket(),
+                self.discrete_state_ticket(self._state),
+            },
+        )
+        self._limited_pose_port = self.DeclareVectorOutputPort(
+            "limited_pose", 6, self._calc_limited_pose, prerequisites_of_calc={self._next_state.ticket()}
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (6,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (6,)")
+    get_blend_factor_input_port = input_getter("blend_factor", "blend factor, (1,); 0 while the arm is not controlled")
+    get_limited_pose_output_port = output_getter("limited_pose", "pose within the limits of the motion, (6,)")
+
+    def _calc_next_state(self, context: Context) -> np.ndarray:
+        if self._blend_factor_port.Eval(context)[0] <= 0.0:
+            return _at_rest(self._pose_port.Eval(context))
+        state = context.get_discrete_state(self._state).value().copy()
+        start = Rotation.from_quat(state[24:])
+        desired = self._desired_pose_port.Eval(context)
+        if np.isfinite(desired).all():
+            turn = (start.inv() * Rotation.from_euler("xyz", desired[POSE_AXES])).as_rotvec()
+            # Half a turn away the rotation vector jumps to the opposite side.
+            if np.linalg.norm(turn) < 0.9 * np.pi:
+                state[18:24] = np.concatenate([desired[:3], turn])
+        wanted = InputParameter(6)
+        wanted.current_position, wanted.current_velocity, wanted.current_acceleration = state[:18].reshape(3, 6)
+        wanted.target_position = state[18:24]
+        wanted.max_velocity, wanted.max_acceleration, wanted.max_jerk = self._limits
+        trajectory = Trajectory(6)
+        # An instance that this system stored would be reported as leaked when the interpreter exits.
+        if Ruckig(6).calculate(wanted, trajectory) not in (Result.Working, Result.Finished):
+            raise RuntimeError("no trajectory within the limits of the motion")
+        state[:18] = np.concatenate(trajectory.at_time(self._period)[:3])
+        return state
+
+    def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
+        state = self._next_state.Eval(context)
+        angles = (Rotation.from_quat(state[24:]) * Rotation.from_rotvec(state[3:6])).as_euler("xyz")
+        output.SetFromVector(np.concatenate([state[:3], angles[::-1]]))
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(_at_rest(self._pose_port.Eval(context)))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(self._next_state.Eval(context))
+
+
+def _at_rest(pose: np.ndarray) -> np.ndarray:
+    """Return the state of a trajectory that rests at a pose (6,)."""
+    state = np.zeros(28)
+    state[:3] = state[18:21] = pose[:3]
+    state[24:] = Rotation.from_euler("xyz", pose[POSE_AXES]).as_quat()
+    return state

@@ -1,0 +1,102 @@
+"""Limiter of velocity, acceleration and jerk of a desired pose."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.control.motion_limits import FRANKA_LIMITS
+from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
+
+PERIOD = 0.005
+START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])
+LIMITS = FRANKA_LIMITS.scaled(0.2)
+
+
+class Loop:
+    """A limiter that is stepped with constant inputs."""
+
+    def __init__(self, limits=LIMITS, blend_factor=1.0):
+        self.system = PoseMotionLimiter(limits, period=PERIOD)
+        self.context = self.system.CreateDefaultContext()
+        self.set(START, blend_factor)
+        self.system.get_pose_input_port().FixValue(self.context, START)
+        self.simulator = Simulator(self.system, self.context)
+        self.simulator.Initialize()
+        self.steps = 0
+
+    def set(self, desired, blend_factor=1.0):
+        self.system.get_desired_pose_input_port().FixValue(self.context, desired)
+        self.system.get_blend_factor_input_port().FixValue(self.context, [blend_factor])
+
+    def run(self, steps):
+        poses = []
+        for _ in range(steps):
+            poses.append(self.system.get_limited_pose_output_port().Eval(self.context).copy())
+            self.steps += 1
+            self.simulator.AdvanceTo(self.steps * PERIOD)
+        return np.array(poses)
+
+
+def derivatives(poses):
+    """Return the largest norms of velocity, acceleration and jerk, linear and angular, by finite differences."""
+    turns = Rotation.from_euler("xyz", poses[:, [5, 4, 3]])
+    angular = (turns[1:] * turns[:-1].inv()).as_rotvec() / PERIOD
+    linear = np.diff(poses[:, :3], axis=0) / PERIOD
+    return [
+        [np.linalg.norm(np.diff(rate, order, axis=0), axis=1).max() / PERIOD**order for order in range(3)]
+        for rate in (linear, angular)
+    ]
+
+
+def assert_close(pose, expected, atol):
+    np.testing.assert_allclose(pose[:3], expected[:3], atol=atol)
+    turns = [Rotation.from_euler("xyz", one[[5, 4, 3]]) for one in (pose, expected)]
+    assert (turns[0] * turns[1].inv()).magnitude() < atol
+
+
+def test_motion_stays_within_the_limits_for_adversarial_commands():
+    loop, rng, poses = Loop(), np.random.default_rng(0), []
+    for k in range(2500):
+        if rng.random() < 0.1 or k % 500 < 50:
+            loop.set(START + rng.uniform(-1, 1, 6) * rng.choice([1e-4, 1e-2, 0.3, 2.0]))
+        poses.append(loop.run(1)[0])
+    for reached, limits in zip(derivatives(np.array(poses)), (LIMITS.linear, LIMITS.angular), strict=True):
+        assert (np.array(reached) <= np.array(limits) * (1 + 1e-9)).all()
+        assert reached[0] > 0.5 * limits[0]  # the limits are used
+
+
+def test_motion_reaches_the_desired_pose():
+    loop = Loop()
+    desired = START + [0.05, -0.03, 0.02, 0.2, -0.1, 0.1]
+    loop.set(desired)
+    assert_close(loop.run(400)[-1], desired, 1e-9)
+
+
+def test_motion_starts_at_the_measured_pose():
+    loop = Loop(blend_factor=0.0)
+    measured = START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
+    loop.system.get_pose_input_port().FixValue(loop.context, measured)
+    assert_close(loop.run(3)[-1], measured, 1e-12)
+    loop.set(START)
+    moved = loop.run(2)
+    assert_close(moved[0], measured, 1e-4)
+    assert derivatives(np.vstack([measured, measured, measured, moved]))[0][2] <= LIMITS.linear[2]
+
+
+@pytest.mark.parametrize(
+    "invalid", [np.full(6, np.nan), np.array([0.5, 0.0, np.inf, 0.3, 0.1, 3.0]), START + [0, 0, 0, np.pi, 0, 0]]
+)
+def test_last_valid_command_is_followed_when_one_is_invalid(invalid):
+    loop = Loop()
+    valid = START + [0.02, 0.0, 0.0, 0.0, 0.0, 0.0]
+    loop.set(valid)
+    loop.run(5)
+    loop.set(invalid)
+    assert_close(loop.run(200)[-1], valid, 1e-9)
+
+
+def test_orientation_stays_continuous_across_half_a_turn_of_an_angle():
+    loop = Loop()
+    loop.set(START + [0, 0, 0, 0, 0, 0.4])  # Rx passes π
+    assert derivatives(loop.run(300))[1][0] <= LIMITS.angular[0]
