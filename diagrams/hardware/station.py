@@ -13,7 +13,8 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.envs.options import Number, Options
-from guiderail.diagrams.hardware.driver import Driver, find_driver, safety_limits
+from guiderail.diagrams.hardware.driver import Driver, PoseDriver, find_driver, safety_limits
+from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_rate_limiter, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.impedance_control import add_controller
 from guiderail.diagrams.stations.registry import register_station
@@ -25,7 +26,6 @@ from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT, E
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
-from guiderail.systems.pose_rate_limiter import PoseRateLimiter
 from guiderail.systems.status_watchdog import StatusWatchdog
 from guiderail.systems.support.declarations import output_getter
 from guiderail.systems.torque_publisher import TorquePublisher
@@ -37,7 +37,8 @@ class HardwareOptions(Options):
 
     robot: str = Field(DEFAULT_ROBOT, description="which arm")
     end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
-    lcm_url: str = Field("", description="address of the robot's driver; LCM's own default where it is empty")
+    driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
+    robot_url: str = Field("", description="address of the robot: LCM's URL, or a host; default: LCM's own")
     robot_timeout: Number = Field(10.0, gt=0, description="how long to wait for the robot's first status [s]")
 
 
@@ -81,7 +82,7 @@ class HardwareStation(Station):
     def __init__(
         self,
         workcell: Workcell,
-        driver: Driver | None = None,
+        driver: Driver | str | None = None,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
         period: float | None = None,
         wrench_time_constant: float = 0.02,
@@ -89,7 +90,7 @@ class HardwareStation(Station):
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
         *,
         robot: Robot | str = DEFAULT_ROBOT,
-        lcm_url: str = "",
+        robot_url: str = "",
         limits: SafetyLimits | None = None,
         status_limits: StatusLimits | None = None,
     ):
@@ -97,14 +98,15 @@ class HardwareStation(Station):
 
         Args:
             workcell: Target frame and held workpiece; the fixture is real.
-            driver: Connection to the robot; the robot's registered driver, opened at `lcm_url`, by default.
+            driver: Connection to the robot, or the name of a driver that is opened at `robot_url`; by default the driver
+                with the robot's name.
             impedance: Impedance at the tool center.
             period: Period of a command [s]; the driver's by default.
             wrench_time_constant: Time constant of the wrench estimate's low-pass filter [s].
             robot_timeout: Longest time that `start` waits for the robot [s].
             end_effector: Tool on the flange, or its name; a gripper has a driver of its own, and stays open here.
             robot: The arm, or its name.
-            lcm_url: Address of the driver; LCM's default if empty.
+            robot_url: Address of the robot: LCM's URL, or a host; LCM's default if empty.
             limits: Limits of measurements and torques; `safety_limits` by default.
             status_limits: Limits of a status; by default they follow from the joints' velocities, the period and the
                 driver's hold-off.
@@ -115,7 +117,9 @@ class HardwareStation(Station):
         """
         super().__init__()
         robot = find_robot(robot)
-        self.driver = driver = find_driver(robot)(lcm_url) if driver is None else driver
+        if not isinstance(driver, Driver):
+            driver = find_driver(driver or robot)(robot_url)
+        self.driver = driver
         self.period = period = driver.period if period is None else period
         self.controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         plant = self.controller_plant.plant
@@ -153,10 +157,9 @@ class HardwareStation(Station):
             ),
         )
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period))
-        rate_limiter = builder.AddNamedSystem("rate_limiter", PoseRateLimiter(period=period))
+        rate_limiter = builder.AddNamedSystem("rate_limiter", make_rate_limiter(self.driver, period))
         controller, impedance_monitor = add_controller(builder, model, self.impedance, period, compensate_gravity=False)
         self._limiter = builder.AddNamedSystem("limiter", TorqueSafetyLimiter(model.plant, self.limits, period=period))
-        publisher = builder.AddNamedSystem("publisher", TorquePublisher(self.driver.write, n, period=period))
 
         status, heartbeat, limiter = self._status, self._heartbeat, self._limiter
         state, external_torque = status.get_estimated_state_output_port(), status.get_external_torque_output_port()
@@ -184,10 +187,15 @@ class HardwareStation(Station):
             (status.get_age_output_port(), limiter.get_status_age_input_port()),
             (status.get_is_new_output_port(), limiter.get_status_is_new_input_port()),
             (watchdog.get_command_timed_out_output_port(), limiter.get_command_timed_out_input_port()),
-            (limiter.get_safe_torque_output_port(), publisher.get_torque_input_port()),
-            (limiter.get_is_sending_output_port(), publisher.get_is_sending_input_port()),
         ):
             builder.Connect(source, target)
+        if isinstance(self.driver, PoseDriver):
+            limited_pose, arm_state = rate_limiter.get_limited_pose_output_port(), limiter.get_arm_state_output_port()
+            add_pose_publisher(builder, self.driver, model, limited_pose, arm_state, period)
+        else:
+            publisher = builder.AddNamedSystem("publisher", TorquePublisher(self.driver.write, n, period=period))
+            builder.Connect(limiter.get_safe_torque_output_port(), publisher.get_torque_input_port())
+            builder.Connect(limiter.get_is_sending_output_port(), publisher.get_is_sending_input_port())
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
@@ -226,6 +234,8 @@ class HardwareStation(Station):
             if (left := end - time.monotonic()) <= 0.0:
                 raise InputError(f"no robot answers on {self.driver}: start its driver, and check the address")
             self.driver.receive(left)
+        if isinstance(self.driver, PoseDriver):
+            self.driver.configure(make_robot_impedance(self.controller_plant, self.impedance))
         self.receive(simulator.get_mutable_context())
         simulator.Initialize()
 

@@ -126,7 +126,7 @@ def test_robot_page_has_the_limits_of_the_code():
     page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("\n## Limits\n")[2].partition("\n## ")[0]
     rows = {row[0]: row[1] for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.MULTILINE)}
     effects = dict(re.findall(r"^\| ([^|]+) \| [^|]+ \| ([^|]+) \|$", page, re.MULTILINE))
-    station = HardwareStation(BncWorkcell(), lcm_url="memq://")
+    station = HardwareStation(BncWorkcell(), robot_url="memq://")
     limits, status, force = station.limits, station.status_limits, np.array(station.impedance.limits[:3])
     load = station.max_torque_shares(station.controller_plant.solve(START, station.controller_plant.posture)).max()
     age = f"{status.max_age / MM:.0f} ms"

@@ -66,7 +66,7 @@ def test_option_difference_is_described_with_both_values(changed, words):
 OTHER_VALUES = {
     "offset_range": (0.0, 0.001), "start_height": (0.02, 0.03), "action_dims": (0,), "gains": (1.0, 1.0),
     "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
-    "time_step": 0.005, "control_period": 0.004, "robot": "other.urdf", "end_effector": "other", "lcm_url": "udpm://",
+    "time_step": 0.005, "control_period": 0.004, "robot": "other.urdf", "end_effector": "other", "robot_url": "udpm://",
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
 }  # fmt: skip
 TOGETHER = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}

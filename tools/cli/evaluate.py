@@ -37,7 +37,7 @@ def evaluate(
         Path | None, option("Write the successful episodes as demonstrations, .npz or .csv; the file must not exist.")
     ] = None,
     signal: Annotated[str, option("Poses that --save writes: commanded or measured.")] = "commanded",
-    lcm_url: cli.LcmUrl = None,
+    robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
     sim: cli.Sim = False,
     synchronous: cli.Synchronous = False,
@@ -62,9 +62,9 @@ def evaluate(
     if quick and episodes is not None:
         raise InputError("--quick is a number of episodes: leave --episodes out")
     episodes = QUICK if quick else 100 if episodes is None else episodes
-    environment = cli.parse_environment(env, station=station, robot=robot, lcm_url=lcm_url)
+    environment = cli.parse_environment(env, station=station, robot=robot, robot_url=robot_url)
     if cli.is_hardware(environment.get("station")):
-        given = environment.keys() - {"station", "robot", "lcm_url"} or task or baselines or save
+        given = environment.keys() - {"station", "robot", "robot_url"} or task or baselines or save
         if given or resample_offsets:
             raise InputError(
                 "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "

@@ -17,7 +17,7 @@ Url = Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's defau
 def deploy(
     run: cli.Run,
     station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
-    lcm_url: cli.LcmUrl = None,
+    robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
     sim: cli.Sim = False,
     synchronous: cli.Synchronous = False,
@@ -36,7 +36,7 @@ def deploy(
     from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.executor import deploy as deploy_policy
 
-    environment = cli.parse_environment(None, lcm_url=lcm_url, robot=robot)
+    environment = cli.parse_environment(None, robot_url=robot_url, robot=robot)
     given = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
     connection = RobotConnection.from_scenario(scenario, **given)
     raise typer.Exit(deploy_policy(run, connection, station=station, assume_yes=yes, out=out, log=print_progress))

@@ -51,7 +51,7 @@ def train(
         bool,
         option("A supervisor watches in the browser, corrects, stops and labels successes.", "--human-in-the-loop"),
     ] = False,
-    lcm_url: cli.LcmUrl = None,
+    robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
     sim: cli.Sim = False,
     synchronous: cli.Synchronous = False,
@@ -84,7 +84,7 @@ def train(
         fixture_offset=fixture_offset,
         station=station,
         robot=robot,
-        lcm_url=lcm_url,
+        robot_url=robot_url,
     )
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     if (folders or "demonstrations" in environment) and task is not None and not resume:

@@ -63,7 +63,7 @@ class RobotConnection:
     """Connection to the robot driver.
 
     Args:
-        lcm_url: Address of the driver, LCM's default if empty; a simulated driver has a bus of its own.
+        robot_url: Address of the driver, LCM's default if empty; a simulated driver has a bus of its own.
         robot: Name of the arm.
         sim: Use a simulated driver, in a process of its own.
         synchronous: Run station and simulated driver in lockstep instead of by the wall clock.
@@ -74,7 +74,7 @@ class RobotConnection:
         InputError: If the options contradict each other, or no such simulated driver exists.
     """
 
-    lcm_url: str = ""
+    robot_url: str = ""
     robot: str = DEFAULT_ROBOT
     sim: bool = False
     synchronous: bool = False
@@ -91,33 +91,33 @@ class RobotConnection:
         if file is None:
             return cls(**options)
         scenario = load_scenario(file)
-        for name, value in (("robot", scenario.robot), ("lcm_url", scenario.lcm_url)):
+        for name, value in (("robot", scenario.robot), ("robot_url", scenario.robot_url)):
             if options.get(name) and value and options[name] != value:
                 option = name.replace("_", "-")
                 raise InputError(f"{file} has {value}, and --{option} {options[name]}: leave one of the two out")
         sim = scenario.is_simulated or options.get("sim", False)
-        url = options.get("lcm_url", "") if sim else scenario.lcm_url or options.get("lcm_url", "")
-        return cls(**options | {"lcm_url": url, "robot": scenario.robot, "scenario": file, "sim": sim})
+        url = options.get("robot_url", "") if sim else scenario.robot_url or options.get("robot_url", "")
+        return cls(**options | {"robot_url": url, "robot": scenario.robot, "scenario": file, "sim": sim})
 
     def __post_init__(self) -> None:
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and self.robot != DEFAULT_ROBOT:
             raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver, not {self.robot}")
-        if self.sim and self.lcm_url:
+        if self.sim and self.robot_url:
             raise InputError(
                 "a simulated driver has a bus of its own, so that no real driver receives its messages: leave "
-                "--lcm-url out"
+                "--robot-url out"
             )
         check_rate(self.rate)
 
     def environment_options(self, station: str) -> dict[str, Any]:
         """Return the environment options of a hardware station on this connection."""
-        url = self.lcm_url
+        url = self.robot_url
         if self.sim:
             # With a time to live of zero no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-        options: dict[str, Any] = {"station": station, "lcm_url": url, "robot": self.robot}
+        options: dict[str, Any] = {"station": station, "robot_url": url, "robot": self.robot}
         return options | ({"robot_timeout": ROBOT_TIMEOUT} if self.sim else {})
 
     def clocks(self, station: HardwareStation) -> tuple[Clock, WallClock]:

@@ -294,7 +294,7 @@ def deploy(
     skill = make_skill(config.task, policy, **environment)
     skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
     with (
-        connection.simulated_driver(config.task, environment["lcm_url"], config.imports),
+        connection.simulated_driver(config.task, environment["robot_url"], config.imports),
         operator_keys() as keys,
     ):
         clock, wall_clock = connection.clocks(skill_station)

@@ -47,7 +47,7 @@ class Scenario:
         return next(iter(self.model_drivers))
 
     @property
-    def lcm_url(self) -> str:
+    def robot_url(self) -> str:
         """LCM URL of the robot's bus."""
         return self.lcm_buses[self.model_drivers[self.robot].lcm_bus].lcm_url
 

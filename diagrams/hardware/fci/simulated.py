@@ -8,11 +8,9 @@ tested where commands are made (`PoseMotionLimiter`).
 from __future__ import annotations
 
 import time
-import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import mujoco
 import numpy as np
 from franky_sim import SimulationServer
 from franky_sim.mujoco_simulator import FrankaMujocoRobot, MujocoSimulator
@@ -20,9 +18,11 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.mujoco import MujocoContact, mujoco_parts
-from guiderail.diagrams.stations.workcell import ConvexWorkcell, MovableWorkcell
+from guiderail.diagrams.stations.workcell import ConvexWorkcell
+from guiderail.models.common.errors import InputError
 
 ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # names in the simulator's model; flange from the seventh link [m]
+STEP = 0.001  # period of the protocol [s]
 FILTER_TIME = 0.005  # time constant of the external torque's low-pass filter [s]
 
 
@@ -33,14 +33,14 @@ class RehearsalRobot(FrankaMujocoRobot):
         positions: Initial joint positions (7,) [rad].
     """
 
-    def __init__(self, positions: Sequence[float]):
-        super().__init__(initial_q=positions)
+    def __init__(self, positions: np.ndarray):
+        super().__init__(initial_q=tuple(positions))
         self._external = np.zeros(7)
 
     def _post_step(self) -> None:
         # Joint limits and friction are constraints too, but a task reaches none of them.
         contact = self._data.qfrc_constraint[self._dof_addrs]
-        self._external += 0.001 / FILTER_TIME * (contact - self._external)
+        self._external += STEP / FILTER_TIME * (contact - self._external)
         super()._post_step()
 
     @property
@@ -53,7 +53,7 @@ class RehearsalRobot(FrankaMujocoRobot):
 class RehearsalSimulator(MujocoSimulator):
     """Simulated FR3 with a task's parts: the workpiece on the flange, and the fixture in the world."""
 
-    def __init__(self, workcell: MovableWorkcell, fixture_offset: RigidTransform = RigidTransform()):  # noqa: B008
+    def __init__(self, workcell: Any, fixture_offset: RigidTransform = RigidTransform()):  # noqa: B008
         """Construct the simulator.
 
         Args:
@@ -61,12 +61,13 @@ class RehearsalSimulator(MujocoSimulator):
             fixture_offset: Pose of the actual target in the nominal target.
         """
         super().__init__()
-        assert isinstance(workcell, ConvexWorkcell)
         self.model_of_arm = ArmControllerPlant(workcell, "panda")
         plant = self.model_of_arm.plant
         context = plant.CreateDefaultContext()
         X_FlangeTool = self.model_of_arm.arm.tool_center.CalcPose(context, plant.GetFrameByName("panda_flange"))
         X_WFixture = workcell.X_WT @ fixture_offset @ workcell.X_FT.inverse()
+        if not isinstance(workcell, ConvexWorkcell):
+            raise InputError(f"the rehearsal robot collides convex solids, and {type(workcell).__name__} has none")
         fixture, workpiece, assets = mujoco_parts(
             workcell.fixture_surfaces(), workcell.workpiece_surfaces(), MujocoContact()
         )
@@ -103,17 +104,19 @@ def serve(
     simulator: RehearsalSimulator,
     pose: np.ndarray,
     seconds: float,
+    rate: float = 1.0,
     host: str = "127.0.0.1",
     on_ready: Callable[[str], None] = print,
 ) -> None:
-    """Simulate the robot and answer libfranka's protocol by the wall clock.
+    """Simulate the robot by the wall clock, and answer libfranka's protocol.
 
-    A machine that is too slow for 1 kHz slows the robot's clock down, as the simulator waits for nothing.
+    On a machine that is too slow for the rate, the robot's clock falls behind.
 
     Args:
         simulator: The simulator.
         pose: Initial pose of the tool center, (6,).
         seconds: Simulated time to run [s].
+        rate: Rate of the robot's clock relative to the wall clock.
         host: Address to listen at, of this machine.
         on_ready: Function that is called with the address when clients can connect.
     """
@@ -122,8 +125,9 @@ def serve(
         with SimulationServer(simulator, [host]) as server:
             on_ready(host)
             start = time.monotonic()
-            for step in range(1, round(1000 * seconds) + 1):
+            for step in range(1, round(seconds / STEP) + 1):
                 server.run_once(realtime=False)
-                time.sleep(max(0.0, start + 0.001 * step - time.monotonic()))
-                start = max(start, time.monotonic() - 0.001 * step)  # no haste after a delay
-
+                due = start + STEP / rate * step
+                delay = time.monotonic() - due
+                time.sleep(max(0.0, -delay))
+                start += max(0.0, delay)  # a delay is not made up for

@@ -48,7 +48,7 @@ def test_both_contracts_hold_in_every_tasks_diagram(task):
         else:
             with pytest.raises(InputError, match="guiderail deploy"):
                 make_env(task, station=name)
-            diagram = make_skill(task, lambda observation: observation, station=name, lcm_url="memq://").diagram
+            diagram = make_skill(task, lambda observation: observation, station=name, robot_url="memq://").diagram
         station, guidance = (diagram.GetSubsystemByName(part) for part in ("station", "guidance"))
         assert all(station.HasInputPort(port) for port in STATION_INPUTS), name
         assert all(station.HasOutputPort(port) for port in STATION_OUTPUTS), name

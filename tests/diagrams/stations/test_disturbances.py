@@ -136,7 +136,7 @@ def test_environment_raises_when_hardware_is_disturbed():
     from guiderail.diagrams.envs.make import make_skill
 
     with pytest.raises(InputError, match="real robot"):
-        make_skill("GridClamp", lambda seen: seen, station="hardware", lcm_url="memq://", lost_commands=0.1)
+        make_skill("GridClamp", lambda seen: seen, station="hardware", robot_url="memq://", lost_commands=0.1)
 
 
 def test_every_disturbance_is_off_by_default():

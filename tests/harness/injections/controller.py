@@ -16,7 +16,7 @@ from guiderail.tools.hardware.sim_driver import START
 
 def main(url: str, rate: float) -> None:
     """Move the arm until the process is killed."""
-    station = HardwareStation(BncWorkcell(), lcm_url=url, robot_timeout=60.0)
+    station = HardwareStation(BncWorkcell(), robot_url=url, robot_timeout=60.0)
     clock = WallClock(station.driver, station.period, rate)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()

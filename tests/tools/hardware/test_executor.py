@@ -238,7 +238,7 @@ def test_connection_raises_when_options_contradict(wrong, message):
 
 def test_clone_has_the_same_limits_and_driver():
     slow = StatusLimits((1.0,) * 7, max_age=0.1)
-    options = {"period": 0.002, "wrench_time_constant": 0.05, "lcm_url": "memq://x", "status_limits": slow}
+    options = {"period": 0.002, "wrench_time_constant": 0.05, "robot_url": "memq://x", "status_limits": slow}
     station = HardwareStation(EnvConfig.resolve("BncConnector", {}).make_task().workcell(), robot="panda", **options)
     clone = station.clone(EnvConfig.resolve("BncConnector", {}).make_task().workcell())
     assert (clone.limits, clone.impedance, clone.driver) == (station.limits, station.impedance, station.driver)

@@ -32,11 +32,11 @@ def test_scenario_selects_simulated_or_real_robot(written):
     )
     assert (simulated.sim, real.sim) == (True, False)
     assert (simulated.robot, real.robot) == ("iiwa14", "iiwa14")
-    assert real.environment_options("hardware")["lcm_url"] == "udpm://239.255.76.67:7668?ttl=0"
+    assert real.environment_options("hardware")["robot_url"] == "udpm://239.255.76.67:7668?ttl=0"
     # No real driver may receive the messages of a simulated one.
-    assert simulated.environment_options("hardware")["lcm_url"] != real.environment_options("hardware")["lcm_url"]
+    assert simulated.environment_options("hardware")["robot_url"] != real.environment_options("hardware")["robot_url"]
     with pytest.raises(InputError, match="a bus of its own"):
-        RobotConnection(sim=True, lcm_url="udpm://239.255.76.67:7667")
+        RobotConnection(sim=True, robot_url="udpm://239.255.76.67:7667")
     assert RobotConnection.from_scenario(None, robot="panda").robot == "panda"
     assert (
         RobotConnection.from_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot
@@ -71,13 +71,13 @@ def test_load_raises_one_sentence_when_invalid(written, text, message):
 
 @pytest.mark.parametrize(
     ("given", "message"),
-    [({"robot": "panda"}, "--robot panda"), ({"lcm_url": "udpm://239.255.76.67:7777?ttl=0"}, "--lcm-url udpm")],
+    [({"robot": "panda"}, "--robot panda"), ({"robot_url": "udpm://239.255.76.67:7777?ttl=0"}, "--robot-url udpm")],
 )
 def test_connection_raises_when_options_contradict_the_file(written, given, message):
     file = written(f"station: hardware\n{BUS}{DRIVER}")
     with pytest.raises(InputError, match=message):
         RobotConnection.from_scenario(file, **given)
-    same = RobotConnection.from_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
+    same = RobotConnection.from_scenario(file, robot="iiwa14", robot_url="udpm://239.255.76.67:7668?ttl=0")
     assert same == RobotConnection.from_scenario(file)
 
 

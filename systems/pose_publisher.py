@@ -1,0 +1,62 @@
+"""Publisher of desired poses to a robot that runs the impedance itself."""
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem
+
+from guiderail.models.common.poses import pose_to_transform
+from guiderail.systems.support.declarations import check_period, input_getter
+from guiderail.systems.torque_safety_limiter import ArmState
+
+
+class PosePublisher(LeafSystem):
+    """Publish a desired pose once per period while the arm is controlled; otherwise stop the robot.
+
+    A pose that is not finite stops the robot, too. Before the arm is controlled for the first time nothing is sent.
+
+    .. pydrake_system::
+
+        name: PosePublisher
+        input_ports:
+        - pose
+        - arm_state
+
+    ``pose`` is X_TP as (6,), [x y z Rz Ry Rx] in meters and radians. ``arm_state`` is (1,), a number of `ArmState`.
+
+    Args:
+        write_pose: Function that sends a pose X_BaseTool at a time [s], such as `PoseDriver.write_pose`.
+        stop: Function that brings the robot to rest, such as `PoseDriver.stop`.
+        X_BaseTarget: Pose of the target frame T in the robot's base frame.
+        period: Publishing period [s], positive.
+
+    Raises:
+        InputError: If the period is out of range.
+    """
+
+    def __init__(
+        self,
+        write_pose: Callable[[RigidTransform, float], None],
+        stop: Callable[[], None],
+        X_BaseTarget: RigidTransform,
+        *,
+        period: float,
+    ):
+        super().__init__()
+        check_period(period)
+        self._write_pose, self._stop, self._X_BaseTarget = write_pose, stop, X_BaseTarget
+        self._pose_port = self.DeclareVectorInputPort("pose", 6)
+        self._arm_state_port = self.DeclareVectorInputPort("arm_state", 1)
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+
+    get_pose_input_port = input_getter("pose", "desired pose of the tool center, (6,)")
+    get_arm_state_input_port = input_getter("arm_state", "state of the arm, (1,), a number of `ArmState`")
+
+    def _publish(self, context: Context) -> None:
+        state = self._arm_state_port.Eval(context)[0]
+        pose = self._pose_port.Eval(context)
+        if state in (ArmState.RAMPING, ArmState.RUNNING) and np.isfinite(pose).all():
+            self._write_pose(self._X_BaseTarget @ pose_to_transform(pose), context.get_time())
+        elif state != ArmState.WAITING:
+            self._stop()
