@@ -83,6 +83,13 @@ class Driver(ABC):
                 return
             time.sleep(POLL_PERIOD)
 
+    def recover(self) -> None:  # noqa: B027 (optional hook)
+        """Clear an error of the robot after the user has confirmed; the arm does not move.
+
+        Raises:
+            InputError: If the error persists.
+        """
+
     def check_usable(self) -> None:  # noqa: B027 (optional hook)
         """Raise `InputError` if the connection cannot receive in this environment."""
 
@@ -136,7 +143,7 @@ class RobotImpedance:
 class PoseDriver(Driver):
     """Connection to a robot whose own program runs the impedance controller and follows desired poses.
 
-    A driver implements `read`, `configure`, `write_pose`, `stop` and `recover`.
+    A driver implements `read`, `configure`, `write_pose` and `stop`, and `recover` if its robot has errors.
 
     Attributes:
         motion_limits: Limits of the desired poses that the robot accepts.
@@ -155,10 +162,6 @@ class PoseDriver(Driver):
     @abstractmethod
     def stop(self) -> None:
         """Bring the arm to rest by the robot's own means; repeated calls have no effect."""
-
-    @abstractmethod
-    def recover(self) -> None:
-        """Clear the robot's error, after the user has confirmed."""
 
     def write(self, torque: np.ndarray, time: float) -> None:
         """Raise an error, because the robot accepts poses."""

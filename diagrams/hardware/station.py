@@ -98,8 +98,8 @@ class HardwareStation(Station):
 
         Args:
             workcell: Target frame and held workpiece; the fixture is real.
-            driver: Connection to the robot, or the name of a driver that is opened at `robot_url`; by default the driver
-                with the robot's name.
+            driver: Connection to the robot, or the name of a driver that is opened at `robot_url`; by default that with
+                the robot's name.
             impedance: Impedance at the tool center.
             period: Period of a command [s]; the driver's by default.
             wrench_time_constant: Time constant of the wrench estimate's low-pass filter [s].

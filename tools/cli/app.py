@@ -193,7 +193,8 @@ Processes = Annotated[
 ]
 Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
 
-RobotUrl = Annotated[str | None, option("Hardware: LCM URL of the driver's bus.  [default: LCM's default]")]
+RobotUrl = Annotated[str | None, option("Hardware: LCM URL of the driver's bus, or host.  [default: LCM's default]")]
+Driver = Annotated[str | None, option("Hardware: driver, such as fci for a Franka.  [default: the robot's on LCM]")]
 Robot = Annotated[str | None, option("Hardware: robot arm.  [default: the scenario's, or iiwa14]", choices="robots")]
 Sim = Annotated[bool, option("Hardware: use a simulated driver in a subprocess instead of a robot.", "--sim")]
 Synchronous = Annotated[
@@ -305,12 +306,12 @@ def hardware_arguments(
     """Return the arguments of `RobotConnection.from_scenario` that were given.
 
     Args:
-        environment: Options of the environment; `robot_url` and `robot` are taken from it.
+        environment: Options of the environment; `robot_url`, `robot` and `driver` are taken from it.
         sim: Whether a simulated driver is used.
         synchronous: Whether it runs in lockstep.
         rate: Speed of its clock; None for the default.
     """
-    given = {name: environment[name] for name in ("robot_url", "robot") if name in environment}
+    given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
     return given | {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
 
 

@@ -39,6 +39,7 @@ def evaluate(
     signal: Annotated[str, option("Poses that --save writes: commanded or measured.")] = "commanded",
     robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
+    driver: cli.Driver = None,
     sim: cli.Sim = False,
     synchronous: cli.Synchronous = False,
     rate: cli.Rate = None,
@@ -62,9 +63,9 @@ def evaluate(
     if quick and episodes is not None:
         raise InputError("--quick is a number of episodes: leave --episodes out")
     episodes = QUICK if quick else 100 if episodes is None else episodes
-    environment = cli.parse_environment(env, station=station, robot=robot, robot_url=robot_url)
+    environment = cli.parse_environment(env, station=station, robot=robot, robot_url=robot_url, driver=driver)
     if cli.is_hardware(environment.get("station")):
-        given = environment.keys() - {"station", "robot", "robot_url"} or task or baselines or save
+        given = environment.keys() - {"station", "robot", "robot_url", "driver"} or task or baselines or save
         if given or resample_offsets:
             raise InputError(
                 "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "

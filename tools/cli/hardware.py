@@ -19,6 +19,7 @@ def deploy(
     station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
     robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
+    driver: cli.Driver = None,
     sim: cli.Sim = False,
     synchronous: cli.Synchronous = False,
     rate: cli.Rate = None,
@@ -36,7 +37,7 @@ def deploy(
     from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.executor import deploy as deploy_policy
 
-    environment = cli.parse_environment(None, robot_url=robot_url, robot=robot)
+    environment = cli.parse_environment(None, robot_url=robot_url, robot=robot, driver=driver)
     given = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
     connection = RobotConnection.from_scenario(scenario, **given)
     raise typer.Exit(deploy_policy(run, connection, station=station, assume_yes=yes, out=out, log=print_progress))
@@ -76,6 +77,7 @@ def teleoperate(
 @cli.command("sim-driver --seconds 60", "sim-driver")
 def sim_driver(
     url: Url = "",
+    driver: cli.Driver = None,
     seconds: Annotated[float, option("Duration in simulated time [s].")] = 3600.0,
     command_timeout: Annotated[float, option("Longest wait for a command [s].")] = 5.0,
     task: Annotated[
@@ -88,7 +90,7 @@ def sim_driver(
     scenario: Annotated[Path | None, option("Scenario file with the robot's surroundings.")] = None,
     imports: cli.Imports = None,
 ) -> None:
-    """Simulate the driver of an iiwa on LCM, with a safety monitor.
+    """Simulate a robot and its driver: an iiwa on LCM with a safety monitor, or with --driver fci a Franka.
 
     The robot stands in front of a task's fixture. The exit code is 1 if commands stopped arriving.
     """
@@ -97,7 +99,15 @@ def sim_driver(
     name = cli.find_task(task, imports)[0]
     xy = None if offset is None else tuple(cli.parse_floats(offset, 2, "--offset"))
     completed = run_sim_driver(
-        url, seconds, command_timeout, name, rate=rate, offset=xy, scenario=scenario, log=print_progress
+        url,
+        seconds,
+        command_timeout,
+        name,
+        rate=rate,
+        offset=xy,
+        scenario=scenario,
+        driver=driver or "",
+        log=print_progress,
     )
     raise typer.Exit(0 if completed else 1)
 

@@ -53,6 +53,7 @@ def train(
     ] = False,
     robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
+    driver: cli.Driver = None,
     sim: cli.Sim = False,
     synchronous: cli.Synchronous = False,
     rate: cli.Rate = None,
@@ -85,6 +86,7 @@ def train(
         station=station,
         robot=robot,
         robot_url=robot_url,
+        driver=driver,
     )
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     if (folders or "demonstrations" in environment) and task is not None and not resume:

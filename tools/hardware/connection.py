@@ -25,6 +25,7 @@ LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall cloc
 COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
 MAX_DURATION = 7 * 24 * 3600.0  # of a simulated driver, by the robot's clock [s]
 DEFAULT_RATE = 0.2  # in contact, a simulated robot with 1 kHz is slower than real time on usual machines
+SIMULATED = (DEFAULT_ROBOT, "fci")  # drivers that have a simulated robot
 ROBOT_TIMEOUT = 60.0  # a simulated driver is started with the command [s]
 NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine the arm will be stopped because commands are late"
 
@@ -65,6 +66,7 @@ class RobotConnection:
     Args:
         robot_url: Address of the driver, LCM's default if empty; a simulated driver has a bus of its own.
         robot: Name of the arm.
+        driver: Name of the driver; empty for the one with the robot's name.
         sim: Use a simulated driver, in a process of its own.
         synchronous: Run station and simulated driver in lockstep instead of by the wall clock.
         rate: Rate of a simulated robot's clock relative to the wall clock.
@@ -76,6 +78,7 @@ class RobotConnection:
 
     robot_url: str = ""
     robot: str = DEFAULT_ROBOT
+    driver: str = ""
     sim: bool = False
     synchronous: bool = False
     rate: float = DEFAULT_RATE
@@ -102,8 +105,10 @@ class RobotConnection:
     def __post_init__(self) -> None:
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
-        if self.sim and self.robot != DEFAULT_ROBOT:
-            raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver, not {self.robot}")
+        if self.sim and (self.driver or self.robot) not in SIMULATED:
+            raise InputError(f"these drivers have a simulated robot: {', '.join(SIMULATED)}; not {self.robot}")
+        if self.synchronous and self.driver:
+            raise InputError(f"the simulated robot of the driver {self.driver} does not wait: leave --synchronous out")
         if self.sim and self.robot_url:
             raise InputError(
                 "a simulated driver has a bus of its own, so that no real driver receives its messages: leave "
@@ -117,7 +122,9 @@ class RobotConnection:
         if self.sim:
             # With a time to live of zero no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-        options: dict[str, Any] = {"station": station, "robot_url": url, "robot": self.robot}
+            if self.driver:
+                url = f"127.{os.getpid() // 65536 % 255}.{os.getpid() // 256 % 256}.{os.getpid() % 255 + 1}"
+        options: dict[str, Any] = {"station": station, "robot_url": url, "robot": self.robot, "driver": self.driver}
         return options | ({"robot_timeout": ROBOT_TIMEOUT} if self.sim else {})
 
     def clocks(self, station: HardwareStation) -> tuple[Clock, WallClock]:
@@ -154,7 +161,7 @@ class RobotConnection:
             "from guiderail.tools.hardware import sim_driver\n"
             f"import_modules({list(imports)!r})\n"
             f"sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "
-            f"scenario={scenario!r} and Path({scenario!r}))"
+            f"scenario={scenario!r} and Path({scenario!r}), driver={self.driver!r})"
         )
         with subprocess_tied_to_parent(code):
             yield

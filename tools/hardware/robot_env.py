@@ -336,6 +336,7 @@ class RobotEnv(GuidedEnv):
         if self._arm_state != ArmState.OFF:
             return
         self._confirm_resume(self._active_fault.description)
+        self._station.driver.recover()
         # No status was received while the operator was asked. Those of an arm that was moved in the meantime are
         # accepted after the settling time only.
         self._clock.begin()

@@ -76,8 +76,7 @@ def robot_session(
                 confirm("Resume from where it is?")
 
         randomize_parts = None
-        if connection.sim:
-            assert isinstance(station.driver, LcmDriver)
+        if connection.sim and isinstance(station.driver, LcmDriver):
             randomize_parts = PartRandomizer(task, station.driver, config.seed)
         env = RobotEnv(
             diagram,

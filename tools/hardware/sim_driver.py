@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.lcm import DrakeLcm
+from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
@@ -18,6 +19,7 @@ from guiderail.diagrams.hardware.monitor import SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.drake_poses import pose_to_transform
 from guiderail.tools.hardware.part_randomization import subscribe_part_offsets
 from guiderail.tools.hardware.scenario import load_scenario
 
@@ -36,9 +38,10 @@ def run_sim_driver(
     rate: float | None = None,
     offset: Sequence[float] | None = None,
     scenario: Path | None = None,
+    driver: str = "",
     log: Callable[[str], None] = print,
 ) -> bool:
-    """Simulate an iiwa, its driver and a safety monitor in front of a task's fixture.
+    """Simulate a robot and its driver in front of a task's fixture: by default an iiwa with a safety monitor on LCM.
 
     Args:
         url: LCM URL of the driver's bus; LCM's default if empty.
@@ -49,6 +52,7 @@ def run_sim_driver(
             instead (lockstep).
         offset: Offset (x, y) of the fixture from its nominal position [m].
         scenario: Scenario file with the surroundings; see `load_scenario`.
+        driver: "fci" for a Franka on its own protocol, at the address `url`, always by the wall clock.
         log: Function that shows a message.
 
     Returns:
@@ -67,6 +71,17 @@ def run_sim_driver(
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
     reset = None if offset is None else validate_options(insertion.Reset, {"offset": tuple(offset)}, "a robot")
     start = START if task == DEFAULT_TASK else insertion.start_pose(np.random.default_rng(0)) + START_OFFSET
+    if driver == "fci":
+        if scenario is not None:
+            raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
+        from guiderail.diagrams.hardware.fci.simulated import RehearsalSimulator, serve  # needs franky-sim
+
+        fixture = RigidTransform()
+        if reset is not None:
+            fixture = pose_to_transform(insertion.offsets.draw(np.random.default_rng(0), reset)[0])
+        simulator = RehearsalSimulator(insertion.workcell(), fixture)
+        serve(simulator, start, seconds, 1.0 if rate is None else rate, url, log)
+        return True
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm = open_bus(url)
     # In real time the monitor has a connection of its own, as next to a real driver, where it is another process.

@@ -15,7 +15,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.hardware.driver import PoseDriver, RobotImpedance, register_driver
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import JointStatus
+from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
 
 DYNAMICS_SHARE = 0.2  # share of the robot's motion limits that commands may use
@@ -31,33 +31,31 @@ class FciDriver(PoseDriver):
     """Franka Emika Panda or FR3 on the Franka Control Interface.
 
     The external torque of the interface is that of the arm on its surroundings. After a reflex the status is malformed
-    until `recover` has cleared the error, so the station stops.
+    until `recover` has cleared the error, so the station stops. If this program ends or hangs, libfranka's loop ends
+    with it and the robot brakes, or keeps the last desired pose with the bounded wrench.
     """
 
     name = "panda"
     torque_reflex_limits = TORQUE_THRESHOLD
-    has_command_timeout = False
+    has_command_timeout = True
     hold_off = 0.0
     motion_limits = FRANKA_LIMITS.scaled(DYNAMICS_SHARE)
 
     def __init__(self, url: str = "", *, client: Any = None):
-        """Connect to the robot.
+        """Construct the driver; the first `read` connects to the robot.
 
         Args:
             url: Host name or address of the robot.
             client: Module franky, or a double of it.
 
         Raises:
-            InputError: If franky is not installed, no host is named, or the robot does not answer.
+            InputError: If franky is not installed, or no host is named.
         """
         super().__init__(url)
-        self._franky = franky = client or _import_franky()
         if not url:
             raise InputError("the driver fci needs the robot's host: give --robot-url")
-        try:
-            self._robot = franky.Robot(url, realtime_config=franky.RealtimeConfig.Ignore)
-        except Exception as error:  # the client raises exceptions of its own, without a common base class
-            raise InputError(f"no robot answers at {url}: {error}") from None
+        self._franky = client or _import_franky()
+        self._robot: Any = None
         self._motion: Any = None
         self._impedance: RobotImpedance | None = None
 
@@ -80,10 +78,19 @@ class FciDriver(PoseDriver):
         self._impedance = impedance
 
     def read(self) -> JointStatus | None:
-        """Return the newest status."""
-        if self.error:
-            return JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
-        state = self._robot.state
+        """Return the newest status, None while no robot answers."""
+        franky = self._franky
+        if self._robot is None:
+            try:
+                self._robot = franky.Robot(self.url, realtime_config=franky.RealtimeConfig.Ignore)
+            except franky.NetworkException:
+                return None
+        try:
+            if self.error:
+                return MALFORMED_STATUS
+            state = self._robot.state
+        except franky.NetworkException:
+            return MALFORMED_STATUS  # the connection is lost
         q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
         return JointStatus(state.time.to_sec(), q, v, -external)
 

@@ -23,6 +23,7 @@ from guiderail.models.common.errors import InputError
 
 ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # names in the simulator's model; flange from the seventh link [m]
 STEP = 0.001  # period of the protocol [s]
+RESIDUAL_FRICTION = 0.1  # [Nm] of each joint; the interface's torques are "without gravity and friction" (libfranka)
 FILTER_TIME = 0.005  # time constant of the external torque's low-pass filter [s]
 
 
@@ -84,6 +85,8 @@ class RehearsalSimulator(MujocoSimulator):
         option = root.find("option")
         assert option is not None
         option.attrib.update(cone="elliptic", impratio="10", ccd_tolerance="1e-9", ccd_iterations="100")
+        for joint in root.iterfind("default//joint[@frictionloss]"):
+            joint.set("frictionloss", str(RESIDUAL_FRICTION))
         asset = root.find("asset")
         assert asset is not None
         asset.extend(self._assets)
