@@ -8,6 +8,7 @@ damping. pylibfranka, Franka's own binding, would leave the loop at 1 kHz to Pyt
 from __future__ import annotations
 
 import importlib
+import logging
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from guiderail.diagrams.hardware.driver import PoseDriver, RobotImpedance, regis
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
+
+logger = logging.getLogger(__name__)
 
 DYNAMICS_SHARE = 0.2  # share of the robot's motion limits that commands may use
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
@@ -38,7 +41,7 @@ class FciDriver(PoseDriver):
     name = "panda"
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
-    hold_off = 0.0
+    hold_off = 0.25  # the robot needs none; statuses are watched before the arm is taken over
     motion_limits = FRANKA_LIMITS.scaled(DYNAMICS_SHARE)
 
     def __init__(self, url: str = "", *, client: Any = None):
@@ -89,7 +92,7 @@ class FciDriver(PoseDriver):
             if self.error:
                 return MALFORMED_STATUS
             state = self._robot.state
-        except franky.NetworkException:
+        except (franky.NetworkException, RuntimeError):  # the latter is a socket's, "Net Exception"
             return MALFORMED_STATUS  # the connection is lost
         q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
         return JointStatus(state.time.to_sec(), q, v, -external)
@@ -133,7 +136,10 @@ class FciDriver(PoseDriver):
         """Damp the arm to rest by the robot's own loop; the brakes hold it afterwards."""
         if self._motion is not None:
             self._motion = None
-            self._robot.move(self._franky.TorqueStopMotion(max_duration=STOP_TIME), asynchronous=True)
+            try:
+                self._robot.move(self._franky.TorqueStopMotion(max_duration=STOP_TIME), asynchronous=True)
+            except (self._franky.NetworkException, RuntimeError):
+                logger.warning("the robot at %s cannot be reached: it brakes by itself", self.url)
 
     def recover(self) -> None:
         """Clear the error of a reflex; the arm does not move.

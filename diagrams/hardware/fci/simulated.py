@@ -24,7 +24,7 @@ from guiderail.models.common.errors import InputError
 ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # names in the simulator's model; flange from the seventh link [m]
 STEP = 0.001  # period of the protocol [s]
 RESIDUAL_FRICTION = 0.1  # [Nm] of each joint; the interface's torques are "without gravity and friction" (libfranka)
-FILTER_TIME = 0.005  # time constant of the external torque's low-pass filter [s]
+FILTER_TIME = 0.02  # time constant of the external torque's low-pass filter [s]
 
 
 class RehearsalRobot(FrankaMujocoRobot):

@@ -1,0 +1,280 @@
+"""Driver on the Franka Control Interface, with a double of its client; `make fci` tests the real client."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.hardware.fci.driver import FORCE_THRESHOLD_SHARE, FciDriver
+from guiderail.diagrams.hardware.pose_control import make_robot_impedance
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.stations.arm import ArmControllerPlant
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import Fault
+from guiderail.models.control.motion_limits import FRANKA_LIMITS
+from guiderail.systems.torque_safety_limiter import ArmState
+from guiderail.tools.hardware.sim_driver import START
+
+WORKCELL = BncWorkcell()
+IMPEDANCE = Impedance().with_max_force(18.0)
+
+
+class NetworkError(Exception):
+    """Error of a lost connection."""
+
+
+class Affine:
+    """Transformation with the client's attribute `matrix`."""
+
+    def __init__(self, matrix):
+        self.matrix = np.array(matrix)
+
+
+class Robot:
+    """Robot that holds its joints, and records what it is told to do."""
+
+    def __init__(self, positions):
+        self.calls, self.errors, self.is_connected = [], "", True
+        self.positions, self.external, self.time = positions, np.zeros(7), 0.0
+        self.can_recover = True
+
+    @property
+    def has_errors(self):
+        if not self.is_connected:
+            raise NetworkError
+        return bool(self.errors)
+
+    @property
+    def state(self):
+        self.time += 0.005
+        return SimpleNamespace(
+            q=self.positions,
+            dq=np.zeros(7),
+            tau_ext_hat_filtered=self.external,
+            time=SimpleNamespace(to_sec=lambda time=self.time: time),
+            current_errors=self.errors,
+            F_T_NE=Affine(RigidTransform([0.0, 0.0, 0.1]).GetAsMatrix4()),
+        )
+
+    def recover_from_errors(self):
+        if self.can_recover:
+            self.errors = ""
+        return self.can_recover
+
+    def __getattr__(self, name):
+        return lambda *args, **options: self.calls.append((name, args, options))
+
+
+class Motion(SimpleNamespace):
+    """Motion with the methods of the client's impedance motion."""
+
+    def set_gains(self, gains):
+        self.gains = gains
+
+    def set_reference(self, reference):
+        self.references = [*getattr(self, "references", []), reference]
+
+
+def client(robot):
+    """Return a double of the module franky with one robot."""
+
+    def connect(url, realtime_config):
+        if not robot.is_connected:
+            raise NetworkError
+        return robot
+
+    return SimpleNamespace(
+        Robot=connect,
+        RealtimeConfig=SimpleNamespace(Ignore=0),
+        NetworkException=NetworkError,
+        CartesianReference=lambda target: target.matrix,
+        Affine=Affine,
+        CartesianImpedanceTrackingMotion=lambda **options: Motion(**options),
+        CartesianImpedanceGains=SimpleNamespace,
+        PostureTask=lambda *values: values,
+        TorqueStopMotion=lambda **options: ("stop", options),
+    )
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ArmControllerPlant(WORKCELL, "panda")
+
+
+@pytest.fixture
+def robot(model):
+    return Robot(model.solve(START, model.posture))
+
+
+@pytest.fixture
+def driver(robot, model):
+    driver = FciDriver("192.0.2.1", client=client(robot))
+    assert driver.read() is not None
+    driver.configure(make_robot_impedance(model, IMPEDANCE))
+    return driver
+
+
+def motions(robot):
+    return [args[0] for name, args, _ in robot.calls if name == "move"]
+
+
+def test_host_is_required():
+    with pytest.raises(InputError, match="--robot-url"):
+        FciDriver()
+
+
+def test_missing_client_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "franky", None)
+    with pytest.raises(InputError, match=r"guiderail\[fci\]"):
+        FciDriver("192.0.2.1")
+
+
+def test_motion_limits_are_within_the_published_ones():
+    ours, published = FciDriver.motion_limits, FRANKA_LIMITS
+    assert (np.array(ours.linear + ours.angular) <= np.array(published.linear + published.angular)).all()
+
+
+def test_status_has_the_torque_of_the_surroundings(driver, robot):
+    robot.external = np.arange(7.0)
+    status = driver.read()
+    np.testing.assert_array_equal(status.external_torque, -np.arange(7.0))
+    np.testing.assert_array_equal(status.positions, robot.positions)
+    assert driver.read().time > status.time
+
+
+def test_no_status_before_the_robot_answers(robot):
+    robot.is_connected = False
+    driver = FciDriver("192.0.2.1", client=client(robot))
+    assert driver.read() is None
+    robot.is_connected = True
+    assert driver.read().is_readable
+
+
+@pytest.mark.parametrize("failure", ["reflex", "connection"])
+def test_status_is_malformed_after_a_failure(driver, robot, failure):
+    if failure == "reflex":
+        robot.errors = "cartesian_reflex"
+    else:
+        robot.is_connected = False
+    assert not driver.read().is_readable
+
+
+def test_recover_clears_the_error_or_raises(driver, robot):
+    robot.errors, robot.can_recover = "cartesian_reflex", False
+    with pytest.raises(InputError, match="cannot recover: cartesian_reflex"):
+        driver.recover()
+    robot.can_recover = True
+    driver.recover()
+    assert driver.read().is_readable
+
+
+def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
+    calls = {name: args for name, args, _ in robot.calls}
+    impedance = make_robot_impedance(model, IMPEDANCE)
+    expected = RigidTransform([0.0, 0.0, -0.1]) @ impedance.X_FlangeTool
+    np.testing.assert_allclose(calls["set_ee"][0], expected.GetAsMatrix4().ravel("F"), atol=1e-12)
+    assert calls["set_load"][0] == pytest.approx(impedance.mass)
+    assert calls["set_collision_behavior"][1][0] == pytest.approx(
+        FORCE_THRESHOLD_SHARE * impedance.max_wrench[:3].max()
+    )
+
+
+def test_spring_error_is_bounded_by_the_wrench(driver, robot):
+    driver.write_pose(RigidTransform(), 0.0)
+    (motion,) = motions(robot)
+    limits = np.array(IMPEDANCE.limits)
+    np.testing.assert_allclose(motion.translational_error_clip * 1500.0, limits[:3])
+    np.testing.assert_allclose(motion.rotational_error_clip * 30.0, limits[3:])
+    np.testing.assert_allclose(motion.gains.stiffness, np.diag([1500.0] * 3 + [30.0] * 3))
+    assert (np.linalg.eigvalsh(motion.gains.damping + motion.gains.damping.T) > 0.0).all()
+
+
+def test_poses_update_one_motion_until_the_stop(driver, robot):
+    for x in (0.1, 0.2):
+        driver.write_pose(RigidTransform([x, 0.0, 0.0]), 0.0)
+    (motion,) = motions(robot)
+    assert [reference[0, 3] for reference in motion.references] == [0.1, 0.2]
+    driver.stop()
+    driver.stop()
+    assert [kind for kind, _ in motions(robot)[1:]] == ["stop"]
+    driver.write_pose(RigidTransform(), 0.0)
+    assert isinstance(motions(robot)[2], Motion)
+
+
+def test_pose_before_configuration_is_refused(robot):
+    driver = FciDriver("192.0.2.1", client=client(robot))
+    driver.read()
+    with pytest.raises(InputError, match="configured"):
+        driver.write_pose(RigidTransform(), 0.0)
+
+
+def test_torques_are_refused(driver):
+    with pytest.raises(InputError, match="poses, not torques"):
+        driver.write(np.zeros(7), 0.0)
+
+
+def test_impedance_needs_a_target_with_the_axes_of_the_base(model):
+    class Turned(BncWorkcell):
+        @property
+        def X_WT(self):
+            return super().X_WT @ RigidTransform(np.diag([-1.0, -1.0, 1.0, 1.0]))
+
+    with pytest.raises(InputError, match="axes of its base"):
+        make_robot_impedance(ArmControllerPlant(Turned(), "panda"), IMPEDANCE)
+
+
+class Loop:
+    """Hardware station with the driver and the double, advanced by its own period."""
+
+    def __init__(self, robot):
+        self.driver = FciDriver("192.0.2.1", client=client(robot))
+        self.station = HardwareStation(WORKCELL, self.driver, IMPEDANCE, robot="panda")
+        self.simulator = Simulator(self.station)
+        self.context = self.simulator.get_mutable_context()
+        self.command(START)
+        self.station.start(self.simulator)
+        self.time = 0.0
+
+    def command(self, pose):
+        self.station.get_desired_pose_input_port().FixValue(self.context, pose)
+
+    def go(self, seconds):
+        for _ in range(round(seconds / self.station.period)):
+            self.station.receive(self.context)
+            self.time += self.station.period
+            self.simulator.AdvanceTo(self.time)
+
+    @property
+    def arm_state(self):
+        return ArmState(int(self.station.get_arm_state_output_port().Eval(self.context)[0]))
+
+
+def test_station_sends_poses_from_the_measured_pose_on(robot):
+    loop = Loop(robot)
+    loop.go(0.1)
+    assert not motions(robot)  # nothing is sent while the status settles
+    loop.go(1.0)
+    assert loop.arm_state == ArmState.RUNNING
+    (motion,) = motions(robot)
+    expected = WORKCELL.X_WT @ RigidTransform([0.0, 0.0, START[2]])
+    np.testing.assert_allclose(motion.references[0][:3, 3], expected.translation(), atol=1e-4)
+    loop.command(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+    loop.go(0.5)
+    moved = np.array([reference[:3, 3] for reference in motion.references])
+    np.testing.assert_allclose(moved[-1] - moved[0], [0.01, 0.0, 0.0], atol=1e-6)
+    speed = np.linalg.norm(np.diff(moved, axis=0), axis=1).max() / loop.station.period
+    assert 0.0 < speed <= FciDriver.motion_limits.linear[0]
+
+
+def test_station_stops_the_robot_after_a_reflex(robot):
+    loop = Loop(robot)
+    loop.go(1.0)
+    robot.errors = "cartesian_reflex"
+    loop.go(0.1)
+    assert loop.arm_state == ArmState.DAMPING
+    assert motions(robot)[-1][0] == "stop"
+    assert Fault(int(loop.station.get_fault_output_port().Eval(loop.context)[0])) == Fault.MALFORMED

@@ -1,0 +1,112 @@
+"""Rehearsal of a Franka through its own protocol: insert, lock, stop, and the loss of the robot.
+
+Run by `make fci`, in an environment with franky and franky-sim. The robot is a process of its own that answers
+libfranka's network protocol; its clock runs at a rate of the wall clock's, because a busy machine does not reach 1 kHz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.hardware.clock import WallClock
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.control.joint_status import Fault
+from guiderail.systems.torque_safety_limiter import ArmState
+from guiderail.tools.hardware.connection import subprocess_tied_to_parent
+from guiderail.tools.hardware.sim_driver import START
+
+FORCE_LIMIT = 18.0  # bound of the impedance's force [N]
+CONTROL_STEPS = 4  # status periods of a control step
+DOWN, TURN = 0.01, 0.6  # speed of the insertion [m/s] and of the turn [rad/s]
+PRESSED = -0.006  # commanded height while the plug is turned [m]
+
+
+class Rehearsal:
+    """Hardware station on the simulated robot."""
+
+    def __init__(self, rate: float):
+        self.host = f"127.0.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
+        self.station = HardwareStation(
+            BncWorkcell(),
+            "fci",
+            Impedance().with_max_force(FORCE_LIMIT),
+            robot="panda",
+            robot_url=self.host,
+            robot_timeout=60.0,
+        )
+        self.simulator = Simulator(self.station)
+        self.context = self.simulator.get_mutable_context()
+        self.clock = WallClock(self.station.driver, self.station.period, rate)
+        self.pose = START.copy()
+        self.max_force = 0.0
+
+    def start(self) -> None:
+        self.station.get_desired_pose_input_port().FixValue(self.context, self.pose)
+        self.station.start(self.simulator)
+        self.clock.begin()
+
+    def advance(self, seconds: float, velocity: np.ndarray | None = None) -> None:
+        period = CONTROL_STEPS * self.station.period
+        for _ in range(round(seconds / period)):
+            if velocity is not None:
+                self.pose = self.pose + period * velocity
+            self.station.get_desired_pose_input_port().FixValue(self.context, self.pose)
+            self.clock.advance(self.simulator, self.station, CONTROL_STEPS)
+            self.max_force = max(self.max_force, float(self["contact_force"][0]))
+
+    def __getitem__(self, port: str) -> np.ndarray:
+        return self.station.GetOutputPort(port).Eval(self.context)
+
+    def describe(self) -> str:
+        state, fault = ArmState(int(self["arm_state"][0])), Fault(int(self["fault"][0]))
+        position, turn = 1e3 * self["pose"][:3], np.rad2deg(self["pose"][3])
+        return f"{state.name}, {fault.description}; at {np.round(position, 2)} mm, turned {turn:.1f} degrees"
+
+
+def rehearse(rate: float) -> list[str]:
+    """Run the rehearsal; return what failed."""
+    failures = []
+
+    def check(name: str, passed: bool, description: str) -> None:
+        print(f"{'ok  ' if passed else 'FAIL'} {name:<10} {description}", flush=True)
+        if not passed:
+            failures.append(name)
+
+    run = Rehearsal(rate)
+    code = (
+        "from guiderail.tools.hardware.sim_driver import run_sim_driver\n"
+        f"run_sim_driver({run.host!r}, 1e4, 60.0, rate={rate!r}, driver='fci', log=lambda _: None)"
+    )
+    with subprocess_tied_to_parent(code) as robot:
+        run.start()
+        run.advance(1.2)
+        check("take over", run["arm_state"][0] == ArmState.RUNNING, run.describe())
+        run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))
+        run.advance((START[3] + 0.1) / TURN, np.array([0.0, 0.0, 0.0, -TURN, 0.0, 0.0]))
+        run.advance(0.3)
+        height, turn = run["pose"][2], run["pose"][3]
+        check("lock", abs(height) < 0.6e-3 + 0.4e-3 and abs(turn) < np.deg2rad(8.0), run.describe())
+        check("force", run.max_force < 20.0, f"at most {run.max_force:.1f} N by the impedance")
+        run.station.stop(run.context)
+        run.advance(0.6)
+        check("stop", run["arm_state"][0] == ArmState.OFF, run.describe())
+        robot.kill()
+        before = time.monotonic()
+        run.advance(0.2)
+        fault = Fault(int(run["fault"][0]))
+        check("loss", fault != Fault.NONE, f"{fault.description}, {time.monotonic() - before:.1f} s later")
+    return failures
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rate", type=float, default=0.1, help="rate of the robot's clock (default: 0.1)")
+    sys.exit(bool(rehearse(parser.parse_args().rate)))
