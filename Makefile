@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling newest clean
+.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling fci newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -60,6 +60,11 @@ injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 
 scaling: $(VENV)/.ready  ## constraints in every scale against an adversary, minutes
 	$(BIN)/python tests/harness/constraint_scaling.py
+
+fci:  ## rehearse a Franka on the simulator of its protocol, minutes
+	$(PYTHON) -m venv .venv-fci
+	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[fci,mujoco]" franky-sim
+	.venv-fci/bin/python tests/harness/fci/rehearse.py
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
 	.ci/newest python3.12

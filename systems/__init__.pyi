@@ -27,6 +27,8 @@ from .mujoco_gantry import MovedBodies as MovedBodies
 from .mujoco_gantry import MujocoGantry as MujocoGantry
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
+from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter
+from .pose_publisher import PosePublisher as PosePublisher
 from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter
 from .pose_wrench import PoseWrench as PoseWrench
 from .recorder import Recorder as Recorder

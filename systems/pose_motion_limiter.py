@@ -5,6 +5,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_limits import MotionLimits
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
@@ -93,7 +94,7 @@ class PoseMotionLimiter(LeafSystem):
         trajectory = Trajectory(6)
         # An instance that this system stored would be reported as leaked when the interpreter exits.
         if Ruckig(6).calculate(wanted, trajectory) not in (Result.Working, Result.Finished):
-            raise RuntimeError("no trajectory within the limits of the motion")
+            raise InputError(f"no trajectory from {state[:18]} to {state[18:24]} is within the limits of the motion")
         state[:18] = np.concatenate(trajectory.at_time(self._period)[:3])
         return state
 

@@ -27,6 +27,7 @@ from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_limits import FRANKA_LIMITS
 from guiderail.models.control.wrench_bound import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.templates import load_template
@@ -76,6 +77,8 @@ def built():
         systems.CenterOfPressure(0.5),
         systems.ContactDetector(plant, [body], [other], PERIOD),
         systems.HeartbeatMonitor(period=PERIOD, timeout=1.0),
+        systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),
+        systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
         systems.PoseRateLimiter(period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),

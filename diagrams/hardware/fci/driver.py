@@ -59,6 +59,7 @@ class FciDriver(PoseDriver):
             raise InputError("the driver fci needs the robot's host: give --robot-url")
         self._franky = client or _import_franky()
         self._robot: Any = None
+        self._is_lost = False
         self._motion: Any = None
         self._impedance: RobotImpedance | None = None
 
@@ -83,6 +84,8 @@ class FciDriver(PoseDriver):
     def read(self) -> JointStatus | None:
         """Return the newest status, None while no robot answers."""
         franky = self._franky
+        if self._is_lost:
+            return MALFORMED_STATUS  # each further call of the client would wait for a second
         if self._robot is None:
             try:
                 self._robot = franky.Robot(self.url, realtime_config=franky.RealtimeConfig.Ignore)
@@ -93,7 +96,8 @@ class FciDriver(PoseDriver):
                 return MALFORMED_STATUS
             state = self._robot.state
         except (franky.NetworkException, RuntimeError):  # the latter is a socket's, "Net Exception"
-            return MALFORMED_STATUS  # the connection is lost
+            self._is_lost = True
+            return MALFORMED_STATUS
         q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
         return JointStatus(state.time.to_sec(), q, v, -external)
 
@@ -148,6 +152,8 @@ class FciDriver(PoseDriver):
             InputError: If the error persists.
         """
         self._motion = None
+        if self._is_lost:
+            raise InputError(f"the connection to the robot at {self.url} is lost: start the program again")
         if not self._robot.recover_from_errors():
             raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
 
