@@ -42,4 +42,4 @@ def test_nothing_is_sent_before_the_arm_is_controlled():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_pose_that_is_not_finite_stops_the_robot(value):
-    assert publish(ArmState.RUNNING, POSE * value) == ["stop"] * 3
+    assert publish(ArmState.RUNNING, np.full(6, value)) == ["stop"] * 3
