@@ -2,11 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+OUTSIDE := .venv-outside
 # Meshcat and LCM use this machine's network only.
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling fci newest clean
+.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling fci newest outside clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -66,15 +67,31 @@ fci:  ## rehearse a Franka on the simulator of its protocol, minutes
 	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[fci,mujoco]" franky-sim
 	.venv-fci/bin/python tests/harness/fci/rehearse.py
 
+outside: $(OUTSIDE)/.ready  ## train in metaworld with guidance, in an environment of its own, hours (downloads 3 GB)
+	$(OUTSIDE)/bin/python -m pytest -q -c /dev/null --noconftest tests/research/outside_envs
+	for seed in 0 1 2 3 4; do \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance kgrl --seed $$seed --out runs/outside; done
+	for guidance in residual clipped_residual none; do \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance $$guidance --out runs/outside; \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance $$guidance --baselines --out runs/outside; done
+	$(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance kgrl --baselines --out runs/outside
+	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
+
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
 	.ci/newest python3.12
 	.ci/newest python3.13
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) $(OUTSIDE) build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
 $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	touch $@
+
+# metaworld and robosuite need an older MuJoCo than this package's extra: neither Drake nor that extra is installed here.
+$(OUTSIDE)/.ready: pyproject.toml research/outside_envs/requirements.txt
+	$(PYTHON) -m venv $(OUTSIDE)
+	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check -r research/outside_envs/requirements.txt -e .
 	touch $@
 
 $(VENV)/.ready: pyproject.toml setup.py constraints.txt

@@ -58,7 +58,7 @@ _SIMULATION_FAILURE = re.compile(
 MAX_POSITION, MAX_JOINT_SPEED = 10.0, 1e3
 
 
-class GuidedEnv(DrakeGymEnv):
+class DiagramEnv(DrakeGymEnv):
     """Gymnasium environment that runs a `TaskDiagram`.
 
     It keeps `DrakeGymEnv`'s interface and replaces its `reset` and `step`. The diagram is built once. A reset restores

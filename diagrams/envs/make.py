@@ -21,7 +21,7 @@ from guiderail.diagrams.envs.assemble import (
     make_randomize,
 )
 from guiderail.diagrams.envs.config import EnvConfig, freeze
-from guiderail.diagrams.envs.env import GuidedEnv, check_render_mode
+from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
@@ -67,7 +67,7 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
     return build_prior_knowledge(declared, make_station(declared))
 
 
-def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> GuidedEnv:
+def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
     """Build the environment `gymnasium.make("guiderail/<Task>-v0", ...)`.
 
     From this call on the process computes with one thread. Matrices are small here; where other processes use the
@@ -101,7 +101,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     diagram = replace(built.diagram, randomize=randomize, declaration=declared)
     release = partial(_IDLE[key].append, built)
     try:
-        return GuidedEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
+        return DiagramEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
     except BaseException:  # such as a browser view that finds no port
         release()
         raise

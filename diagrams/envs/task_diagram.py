@@ -1,4 +1,4 @@
-"""Task diagram: a wired task with the ports that `GuidedEnv` reads."""
+"""Task diagram: a wired task with the ports that `DiagramEnv` reads."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class TaskDiagram:
-    """Task, wired and built, as `GuidedEnv` runs it.
+    """Task, wired and built, as `DiagramEnv` runs it.
 
     The diagram exports the input ``action`` (A,), in [-1, 1], and these outputs:
 

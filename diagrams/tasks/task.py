@@ -94,7 +94,7 @@ class Task(ABC):
         statistics: Statistics of a table of episodes that only this task has; studies name them.
         isotropic_groups: Indices of outputs of one unit, group by group; residual learning moves all outputs of a group
             by the same amount. None: one group of all.
-        pushable: True if `GuidedEnv.push` may displace the robot.
+        pushable: True if `DiagramEnv.push` may displace the robot.
         config: Configuration of the environment.
         options: The task's own options, an instance of `Options`.
         has_held_out_distribution: True if `reset` samples from a held-out distribution if `options.held_out` is true.

@@ -1,5 +1,6 @@
 """Movement primitives learned from demonstrations, and the constraints and actions that modulate them."""
 
+from guiderail.models.primitives.alignment import align_demonstrations
 from guiderail.models.primitives.constraints import LinearConstraints
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential, make_kernel, register_kernel
@@ -26,6 +27,7 @@ __all__ = [
     "ReferenceTrajectory",
     "SquaredExponential",
     "UnsolvableError",
+    "align_demonstrations",
     "make_kernel",
     "pose_demonstrations",
     "pose_outputs",

@@ -174,7 +174,8 @@ class LcNsKmp:
         """Begin an episode of commands, one a control step, without a diagram.
 
         Args:
-            pose: Measured output (O,) that fills the history; the first mean by default.
+            pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first
+                mean by default.
             gain: Raw null-space action per unit of the action of `PrimitiveStepper.step`, (O,); ones by default.
             history_source: Outputs that the motion continues from.
 

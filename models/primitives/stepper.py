@@ -33,7 +33,8 @@ class PrimitiveStepper:
 
     Args:
         primitive: Primitive with O outputs.
-        pose: Measured output (O,) that fills the history; the first mean by default.
+        pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first mean by
+            default.
         gain: Raw null-space action per unit of the action (O,); ones by default.
         history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
             or is pushed by an operator.
@@ -59,9 +60,11 @@ class PrimitiveStepper:
         self.primitive, self.num_steps = primitive, 0
         self.gain = np.ones(primitive.num_outputs) if gain is None else self._checked(gain, "gain")
         first = primitive.reference.means[0]
-        pose = first if pose is None else self._checked(pose, "pose")
         self._is_measured = history_source == "measured"
-        self._history = np.tile(pose, (primitive.history, 1))
+        if pose is not None and np.asarray(pose).shape == (primitive.history, primitive.num_outputs):
+            self._history = np.array([self._checked(each, "pose") for each in np.asarray(pose)])
+        else:
+            self._history = np.tile(first if pose is None else self._checked(pose, "pose"), (primitive.history, 1))
         self._last = primitive.constraints.nearest(first)
 
     def step(self, action: ArrayLike, pose: ArrayLike | None = None) -> Command:

@@ -164,7 +164,8 @@ class StepFactor:
         sizes = np.abs(self.constraint_map) @ np.maximum(x.max(axis=0), -x.min(axis=0))
         finite = (np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (self.lower, self.upper))
         near_lower, near_upper = (rounding * (sizes + size) for size in finite)
-        lower, upper = (self.lower + near_lower).astype(np.float32), (self.upper - near_upper).astype(np.float32)
+        with np.errstate(over="ignore"):
+            lower, upper = (self.lower + near_lower).astype(np.float32), (self.upper - near_upper).astype(np.float32)
         transposed = self.constraint_map.astype(np.float32).T
         is_slack = np.empty(len(x), dtype=bool)
         buffer = np.empty((min(_CHUNK, len(x)), len(lower)), dtype=np.float32)

@@ -23,7 +23,7 @@ from pydrake.systems.framework import InputPort, OutputPort
 from stable_baselines3.common.buffers import NStepReplayBuffer
 
 import guiderail.systems
-from guiderail.diagrams.envs.env import GuidedEnv
+from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.tools.learning import batched_mlp, checkpoint, fast_sb3, off_policy, trainer
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
@@ -37,8 +37,8 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (trainer, "make_environment", "building the environment"),
     (trainer, "rollout", "rollout"),
     (trainer, "_save", "checkpoint"),
-    (GuidedEnv, "reset", "reset"),
-    (GuidedEnv, "step", "environment"),
+    (DiagramEnv, "reset", "reset"),
+    (DiagramEnv, "step", "environment"),
     (Simulator, "AdvanceTo", "Drake"),
     (InputPort, "Eval", "Drake, as a port is read"),
     (OutputPort, "Eval", "Drake, as a port is read"),

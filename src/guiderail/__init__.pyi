@@ -1,6 +1,6 @@
 from .diagrams.envs.assemble import build_skill_diagram as build_skill_diagram
 from .diagrams.envs.assemble import build_task_diagram as build_task_diagram
-from .diagrams.envs.env import GuidedEnv as GuidedEnv
+from .diagrams.envs.env import DiagramEnv as DiagramEnv
 from .diagrams.envs.make import make_env as make_env
 from .diagrams.envs.make import make_skill as make_skill
 from .diagrams.envs.observation import Observation as Observation
@@ -31,6 +31,7 @@ from .models.primitives import LinearConstraints as LinearConstraints
 from .models.primitives import Matern52 as Matern52
 from .models.primitives import ReferenceTrajectory as ReferenceTrajectory
 from .models.primitives import SquaredExponential as SquaredExponential
+from .models.primitives import align_demonstrations as align_demonstrations
 from .models.primitives import register_kernel as register_kernel
 from .models.robots.robot import Robot as Robot
 from .models.robots.robot import register_robot as register_robot
@@ -44,6 +45,13 @@ from .tools.evaluation.evaluation import Evaluation as Evaluation
 from .tools.evaluation.rollout import Callback as Callback
 from .tools.evaluation.rollout import Transition as Transition
 from .tools.evaluation.rollout import rollout as rollout
+from .tools.guided.env import GuidedEnv as GuidedEnv
+from .tools.guided.guide import Guide as Guide
+from .tools.guided.segment import Frame as Frame
+from .tools.guided.segment import Segment as Segment
+from .tools.guided.segment import cut_demonstrations as cut_demonstrations
+from .tools.guided.segment import find_events as find_events
+from .tools.guided.vector_env import GuidedVectorEnv as GuidedVectorEnv
 from .tools.imports import trust_imports as trust_imports
 from .tools.learning.learner import Learner as Learner
 from .tools.learning.learner import LearnerConfig as LearnerConfig

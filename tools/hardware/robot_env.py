@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from guiderail.diagrams.envs.env import GuidedEnv
+from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.station import HardwareStation
@@ -44,7 +44,7 @@ class RobotStoppedError(Exception):
         self.fault = fault
 
 
-class RobotEnv(GuidedEnv):
+class RobotEnv(DiagramEnv):
     """Environment of a `TaskDiagram` with a hardware station.
 
     A reset moves the arm: back along its path, and slowly to the start. If the arm is stopped, in an episode or a

@@ -1,4 +1,4 @@
-"""Reset and step of `GuidedEnv`, on a task so small that every number is known."""
+"""Reset and step of `DiagramEnv`, on a task so small that every number is known."""
 
 import gymnasium
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from guiderail.diagrams.envs.env import INFO_KEYS, GuidedEnv
+from guiderail.diagrams.envs.env import INFO_KEYS, DiagramEnv
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.task_diagram import TaskDiagram, round_period
 from guiderail.models.common.errors import InputError
@@ -101,7 +101,7 @@ def make(num_steps=20, **arguments):
         reward_terms=("double", "one"),
         randomize=randomize,
     )
-    env = GuidedEnv(task, **arguments)
+    env = DiagramEnv(task, **arguments)
     env.toy = toy
     return env
 
@@ -379,9 +379,9 @@ def test_stepping_on_after_the_end_is_refused():
 
 
 def test_metadata_is_not_shared_between_environments():
-    before = dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)
+    before = dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(DiagramEnv.metadata)
     first, second = make(action_repeat=1), make(action_repeat=5)
-    assert (dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)) == before
+    assert (dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(DiagramEnv.metadata)) == before
     assert (first.metadata["render_fps"], second.metadata["render_fps"]) == (10, 2)
 
 

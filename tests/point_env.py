@@ -1,0 +1,62 @@
+"""Environment of another origin: a point that follows velocity actions towards a target, and a gripper."""
+
+import gymnasium
+import numpy as np
+
+from guiderail import Demonstrations
+
+PERIOD = 0.05
+SPEED = 0.04  # largest displacement in a step [m]
+
+
+class PointEnv(gymnasium.Env):
+    """Point at p; the target lies at `target`, and the episode ends in success near it with a closed gripper."""
+
+    def __init__(self, kind="box"):
+        spaces = gymnasium.spaces
+        self.kind, box = kind, spaces.Box(-np.inf, np.inf, (6,), np.float64)
+        self.observation_space = spaces.Dict({"state": box}) if kind == "dict" else box
+        if kind == "image":
+            self.observation_space = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.commands = []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.p = self.np_random.uniform(-0.02, 0.02, 3)
+        self.target = np.array([0.5, 0.1, 0.2]) + self.np_random.uniform(-0.05, 0.05, 3)
+        self.R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return self._observe(), {"own": 1}
+
+    def step(self, action):
+        self.p = self.p + SPEED * np.clip(action[:3], -1, 1)
+        distance = np.linalg.norm(self.p - self.target)
+        success = bool(distance < 0.01 and action[3] > 0)
+        return self._observe(), -distance, success, False, {"is_success": success, "own": 2}
+
+    def _observe(self):
+        if self.kind == "image":
+            return np.zeros((4, 4, 3), np.uint8)
+        state = np.concatenate([self.p, self.target])
+        return {"state": state} if self.kind == "dict" else state
+
+
+def pose(env, observation):
+    return env.unwrapped.p.copy()
+
+
+def to_action(env, observation, command, extra):
+    inner = env.unwrapped
+    inner.commands.append(command.copy())
+    return np.append(np.clip((command - inner.p) / SPEED, -1, 1), 0.0 if extra is None else extra)
+
+
+def demonstrations(end=(0.0, 0.0, 0.0), steps=25, count=5, seed=0, start=(-0.5, -0.1, -0.2)):
+    """Return curved motions from about `start` to `end`, in the target's frame."""
+    rng, t = np.random.default_rng(seed), PERIOD * np.arange(steps)
+    s = np.linspace(0, 1, steps)[:, None]
+    outputs = []
+    for _ in range(count):
+        bend = rng.normal(scale=0.03, size=3)
+        outputs.append((1 - s) * np.array(start) + s * np.array(end) + 4 * s * (1 - s) * bend)
+    return Demonstrations([t] * count, outputs)

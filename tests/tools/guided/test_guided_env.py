@@ -1,0 +1,312 @@
+"""Guidance around an environment of another origin: constraints, frames, segments, observations and refusals."""
+
+import gymnasium
+import numpy as np
+import pytest
+from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
+
+from guiderail import Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segment
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import transform_to_pose
+from guiderail.models.common.transforms import RigidTransform
+from guiderail.models.primitives import UnsolvableError
+from guiderail.models.primitives.bounds import compute_bounds
+
+TOLERANCE = 1e-9
+ENFORCED = ("kgrl", "skgrl", "clipped_residual")
+SHOWN = demonstrations()
+LIMIT = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
+
+
+def at_target(env, observation):
+    return env.unwrapped.target
+
+
+def guided(guidance="kgrl", kind="box", **keywords):
+    given = {
+        "demonstrations": SHOWN, "frame": at_target, "constraints": LIMIT, "pose": pose, "to_action": to_action,
+        "guidance": guidance, "period": PERIOD, "action_repeat": 3,
+    }  # fmt: skip
+    return GuidedEnv(PointEnv(kind), **(given | keywords))
+
+
+def episode(env, policy, seed=0, options=None):
+    observation, info = env.reset(seed=seed, options=options)
+    infos, done, k = [info], False, 0
+    while not done:
+        observation, _, terminated, truncated, info = env.step(policy(k))
+        infos.append({**info, "observation": observation, "terminated": terminated, "truncated": truncated})
+        done, k = terminated or truncated, k + 1
+    return infos
+
+
+@pytest.mark.parametrize("guidance", [*ENFORCED, "kmp"])
+def test_motion_without_actions_ends_at_the_target(guidance):
+    env = guided(guidance, constraints=None)
+    last = episode(env, lambda k: np.zeros(3))[-1]
+    assert last["phase"] == 1.0
+    assert np.linalg.norm(env.unwrapped.p - env.unwrapped.target) < 0.02
+    assert last["truncated"] and not last["terminated"]  # noqa: PT018
+
+
+@pytest.mark.parametrize("guidance", ENFORCED)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_command_satisfies_the_constraints_for_any_actions(guidance, seed):
+    env, rng = guided(guidance, action_scale=20.0), np.random.default_rng(seed)
+    policies = [
+        lambda k: rng.uniform(-1, 1, 3),
+        lambda k: rng.choice([-1.0, 1.0], 3),
+        lambda k: np.array([0, 1.0, 0]),
+        lambda k: np.array([0, -1.0, 0]),
+    ]
+    for policy in policies:
+        env.unwrapped.commands.clear()
+        infos = episode(env, policy, seed)
+        local = np.array(env.unwrapped.commands) - env.unwrapped.target
+        assert max(LIMIT.violation(y) for y in local) <= TOLERANCE
+        assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
+        assert sum(info["fallback"] for info in infos[1:]) == 0
+    assert np.abs(local[:, 1] + 0.13).min() < 1e-6  # the last policy reaches the bound
+
+
+def test_residual_leaves_the_constraints_and_says_so():
+    infos = episode(guided("residual", action_scale=5.0), lambda k: np.array([0.0, 1.0, 0.0]))
+    assert max(info["constraint_violation"] for info in infos[1:]) > 0.02
+
+
+def test_action_of_one_dimension_equals_that_entry_of_a_full_action():
+    env = guided(action_dims=[1])
+    assert env.action_space.shape == (1,)
+    one, full = episode(env, lambda k: np.ones(1)), episode(guided(), lambda k: np.array([0.0, 1.0, 0.0]))
+    for a, b in zip(one[1:], full[1:], strict=True):
+        np.testing.assert_allclose(a["command"], b["command"], atol=1e-12)
+
+
+def test_info_and_observation_have_phase_and_command():
+    env = guided(history=4)
+    assert env.observation_space.shape == (6 + 1 + 3,)
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert info["own"] == 1
+    assert observation[6] == -1.0
+    observation, reward, _, _, info = env.step(np.zeros(3))
+    assert env.observation_space.contains(observation)
+    assert observation[6] == pytest.approx(2 * info["phase"] - 1)
+    assert info["own"] == 2
+    assert info["segment"] == "0"
+    assert np.abs(observation[7:]).max() < 1.5
+    assert reward < 0
+
+
+@pytest.mark.parametrize(("kind", "keys"), [("dict", {"state", "phase"}), ("image", {"observation", "phase"})])
+def test_other_observation_spaces_are_extended(kind, keys):
+    env = guided(kind=kind, observe=["phase"])
+    observation, _ = env.reset(seed=0)
+    assert set(observation) == keys
+    assert env.observation_space.contains(observation)
+
+
+def test_observation_is_unchanged_without_additions():
+    env = guided(observe=())
+    assert env.observation_space == env.env.observation_space
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (6,)
+
+
+def two_segments(**second):
+    first = demonstrations(end=(0.0, 0.0, 0.1))
+    down = demonstrations(start=(0.0, 0.0, 0.1), steps=15, seed=1)
+    return [
+        Segment(first, frame=at_target, extra=-1.0, name="approach"),
+        Segment(down, **{"frame": at_target, "extra": 1.0, "name": "insert", "dwell": 6, **second}),
+    ]
+
+
+def test_segments_follow_each_other_with_their_extra():
+    env = guided(demonstrations=two_segments(), constraints=None, frame=None)
+    infos = episode(env, lambda k: np.zeros(3))
+    names = [info["segment"] for info in infos]
+    assert names == sorted(names, key=["approach", "insert"].index)
+    assert infos[-1]["is_success"]  # only a closed gripper at the target succeeds
+    assert infos[-1]["terminated"]
+
+
+def test_frame_is_read_when_its_segment_begins():
+    seen = []
+
+    def moving(env, observation):
+        seen.append(env.unwrapped.p.copy())
+        return env.unwrapped.target
+
+    env = guided(demonstrations=two_segments(frame=moving), constraints=None, frame=None)
+    episode(env, lambda k: np.zeros(3))
+    assert len(seen) == 1
+    assert np.linalg.norm(seen[0] - env.unwrapped.target) < 0.15
+
+
+def test_event_ends_a_segment_early():
+    late, early = two_segments(), two_segments()
+    early[0] = Segment(
+        early[0].demonstrations, frame=at_target, until=lambda env, o: env.unwrapped.p[0] > 0.2, name="approach"
+    )
+    counts = []
+    for segments in (late, early):
+        env = guided(demonstrations=segments, constraints=None, frame=None, action_repeat=1)
+        counts.append(sum(info["segment"] == "approach" for info in episode(env, lambda k: np.zeros(3))))
+    assert counts[1] < counts[0] - 3
+
+
+def test_rotated_frame_gives_the_same_motion():
+    R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = [y @ R for y in SHOWN.outputs]  # R^T applied to every row
+    rotated = type(SHOWN)(SHOWN.times, turned)
+    plain = guided(constraints=None)
+    other = guided(demonstrations=rotated, constraints=None, frame=lambda env, o: Frame(env.unwrapped.target, R))
+    a, b = (episode(env, lambda k: np.zeros(3)) for env in (plain, other))
+    np.testing.assert_allclose(a[5]["command"], b[5]["command"], atol=5e-3)
+    np.testing.assert_allclose(a[-1]["command"], b[-1]["command"], atol=5e-3)
+
+
+@pytest.mark.parametrize("orientation", ["rotation_vector", "euler_zyx"])
+def test_frame_transforms_poses_there_and_back(orientation):
+    frame = Frame([0.1, 0.2, 0.3], [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    output = np.array([0.5, -0.2, 0.1, 0.3, 0.4, -0.5])
+    inside = frame.to_frame(output, orientation)
+    assert not np.allclose(inside[3:], output[3:])
+    np.testing.assert_allclose(frame.to_world(inside, orientation), output, atol=1e-12)
+    turned = frame.to_frame(output, orientation, near=np.array([0, 0, 0, 6.3, 0, 0]))
+    np.testing.assert_allclose(frame.to_world(turned, orientation)[:3], output[:3], atol=1e-12)
+
+
+def test_demonstrated_bounds_and_callables_are_constraints():
+    bounds = compute_bounds(SHOWN, phases=3, margin=0.1, min_margin=0.005)
+    for constraints in (bounds, lambda env, o: LIMIT, lambda env, o: bounds):
+        env = guided(constraints=constraints, action_scale=20.0)
+        infos = episode(env, lambda k: np.array([1.0, 1.0, -1.0]))
+        assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
+
+
+def test_fallback_is_counted_and_stays_inside(monkeypatch):
+    env = guided()
+    env.reset(seed=0)
+
+    def fail(*_):
+        raise UnsolvableError("no solution")
+
+    monkeypatch.setattr("guiderail.models.primitives.lc_ns_kmp.LcNsKmp.predict", fail)
+    *_, info = env.step(np.zeros(3))
+    assert info["fallback"] == 3
+    assert info["constraint_violation"] <= TOLERANCE
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0, 0], [np.inf, 0, 0], [0.0, 0.0], ["a", "b", "c"]])
+def test_wrong_action_is_refused_before_the_environment_moves(bad):
+    env = guided()
+    env.reset(seed=0)
+    before = env.unwrapped.p.copy()
+    with pytest.raises(InputError, match="action"):
+        env.step(bad)
+    np.testing.assert_array_equal(env.unwrapped.p, before)
+    env.step(np.zeros(3))
+
+
+def test_action_beyond_the_range_is_clipped():
+    a, b = (episode(guided(), lambda k, s=scale: np.full(3, s)) for scale in (1.0, 100.0))
+    np.testing.assert_array_equal(a[-1]["command"], b[-1]["command"])
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"guidance": "kgr"}, "did you mean kgrl"),
+        ({"demonstrations": None}, "needs demonstrations="),
+        ({"demonstrations": [], "constraints": None, "frame": None}, "at least one segment"),
+        ({"period": None}, "period of the environment"),
+        ({"period": -1.0}, "period of the environment"),
+        ({"action_repeat": 0}, "action_repeat"),
+        ({"history": 0}, "history"),
+        ({"observe": ["force"]}, "observe"),
+        ({"action_dims": [7]}, "action_dims"),
+        ({"constraints": LinearConstraints.none(2)}, "2 outputs"),
+        ({"constraints": [1.0]}, "constraints of a segment"),
+        ({"guidance": "template"}, "template="),
+        ({"demonstrations": two_segments()}, "each Segment"),
+    ],
+)
+def test_wrong_argument_is_refused(keywords, message):
+    with pytest.raises(InputError, match=message):
+        guided(**keywords)
+
+
+@pytest.mark.parametrize("wrong", [lambda e, o: np.full(3, np.nan), lambda e, o: np.zeros(2)])
+def test_wrong_pose_is_refused_at_reset(wrong):
+    env = guided(pose=wrong)
+    with pytest.raises(InputError, match="pose must return 3 finite numbers"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "residual"])
+def test_vector_environment_equals_single_ones(guidance):
+    keywords = {
+        "demonstrations": SHOWN, "frame": at_target, "constraints": LIMIT, "pose": pose, "to_action": to_action,
+        "guidance": guidance, "period": PERIOD, "action_repeat": 2,
+    }  # fmt: skip
+    vector = GuidedVectorEnv([PointEnv] * 3, **keywords)
+    singles = [GuidedEnv(PointEnv(), **keywords) for _ in range(3)]
+    rng = np.random.default_rng(0)
+    observations, _ = vector.reset(seed=[3, 4, 5])
+    alone = [env.reset(seed=seed)[0] for env, seed in zip(singles, (3, 4, 5), strict=True)]
+    np.testing.assert_allclose(observations, alone, atol=1e-12)
+    done = [False] * 3
+    for _ in range(15):
+        actions = rng.uniform(-1, 1, (3, 3))
+        observations, rewards, terminated, truncated, infos = vector.step(actions)
+        for i, env in enumerate(singles):
+            if done[i]:
+                observation, _ = env.reset()
+                done[i] = False
+            else:
+                observation, reward, end, cut, info = env.step(actions[i])
+                done[i] = end or cut
+                assert rewards[i] == pytest.approx(reward, abs=1e-9)
+                assert (terminated[i], truncated[i]) == (end, cut)
+                assert infos["constraint_violation"][i] == pytest.approx(info["constraint_violation"], abs=1e-12)
+            np.testing.assert_allclose(observations[i], observation, atol=1e-6)
+    assert vector.single_action_space.shape == (3,)
+
+
+class PoseEnv(PointEnv):
+    """The same with an orientation that follows at once."""
+
+    def reset(self, *, seed=None, options=None):
+        result = super().reset(seed=seed, options=options)
+        self.p = np.array([0.6, -0.3, 0.45])
+        return result
+
+
+def test_template_guides_within_its_active_constraints():
+    frames = {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}
+    env = GuidedEnv(
+        PoseEnv(),
+        guidance="template",
+        template="pouring",
+        template_frames=lambda env, o: frames,
+        pose=lambda env, o: transform_to_pose(RigidTransform(env.unwrapped.p)),
+        to_action=lambda env, o, command, extra: np.append(np.clip((command[:3] - env.unwrapped.p) / 0.04, -1, 1), 0),
+        period=0.02,
+    )
+    env.reset(seed=0)
+    states = set()
+    for _ in range(60):
+        *_, info = env.step(np.array([0.0, 1.0, -1.0]))
+        assert info["constraint_violation"] <= TOLERANCE
+        states.add(info["segment"])
+    assert len(states) > 1
+    assert env.action_space.shape == (3,)
+
+
+def test_gymnasium_checker_accepts_the_environment():
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(guided(), skip_render_check=True)
+    assert isinstance(guided(), gymnasium.Wrapper)

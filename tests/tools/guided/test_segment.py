@@ -1,0 +1,98 @@
+"""Cutting at events, discrete outputs and alignment in time."""
+
+import numpy as np
+import pytest
+
+from guiderail import Demonstrations, Frame, Segment, align_demonstrations, cut_demonstrations, find_events
+from guiderail.models.common.errors import InputError
+
+
+def recordings():
+    t = 0.1 * np.arange(40)
+    paths = [np.column_stack([np.linspace(0, 1, 40), np.full(40, float(m))]) for m in range(3)]
+    return Demonstrations([t] * 3, paths, ["x [m]", "y [m]"])
+
+
+def test_events_are_found_one_after_the_other():
+    signals = [np.array([[0], [1], [0], [1], [2]]), np.array([[1], [1], [0], [2], [1]])]
+    events = find_events(signals, [lambda s: s[0] == 1, lambda s: s[0] == 2])
+    assert events == [[1, 4], [1, 3]]
+    with pytest.raises(InputError, match="event 1 does not occur in recording 0"):
+        find_events(signals, [lambda s: s[0] == 2, lambda s: s[0] == 1])
+
+
+def test_cut_parts_share_the_sample_and_begin_at_zero():
+    parts = cut_demonstrations(recordings(), [[10, 30], [12, 25], [9, 20]])
+    assert [len(part.times[0]) for part in parts] == [11, 21, 10]
+    assert all(t[0] == 0.0 for part in parts for t in part.times)
+    np.testing.assert_array_equal(parts[0].outputs[1][-1], parts[1].outputs[1][0])
+    assert parts[2].names == ("x [m]", "y [m]")
+
+
+@pytest.mark.parametrize(
+    "cuts", [[[10]], [[10], [10], [0]], [[10], [10], [39]], [[10, 5], [5, 10], [5, 10]], [[1], [1, 2], [1]]]
+)
+def test_wrong_cut_is_refused(cuts):
+    with pytest.raises(InputError, match="cuts"):
+        cut_demonstrations(recordings(), cuts)
+
+
+def test_discrete_output_is_the_most_frequent_at_each_phase():
+    grips = [np.where(np.arange(40) < k, -1, 1) for k in (10, 20, 30)]
+    values = Segment(recordings(), discrete=grips).discrete_values(20)
+    assert [int(v) for v in values] == [-1] * 10 + [1] * 10
+    with pytest.raises(InputError, match="a value for each sample"):
+        Segment(recordings(), discrete=grips[:2]).discrete_values(20)
+    with pytest.raises(InputError, match="not both"):
+        Segment(recordings(), discrete=grips, extra=1.0)
+
+
+@pytest.mark.parametrize(("keywords", "message"), [({"num_steps": 11}, "at least 12"), ({"dwell": -1}, "at least 0")])
+def test_wrong_number_of_steps_is_refused(keywords, message):
+    with pytest.raises(InputError, match=message):
+        Segment(recordings(), **keywords)
+
+
+def test_number_of_steps_follows_from_the_period():
+    segment = Segment(recordings())
+    assert segment.steps_of(0.1) == 40
+    assert segment.steps_of(0.05) == 79
+    assert Segment(recordings(), num_steps=20).steps_of(None) == 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([np.nan, 0, 0],), "origin must be finite"),
+        (([0, 0, 0], np.eye(2)), "orthonormal"),
+        (([0, 0, 0], 2 * np.eye(3)), "orthonormal"),
+    ],
+)
+def test_wrong_frame_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Frame(*arguments)
+
+
+def test_frame_that_does_not_fit_the_outputs_is_refused():
+    with pytest.raises(InputError, match="does not fit outputs of 2 numbers"):
+        Frame([0, 0, 0]).to_world(np.zeros(2), "rotation_vector")
+    with pytest.raises(InputError, match="and a rotation does not fit outputs of 4 numbers"):
+        Frame([0, 0, 0], np.eye(3)).to_world(np.zeros(4), "rotation_vector")
+
+
+def test_alignment_moves_an_event_to_the_same_phase():
+    t = np.linspace(0, 1, 101)
+    steps = [np.column_stack([1 / (1 + np.exp(-60 * (t - at))), t * 0]) for at in (0.4, 0.5, 0.6)]
+    before = Demonstrations([t] * 3, steps)
+    after = align_demonstrations(before, band=0.3)
+    at = [[int(np.argmax(y[:, 0] > 0.5)) for y in shown.outputs] for shown in (before, after)]
+    assert np.ptp(at[0]) >= 19
+    assert np.ptp(at[1]) <= 2
+    assert all(y.min() >= 0 and y.max() <= 1 for y in after.outputs)
+    np.testing.assert_array_equal(after.outputs[1], steps[1])
+
+
+@pytest.mark.parametrize("band", [0.0, -1.0, 1.5])
+def test_wrong_band_is_refused(band):
+    with pytest.raises(InputError, match="band"):
+        align_demonstrations(recordings(), band)

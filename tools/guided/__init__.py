@@ -1,0 +1,1 @@
+"""Guidance around environments that were made elsewhere: `GuidedEnv`, which needs neither Drake nor PyTorch."""

@@ -1,0 +1,224 @@
+"""Guidance around any Gymnasium environment: the policy's action moves a demonstrated motion within constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict
+
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.poses import Orientation
+from guiderail.models.templates import SharedControlTemplate, load_template
+from guiderail.tools.guided.guide import Guide, GuideCommand, GuideSettings, PrimitiveGuide, TemplateGuide, predict
+from guiderail.tools.guided.segment import Constraints, Segment
+
+OBSERVED = ("phase", "command")
+
+
+class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Environment whose actions move the command of a movement primitive or of a template, within its constraints.
+
+    The action is (A,) in [−1, 1], one entry for each of `action_dims` or each input of the template. It is applied for
+    `action_repeat` steps of the environment, whose rewards are added up. An episode is truncated when the motion has
+    ended. `info` has, besides the environment's own entries: `constraint_violation` (the largest of the commands of the
+    action's steps; negative inside, at most 1e-9 for guidance that enforces the constraints), `fallback` (number of
+    these steps without a solution), `phase` (0 to 1), `command` (O,) and `segment` (its name).
+
+    Args:
+        env: Environment to wrap; its own action is what `to_action` returns.
+        demonstrations: One motion in the world, its file, or segments with frames of their own.
+        pose: (env, observation) → measured outputs (O,) in the world, such as a position, or a position and an
+            orientation (see `orientation`).
+        to_action: (env, observation, command, extra) → action of `env` that moves it to the command (O,); `extra` is
+            the segment's discrete output, such as a gripper's.
+        guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (an action is added to it, without
+            constraints), "clipped_residual" (the same, moved to the nearest point within the constraints), "template",
+            or a `Guide`.
+        constraints: Constraints of a single motion without segments; `Segment` has its own.
+        frame: Frame of a single motion without segments, as in `Segment`.
+        template: Template, or the name or file of one, for guidance="template".
+        template_frames: (env, observation) → poses of the template's objects by name, called at reset.
+        period: Duration of a step of `env` [s], positive.
+        action_repeat: Steps of `env` for which an action is applied, at least 1.
+        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_dims: Indices of the outputs that an action moves; all by default.
+        history: P, past outputs that the motion of sKGRL passes through, at least 1.
+        history_variance: ρ, variance of the past outputs [output²].
+        horizon: H, future points at which the constraints are satisfied.
+        orientation: Meaning of outputs 3 to 6: "rotation_vector" or "euler_zyx".
+        observe: What is appended to the observation: "phase" (1,), and "command" (O,), the last command in the
+            segment's frame, scaled to the demonstrations' range.
+
+    Raises:
+        InputError: If an argument is out of range. In `reset`, if the measured pose is not finite. In `step`, if the
+            action is not (A,) finite numbers; the environment has not moved then.
+
+    Attributes:
+        guide: Guide, which computes the commands.
+        action_repeat: Steps of the environment for each action.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        *,
+        demonstrations: Demonstrations | Sequence[Segment] | str | Path | None = None,
+        pose: Callable[[Any, Any], np.ndarray],
+        to_action: Callable[[Any, Any, np.ndarray, Any], Any],
+        guidance: str | Guide = "skgrl",
+        constraints: Constraints | Callable[[Any, Any], Constraints] | None = None,
+        frame: Callable[[Any, Any], Any] | None = None,
+        template: SharedControlTemplate | str | Path | None = None,
+        template_frames: Callable[[Any, Any], Mapping[str, Any]] | None = None,
+        period: float | None = None,
+        action_repeat: int = 5,
+        action_scale: float = 1.0,
+        action_dims: Sequence[int] | None = None,
+        history: int = 4,
+        history_variance: float = 1e-6,
+        horizon: int = 20,
+        orientation: Orientation = "rotation_vector",
+        observe: Sequence[str] = OBSERVED,
+    ):
+        super().__init__(env)
+        if int(action_repeat) != action_repeat or action_repeat < 1:
+            raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
+        if int(history) != history or history < 1:
+            raise InputError(f"history is a number of outputs, at least 1, not {brief(history)}")
+        unknown = [name for name in observe if name not in OBSERVED]
+        if unknown or isinstance(observe, str):
+            raise InputError(f"observe has some of {', '.join(OBSERVED)}, not {brief(observe)}")
+        if isinstance(guidance, Guide):
+            self.guide = guidance
+        elif guidance == "template":
+            if template is None or template_frames is None:
+                raise InputError("guidance by a template needs template= and template_frames=")
+            if not isinstance(template, SharedControlTemplate):
+                template = load_template(template)
+            self.guide = TemplateGuide(template, template_frames, period)
+        else:
+            settings = GuideSettings(action_scale, action_dims, int(history), history_variance, horizon, orientation)
+            self.guide = PrimitiveGuide(_segments(demonstrations, constraints, frame), guidance, settings, period)
+        self.action_repeat, self._observe = int(action_repeat), tuple(observe)
+        self._pose, self._to_action = pose, to_action
+        self._command: GuideCommand | None = None
+        self.action_space = Box(-1.0, 1.0, (self.guide.num_actions,), np.float32)
+        self.observation_space = self._extended_space(env.observation_space)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment and begin the motion at the measured pose."""
+        self._observation, info = self.env.reset(seed=seed, options=options)
+        measured = self._measured()
+        self.guide.reset(self.env, self._observation, measured)
+        return self._extended(), {**info, "phase": self.guide.phase, "segment": self.guide.segment_name}
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Apply an action (A,) for `action_repeat` steps of the environment."""
+        self.begin_action(action)
+        while not self.is_action_complete:
+            self.advance(predict(self.request()))
+        return self.end_action()
+
+    def begin_action(self, action: Any) -> None:
+        """Begin a step; `request`, `advance` and `end_action` are its parts, for several environments at once.
+
+        Raises:
+            InputError: If the action is not (A,) finite numbers.
+        """
+        checked = as_numbers(action, "an action")
+        if checked.shape != (self.guide.num_actions,) or not np.isfinite(checked).all():
+            raise InputError(f"an action must be {self.guide.num_actions} finite numbers, not {brief(action)}")
+        self._action, self._count, self._reward = checked, 0, 0.0
+        self._violation, self._fallbacks = -np.inf, 0
+        self._terminated = self._truncated = False
+        self._info: dict[str, Any] = {}
+
+    @property
+    def is_action_complete(self) -> bool:
+        """True after the last step of an action, or the end of the episode."""
+        return self._count >= self.action_repeat or self._terminated or self._truncated
+
+    def request(self) -> Any:
+        """Return the prediction of the next step, or None."""
+        return self.guide.request(self.env, self._observation, self._action, self._measured())
+
+    def advance(self, output: np.ndarray | None) -> None:
+        """Step the environment with the output (O,) of the requested prediction, or None if there is no solution."""
+        self._command = command = self.guide.finish(output)
+        action = self._to_action(self.env, self._observation, command.output, command.extra)
+        self._observation, reward, self._terminated, self._truncated, self._info = self.env.step(action)
+        self._reward += float(reward)
+        self._violation = max(self._violation, command.violation)
+        self._fallbacks += command.is_fallback
+        self._count += 1
+        self._truncated = bool(self._truncated) or (self.guide.is_finished and not self._terminated)
+
+    def end_action(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Return the result of the step."""
+        assert self._command is not None
+        info = {
+            **self._info,
+            "constraint_violation": self._violation,
+            "fallback": self._fallbacks,
+            "phase": self.guide.phase,
+            "command": self._command.output.copy(),
+            "segment": self.guide.segment_name,
+        }
+        return self._extended(), self._reward, bool(self._terminated), bool(self._truncated), info
+
+    def _measured(self) -> np.ndarray:
+        measured = as_numbers(self._pose(self.env, self._observation), "the measured pose")
+        if measured.shape != (self.guide.num_outputs,) or not np.isfinite(measured).all():
+            raise InputError(f"pose must return {self.guide.num_outputs} finite numbers, not {brief(measured)}")
+        return measured
+
+    def _extra_spaces(self) -> dict[str, Box]:
+        sizes = {"phase": 1, "command": self.guide.num_outputs}
+        return {name: Box(-np.inf, np.inf, (sizes[name],), np.float32) for name in self._observe}
+
+    def _extended_space(self, space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
+        extra = self._extra_spaces()
+        if not extra:
+            return space
+        if isinstance(space, Box) and len(space.shape) == 1:
+            low = np.concatenate([space.low, *(one.low for one in extra.values())])
+            high = np.concatenate([space.high, *(one.high for one in extra.values())])
+            return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        if isinstance(space, Dict):
+            return Dict({**space.spaces, **extra})
+        return Dict({"observation": space, **extra})
+
+    def _extended(self) -> Any:
+        values = {
+            "phase": lambda: [2.0 * self.guide.phase - 1.0],
+            "command": self.guide.scaled_command,
+        }
+        extra = {name: np.asarray(values[name](), dtype=np.float32) for name in self._observe}
+        if not extra:
+            return self._observation
+        space = self.env.observation_space
+        if isinstance(space, Box) and len(space.shape) == 1:
+            return np.concatenate([self._observation, *extra.values()]).astype(np.float32)
+        if isinstance(space, Dict):
+            return {**self._observation, **extra}
+        return {"observation": self._observation, **extra}
+
+
+def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment]:
+    """Return the segments of what is given as demonstrations."""
+    if demonstrations is None:
+        raise InputError("guidance by demonstrations needs demonstrations=")
+    if isinstance(demonstrations, Demonstrations | str | Path):
+        return [Segment(demonstrations, frame=frame, constraints=constraints)]
+    segments = list(demonstrations)
+    if not all(isinstance(segment, Segment) for segment in segments):
+        raise InputError("demonstrations are Demonstrations, a file, or a list of Segment")
+    if constraints is not None or frame is not None:
+        raise InputError("give constraints and frame to each Segment")
+    return segments

@@ -1,0 +1,404 @@
+"""Guides: commands of an episode under a policy's actions, from demonstrations or a shared control template."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.poses import POSE_SIZE, pose_to_transform, transform_to_pose
+from guiderail.models.common.registry import did_you_mean
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
+from guiderail.models.primitives.bounds import DemonstratedBounds
+from guiderail.models.primitives.fit import Selection, fit
+from guiderail.models.primitives.gains import authority_gains, deviation
+from guiderail.models.primitives.poses import Orientation
+from guiderail.models.templates import SharedControlTemplate
+from guiderail.tools.guided.segment import Frame, Segment
+
+PRIMITIVE_GUIDANCE = ("kgrl", "skgrl", "kmp", "residual", "clipped_residual")
+GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
+
+Request = tuple[LcNsKmp, int, np.ndarray, np.ndarray | None]
+"""Primitive, and the arguments of its `predict`."""
+
+
+@dataclass(frozen=True)
+class GuideCommand:
+    """Command of one control step.
+
+    Attributes:
+        output: Command (O,) in the world.
+        violation: Violation of the segment's constraints; negative inside, −inf without constraints.
+        is_fallback: True if no command within the constraints was found, and one near the last command is sent.
+        extra: Discrete output of the segment, for `to_action`.
+    """
+
+    output: np.ndarray
+    violation: float
+    is_fallback: bool
+    extra: Any
+
+
+class Guide(ABC):
+    """Commands of an episode, one a control step.
+
+    Attributes:
+        num_outputs: Number O of outputs of a command.
+        num_actions: Number of entries of an action.
+    """
+
+    num_outputs: int
+    num_actions: int
+
+    def copy(self) -> Guide:
+        """Return a guide for another environment, with an episode of its own and the same fitted parts."""
+        return copy(self)
+
+    @abstractmethod
+    def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
+        """Begin an episode at a measured pose (O,)."""
+
+    @abstractmethod
+    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
+        """Begin a control step; return the prediction that `finish` needs, or None.
+
+        Args:
+            env: Environment, for the callables of segments and templates.
+            observation: Its last observation.
+            action: Policy's action (A,), in [−1, 1].
+            pose: Measured pose (O,).
+        """
+
+    @abstractmethod
+    def finish(self, output: np.ndarray | None) -> GuideCommand:
+        """Complete the control step with the output (O,) of the requested prediction, or None if it was not found."""
+
+    @property
+    @abstractmethod
+    def is_finished(self) -> bool:
+        """True after the last step of the last segment."""
+
+    @property
+    @abstractmethod
+    def phase(self) -> float:
+        """Phase of the motion, from 0 to 1."""
+
+    @property
+    @abstractmethod
+    def segment_name(self) -> str:
+        """Name of the current segment."""
+
+    @abstractmethod
+    def scaled_command(self) -> np.ndarray:
+        """Return the last command (O,) in the segment's frame, scaled to about ±1."""
+
+
+class _FittedSegment:
+    """Segment with its reference, primitive and gains."""
+
+    def __init__(self, segment: Segment, guidance: str, settings: GuideSettings, period: float | None):
+        self.segment, self.guidance, self.settings = segment, guidance, settings
+        self.num_steps = segment.steps_of(period)
+        self.selection: Selection = fit(
+            segment.recorded, num_steps=self.num_steps, floor=segment.floor, horizon=settings.horizon
+        )
+        self.reference = self.selection.reference
+        self.num_outputs = self.reference.num_outputs
+        self.discrete = segment.discrete_values(self.num_steps)
+        samples = np.concatenate(segment.recorded.outputs)
+        self.center = 0.5 * (samples.max(axis=0) + samples.min(axis=0))
+        self.half_range = np.maximum(0.5 * np.ptp(samples, axis=0), np.sqrt(np.mean(self._variances(), axis=0)))
+        self._primitive: LcNsKmp | None = None
+        given = segment.constraints
+        if not callable(given):
+            self.primitive_for(self.as_constraints(given))  # refuses wrong constraints before an episode
+
+    def _variances(self) -> np.ndarray:
+        return self.reference.standard_deviations**2
+
+    def as_constraints(self, given: Any) -> LinearConstraints:
+        """Return constraints as linear ones, phases of demonstrated bounds spread over the steps."""
+        if given is None:
+            return LinearConstraints.none(self.num_outputs)
+        if isinstance(given, DemonstratedBounds):
+            phase = np.searchsorted(given.phases, np.linspace(0.0, 1.0, self.num_steps), side="right") - 1
+            if len(given.phases) == 1:
+                return LinearConstraints.box(given.lower[0], given.upper[0])
+            return LinearConstraints.box(given.lower[phase], given.upper[phase])
+        if not isinstance(given, LinearConstraints):
+            raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(given)}")
+        return given
+
+    def primitive_for(self, constraints: LinearConstraints) -> tuple[LcNsKmp, np.ndarray]:
+        """Return the primitive under constraints, which is kept while they are the same, and the gains (O,)."""
+        current = self._primitive
+        same = current is not None and all(
+            np.array_equal(a, b)
+            for a, b in ((current.constraints.G, constraints.G), (current.constraints.c, constraints.c))
+        )
+        if not same:
+            settings, is_smooth = self.settings, self.guidance == "skgrl"
+            self._primitive = current = self.selection.primitive(
+                horizon=settings.horizon,
+                history=settings.history if is_smooth else 0,
+                history_variance=settings.history_variance,
+                constraints=constraints,
+            )
+            self._gains = self._make_gains(current)
+        assert current is not None
+        return current, self._gains
+
+    def _make_gains(self, primitive: LcNsKmp) -> np.ndarray:
+        dims = list(range(self.num_outputs)) if self.settings.action_dims is None else list(self.settings.action_dims)
+        if self.guidance == "kmp":
+            return np.zeros(self.num_outputs)
+        if self.guidance in ("residual", "clipped_residual"):
+            # The same in all directions and at all times: the RMS of what a null-space action reaches.
+            gains = np.zeros(self.num_outputs)
+            sigma = deviation(self.reference)
+            groups = (range(3), range(3, 6)) if self.num_outputs == 6 else (range(self.num_outputs),)
+            for group in map(list, groups):
+                rms = np.sqrt(np.mean(sigma[group] ** 2))
+                gains[group] = np.sqrt(3.0) * self.settings.action_scale * rms
+            mask = np.isin(np.arange(self.num_outputs), dims)
+            return np.where(mask, gains, 0.0)
+        return authority_gains(primitive, self.settings.action_scale, np.array(dims))
+
+
+@dataclass(frozen=True)
+class GuideSettings:
+    """Settings of guidance by demonstrations.
+
+    Attributes:
+        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_dims: Outputs that an action moves, one entry each; all by default.
+        history: P, past outputs that the motion of sKGRL passes through.
+        history_variance: ρ, variance of the past outputs [output²].
+        horizon: H, future points at which the constraints are satisfied.
+        orientation: Meaning of outputs 3 to 6 of a pose, in frames with a rotation.
+    """
+
+    action_scale: float = 1.0
+    action_dims: Sequence[int] | None = None
+    history: int = 4
+    history_variance: float = 1e-6
+    horizon: int = 20
+    orientation: Orientation = "rotation_vector"
+
+
+class PrimitiveGuide(Guide):
+    """Commands of movement primitives, segment after segment.
+
+    Args:
+        segments: Segments in their order.
+        guidance: "kgrl", "skgrl", "kmp" (no actions), "residual" (no constraints) or "clipped_residual" (moved to the
+            nearest point within the constraints).
+        settings: Settings.
+        period: Control period [s]; required unless every segment has `num_steps`.
+
+    Raises:
+        InputError: If an argument is out of range, or segments have different outputs.
+    """
+
+    def __init__(
+        self, segments: Sequence[Segment], guidance: str, settings: GuideSettings, period: float | None = None
+    ):
+        if guidance not in PRIMITIVE_GUIDANCE:
+            raise InputError(f"there is no guidance {brief(guidance)}: {did_you_mean(guidance, GUIDANCE)}")
+        if not segments:
+            raise InputError("guidance by demonstrations needs at least one segment")
+        sizes = {segment.recorded.num_outputs for segment in segments}
+        if len(sizes) > 1:
+            raise InputError(f"all segments need the same outputs, not {sorted(sizes)} of them")
+        (self.num_outputs,) = sizes
+        self.guidance, self.settings = guidance, settings
+        self._dims = list(range(self.num_outputs)) if settings.action_dims is None else list(settings.action_dims)
+        self.num_actions = len(self._dims)
+        self.segments = [_FittedSegment(segment, guidance, settings, period) for segment in segments]
+        self.num_steps = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments)
+
+    def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
+        """Begin the first segment."""
+        self._recent = [np.array(pose, dtype=float)]
+        self._is_ended = False
+        self._begin(0, env, observation)
+
+    def _begin(self, index: int, env: Any, observation: Any) -> None:
+        self._index, self._step, self._ended_early = index, 0, False
+        fitted = self.segments[index]
+        segment = fitted.segment
+        frame = segment.frame(env, observation) if segment.frame is not None else np.zeros(0)
+        self.frame = frame if isinstance(frame, Frame) else Frame(frame)
+        given = segment.constraints
+        self.constraints = fitted.as_constraints(given(env, observation) if callable(given) else given)
+        is_enforced = self.guidance != "residual" and self.guidance != "clipped_residual"
+        primitive, gains = fitted.primitive_for(
+            self.constraints if is_enforced else LinearConstraints.none(self.num_outputs)
+        )
+        near = fitted.reference.means[0]
+        recent = self._recent[-max(primitive.history, 1) :]
+        recent = [recent[0]] * (max(primitive.history, 1) - len(recent)) + recent
+        past = [self.frame.to_frame(output, self.settings.orientation, near) for output in recent]
+        self._stepper: PrimitiveStepper = primitive.start(np.array(past) if primitive.history else past[-1], gains)
+        self._last = past[-1]
+
+    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request:
+        """Begin a control step, and the next segment if the last one has ended."""
+        fitted = self.segments[self._index]
+        segment = fitted.segment
+        is_over = self._step >= fitted.num_steps + segment.dwell
+        if not is_over and segment.until is not None and self._step > 0:
+            is_over = self._ended_early = bool(segment.until(env, observation))
+        if is_over and self._index + 1 < len(self.segments):
+            self._begin(self._index + 1, env, observation)
+        elif is_over:
+            self._is_ended = True
+        spread = np.zeros(self.num_outputs)
+        spread[self._dims] = np.clip(action, -1.0, 1.0)
+        self._residual = self._stepper.gain * spread if "residual" in self.guidance else None
+        if self._residual is not None:
+            spread = np.zeros(self.num_outputs)
+        return self._stepper.primitive, *self._stepper.request(spread)
+
+    def finish(self, output: np.ndarray | None) -> GuideCommand:
+        """Complete the control step."""
+        step = self._stepper.num_steps
+        if self._residual is not None and output is not None:
+            output = output + self._residual
+            if self.guidance == "clipped_residual":
+                output = self.constraints.nearest(output, step)
+        command = self._stepper.finish(output)
+        self._last = command.output
+        world = self.frame.to_world(command.output, self.settings.orientation)
+        self._recent = [*self._recent, world][-max(self.settings.history, 1) :]
+        extra = self._extra(self._step)
+        self._step += 1
+        return GuideCommand(world, self.constraints.violation(command.output, step), command.is_fallback, extra)
+
+    def _extra(self, step: int) -> Any:
+        fitted = self.segments[self._index]
+        if callable(fitted.segment.extra):
+            last = fitted.num_steps - 1
+            return fitted.segment.extra(min(step / last, 1.0), step > last)
+        if fitted.discrete is not None:
+            return fitted.discrete[min(step, fitted.num_steps - 1)]
+        return fitted.segment.extra
+
+    @property
+    def is_finished(self) -> bool:
+        """True after the last step of the last segment, or if it ended early."""
+        fitted = self.segments[self._index]
+        is_last = self._index + 1 == len(self.segments)
+        return self._is_ended or (is_last and self._step >= fitted.num_steps + fitted.segment.dwell)
+
+    @property
+    def phase(self) -> float:
+        """Share of the steps of all segments; it jumps where a segment ends early."""
+        before = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments[: self._index])
+        return (before + self._step) / self.num_steps
+
+    @property
+    def segment_name(self) -> str:
+        """Name of the current segment, or its number."""
+        return self.segments[self._index].segment.name or str(self._index)
+
+    def scaled_command(self) -> np.ndarray:
+        """Return the last command (O,) in the frame, relative to the range of the segment's demonstrations."""
+        fitted = self.segments[self._index]
+        return (self._last - fitted.center) / fitted.half_range
+
+
+class TemplateGuide(Guide):
+    """Commands of a shared control template; outputs are poses [x y z Rz Ry Rx] [m, rad].
+
+    Args:
+        template: Template.
+        frames: (env, observation) → poses X_WF of the template's objects by name, called at reset.
+        period: Control period [s].
+        extra: Value for `to_action`, or (name of the state) → value.
+
+    Raises:
+        InputError: If the period is not positive.
+    """
+
+    num_outputs = POSE_SIZE
+
+    def __init__(
+        self,
+        template: SharedControlTemplate,
+        frames: Callable[[Any, Any], Mapping[str, Any]],
+        period: float | None,
+        extra: Any = None,
+    ):
+        if period is None or not 0.0 < period < np.inf:
+            raise InputError("guidance by a template needs the period of the environment [s], positive")
+        self.template, self._frames_of, self._period, self._extra_of = template, frames, period, extra
+        self.num_actions = template.inputs
+
+    def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
+        """Begin in the state of the measured pose."""
+        self._frames = self._frames_of(env, observation)
+        missing = [name for name in self.template.frames if name not in self._frames]
+        if missing:
+            raise InputError(f"the template {self.template.name} needs the frame {missing[0]}: give its pose")
+        X_WE = pose_to_transform(pose)
+        self._state = self.template.state_at(X_WE, self._frames)
+        self._X = self.template.command(self._state, X_WE, X_WE, self._frames, self._period).X_WE
+        self._start, self._has_begun = self._progress(), False
+
+    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> None:
+        """Apply the input mapping, and the transition that is due."""
+        if self._has_begun:
+            self._state = self.template.next_state(self._state, self._X, self._frames, self._period)
+        self._has_begun = True
+        displacement = self.template.map(self._state, action, self._X, self._frames, self._period)
+        self._request = self.template.displace(self._X, displacement)
+
+    def finish(self, output: np.ndarray | None) -> GuideCommand:
+        """Project the request into the active constraints; repeat the last command if the result is not finite."""
+        X = self.template.command(self._state, self._X, self._request, self._frames, self._period).X_WE
+        is_fallback = not np.isfinite(transform_to_pose(X)).all()
+        if not is_fallback:
+            self._X = X
+        violation = self.template.violation(self._state, self._X, self._frames)
+        extra = self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
+        return GuideCommand(transform_to_pose(self._X), violation, is_fallback, extra)
+
+    def _progress(self) -> float:
+        return self.template.progress(self._state, self._X, self._frames)
+
+    @property
+    def is_finished(self) -> bool:
+        """Never true: a template has no last step."""
+        return False
+
+    @property
+    def phase(self) -> float:
+        """Number of the state, from 0 to 1."""
+        return self._state / max(len(self.template.states) - 1, 1)
+
+    @property
+    def segment_name(self) -> str:
+        """Name of the template's state."""
+        return self.template.states[self._state].name
+
+    def scaled_command(self) -> np.ndarray:
+        """Return the last command (6,) in the world [m, rad]."""
+        return transform_to_pose(self._X)
+
+
+def predict(request: Request | None) -> np.ndarray | None:
+    """Return the output (O,) of a requested prediction; None if there is no request or it has no solution."""
+    if request is None:
+        return None
+    primitive, step, raw, history = request
+    try:
+        return primitive.predict(step, raw, history).output
+    except UnsolvableError:
+        return None

@@ -1,0 +1,218 @@
+"""Segments of a motion: demonstrations in a frame of their own, constraints and discrete outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.primitives import Demonstrations, LinearConstraints
+from guiderail.models.primitives.bounds import DemonstratedBounds
+from guiderail.models.primitives.poses import Orientation, pose_rotation
+
+MIN_STEPS = 12  # control steps of a segment, which the Gaussian mixture needs
+
+
+class Frame:
+    """Frame F of a segment in the world W.
+
+    Args:
+        p: Origin p_WF, (3,) or (O,) for outputs that are no positions in space [unit of the outputs].
+        R: Rotation matrix R_WF (3, 3); the identity by default.
+
+    Raises:
+        InputError: If a number is not finite or a shape is wrong.
+
+    Attributes:
+        p: Origin (3,) or (O,).
+        R: Rotation matrix (3, 3), or None.
+    """
+
+    def __init__(self, p: ArrayLike, R: ArrayLike | None = None):
+        self.p = as_numbers(p, "a frame's origin")
+        self.R = None if R is None else as_numbers(R, "a frame's rotation")
+        if self.p.ndim != 1 or not np.isfinite(self.p).all():
+            raise InputError(f"a frame's origin must be finite numbers, not {brief(p)}")
+        if self.R is not None and not (self.R.shape == (3, 3) and np.allclose(self.R @ self.R.T, np.eye(3), atol=1e-6)):
+            raise InputError("a frame's rotation must be an orthonormal matrix (3, 3)")
+
+    def to_world(self, output: np.ndarray, orientation: Orientation) -> np.ndarray:
+        """Return an output (O,) in F as one in W; entries 3 to 6 are an orientation if the frame has a rotation."""
+        return self._transformed(output, orientation, is_inverse=False)
+
+    def to_frame(self, output: np.ndarray, orientation: Orientation, near: np.ndarray | None = None) -> np.ndarray:
+        """Return an output (O,) in W as one in F.
+
+        Args:
+            output: Output (O,) in W.
+            orientation: Meaning of entries 3 to 6.
+            near: Output (O,) in F; the orientation is continued from it by full turns.
+        """
+        return self._transformed(output, orientation, is_inverse=True, near=near)
+
+    def _transformed(
+        self, output: np.ndarray, orientation: Orientation, *, is_inverse: bool, near: np.ndarray | None = None
+    ) -> np.ndarray:
+        size = len(self.p)
+        if size > len(output) or (self.R is not None and (size != 3 or len(output) not in (3, 6))):
+            raise InputError(
+                f"a frame with an origin of {size} numbers{' and a rotation' if self.R is not None else ''} does not "
+                f"fit outputs of {len(output)} numbers"
+            )
+        result = np.array(output, dtype=float)
+        if self.R is None:
+            result[:size] += -self.p if is_inverse else self.p
+        elif is_inverse:
+            result[:3] = self.R.T @ (result[:3] - self.p)
+        else:
+            result[:3] = self.p + self.R @ result[:3]
+        if self.R is not None and len(output) == 6:
+            R = self.R.T if is_inverse else self.R
+            rotation = type(r := pose_rotation(result[3:], orientation)).from_matrix(R) * r
+            result[3:] = rotation.as_euler("ZYX") if orientation == "euler_zyx" else rotation.as_rotvec()
+        if near is not None and len(output) == 6:
+            result[3:] = _continued(result[3:], near[3:], orientation)
+        return result
+
+
+def _continued(angles: np.ndarray, near: np.ndarray, orientation: Orientation) -> np.ndarray:
+    """Return the equivalent angles (3,) nearest to `near` (3,)."""
+    if orientation == "euler_zyx":
+        return angles - 2 * np.pi * np.round((angles - near) / (2 * np.pi))
+    size = float(np.linalg.norm(angles))
+    axis = angles / size if size > 1e-9 else near / max(float(np.linalg.norm(near)), 1e-300)
+    return (size + 2 * np.pi * np.round((axis @ near - size) / (2 * np.pi))) * axis
+
+
+Constraints = LinearConstraints | DemonstratedBounds
+"""Constraints of a segment, in its frame."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One part of a motion.
+
+    Attributes:
+        demonstrations: Demonstrations in the segment's frame, at least three, or their file.
+        frame: (env, observation) → `Frame` or origin (O,), called when the segment begins; the world by default.
+        constraints: Constraints in the frame, or (env, observation) → constraints, called when the segment begins.
+        extra: What `to_action` needs and no policy moves, such as a gripper: a value, or (phase of the segment from 0
+            to 1, true while its last point is held) → value. By default it is that of `discrete`.
+        discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
+            the most frequent value of the demonstrations at its phase.
+        until: (env, observation) → true to end the segment early; by default it ends with its steps.
+        num_steps: Control steps; the mean duration of the demonstrations divided by the period by default.
+        dwell: Control steps for which the last point is then held.
+        floor: Standard deviation (O,) or scalar added to every covariance [unit of the output].
+        name: Name of the segment, in `info`.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    demonstrations: Demonstrations | str | Path
+    frame: Callable[[Any, Any], Frame | ArrayLike] | None = None
+    constraints: Constraints | Callable[[Any, Any], Constraints] | None = None
+    extra: Any = None
+    discrete: Sequence[np.ndarray] | None = None
+    until: Callable[[Any, Any], bool] | None = None
+    num_steps: int | None = None
+    dwell: int = 0
+    floor: float | np.ndarray = 1e-3
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for what, value, least in (("num_steps", self.num_steps, MIN_STEPS), ("dwell", self.dwell, 0)):
+            if value is not None and (int(value) != value or value < least):
+                raise InputError(f"{what} of a segment is a whole number of at least {least}, not {brief(value)}")
+        if self.discrete is not None and self.extra is not None:
+            raise InputError("a segment has extra or discrete, not both")
+
+    @cached_property
+    def recorded(self) -> Demonstrations:
+        """Demonstrations, read from their file if it is one."""
+        given = self.demonstrations
+        return given if isinstance(given, Demonstrations) else Demonstrations.load(given)
+
+    def steps_of(self, period: float | None) -> int:
+        """Return the number of control steps.
+
+        Raises:
+            InputError: If neither `num_steps` nor a positive period [s] is known.
+        """
+        if self.num_steps is not None:
+            return int(self.num_steps)
+        if period is None or not 0.0 < period < np.inf:
+            raise InputError("give the period of the environment [s], or num_steps of every segment")
+        duration = float(np.mean([t[-1] - t[0] for t in self.recorded.times]))
+        return max(round(duration / period) + 1, MIN_STEPS)
+
+    def discrete_values(self, num_steps: int) -> list[Any] | None:
+        """Return the most frequent discrete output of the demonstrations for each control step, or None."""
+        if self.discrete is None:
+            return None
+        times = self.recorded.times
+        arrays = [np.asarray(values) for values in self.discrete]
+        if [len(values) for values in arrays] != [len(t) for t in times]:
+            raise InputError("discrete outputs must have a value for each sample of each demonstration")
+        values = []
+        for phase in np.linspace(0.0, 1.0, num_steps):
+            at = [int(np.argmin(np.abs((t - t[0]) / (t[-1] - t[0]) - phase))) for t in times]
+            unique, counts = np.unique([a[k] for a, k in zip(arrays, at, strict=True)], axis=0, return_counts=True)
+            values.append(unique[np.argmax(counts)])
+        return values
+
+
+def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[int]]) -> list[Demonstrations]:
+    """Cut demonstrations at events into segments; a sample at a cut belongs to both sides.
+
+    Args:
+        demonstrations: M demonstrations.
+        cuts: Increasing samples of the events, M lists of equal length K, as `find_events` returns them.
+
+    Returns:
+        K + 1 demonstrations of M parts each; the clock of each part begins at 0.
+
+    Raises:
+        InputError: If there is not one list for each demonstration, or a part has fewer than two samples.
+    """
+    if len(cuts) != demonstrations.num_demonstrations or len({len(each) for each in cuts}) != 1:
+        raise InputError("cuts need one list for each demonstration, all of one length")
+    parts: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in range(len(cuts[0]) + 1)]
+    for m, (t, y, at) in enumerate(zip(demonstrations.times, demonstrations.outputs, cuts, strict=True)):
+        edges = [0, *(int(k) for k in at), len(t) - 1]
+        if min(np.diff(edges)) < 1 or edges[-2] >= len(t):
+            raise InputError(f"the cuts of demonstration {m} must increase inside of it, not {brief(list(at))}")
+        for (times, outputs), first, last in zip(parts, edges[:-1], edges[1:], strict=True):
+            times.append(t[first : last + 1] - t[first])
+            outputs.append(y[first : last + 1])
+    return [Demonstrations(times, outputs, demonstrations.names) for times, outputs in parts]
+
+
+def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np.ndarray], bool]]) -> list[list[int]]:
+    """Return for each recording the samples at which conditions first hold, one after the other.
+
+    Args:
+        signals: M arrays (N_m, S), such as outputs and a gripper.
+        conditions: Conditions on a sample (S,), in the order of the events.
+
+    Raises:
+        InputError: If an event does not occur in a recording.
+    """
+    found = []
+    for m, signal in enumerate(signals):
+        at, events = 0, []
+        for number, condition in enumerate(conditions):
+            at = next((k for k in range(at + 1, len(signal)) if condition(signal[k])), -1)
+            if at < 0:
+                raise InputError(f"event {number} does not occur in recording {m}")
+            events.append(at)
+        found.append(events)
+    return found
