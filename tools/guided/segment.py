@@ -155,7 +155,11 @@ class Segment:
         return max(round(duration / period) + 1, MIN_STEPS)
 
     def discrete_values(self, num_steps: int) -> list[Any] | None:
-        """Return the most frequent discrete output of the demonstrations for each control step, or None."""
+        """Return the most frequent discrete output of the demonstrations for each control step, or None.
+
+        Raises:
+            InputError: If there is not a value for each sample.
+        """
         if self.discrete is None:
             return None
         times = self.recorded.times
