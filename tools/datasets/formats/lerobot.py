@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.datasets.formats.recorded import Recorded, choose_signal, describe_time_shift
 from guiderail.tools.files import atomic_folder
@@ -61,7 +61,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
             np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{folder} holds data that its {INFO} does not describe: {error}") from error
+        raise InputError(f"{folder} holds data that its {INFO} does not describe: {brief(str(error))}") from error
     names = _names(features[chosen], values.shape[1])
     assumptions += [
         f"time is the frame index at {fps:g} frames per second",

@@ -1,0 +1,369 @@
+"""Files with code in them: whatever a command reads, nothing in it is executed.
+
+Each input is a valid file with code in some places: as a name to import, a tag, an expression, a format, or a pickled
+object. Executed code would touch a file. An audit hook of the interpreter also reports unpickled objects, started
+programs and imports of the name in the files. Reading may succeed, or be refused with one sentence.
+"""
+
+import hashlib
+import io
+import json
+import pickle
+import sys
+import zipfile
+from contextlib import contextmanager
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fuzz.changes import edited, edits, get, places
+from fuzz.tally import attempt
+from fuzz.test_runs import ARRAYS, CONFIGS, DESCRIPTION, LAYERS, TABLE, VALUES
+from fuzz.test_templates import TEXTS as TEMPLATES
+from guiderail.diagrams.tasks.part.file import read_task_file, task_folder_digest
+from guiderail.diagrams.tasks.part.task import write_workcell
+from guiderail.models.certificate import checker
+from guiderail.models.common.errors import InputError
+from guiderail.models.parts.mesh_file import load_part
+from guiderail.models.policy import Policy
+from guiderail.models.primitives import Demonstrations
+from guiderail.models.templates import parse_template
+from guiderail.tools.datasets.convert import import_recording
+from guiderail.tools.environments import as_value, check_environment
+from guiderail.tools.evaluation.step_log import read_step_log, write_step_log
+from guiderail.tools.experiments.declaration import load_study
+from guiderail.tools.experiments.study import run_study
+from guiderail.tools.hardware.scenario import load_scenario
+from guiderail.tools.imports import import_stored
+from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.run_folder import RunFolder
+
+pytest.importorskip("rosbags")
+pytest.importorskip("trimesh")
+
+MODULE = "guiderail_canary"
+FORBIDDEN = (
+    "pickle.find_class",
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.fork",
+    "subprocess.Popen",
+)
+EVENTS: list[str] = []
+_armed = False
+
+
+def _audit(event, arguments):
+    if _armed and (event in FORBIDDEN or (event == "import" and MODULE in str(arguments[0]))):
+        EVENTS.append(f"{event} {str(arguments)[:200]}")
+
+
+sys.addaudithook(_audit)
+
+
+class Touch:
+    """Object that runs a program when it is unpickled."""
+
+    def __init__(self, canary):
+        self.canary = canary
+
+    def __reduce__(self):
+        return exec, (f"open({str(self.canary)!r}, 'w')",)
+
+
+@pytest.fixture(scope="module")
+def canary(tmp_path_factory):
+    """Return the file that executed code would touch; a module of the name is on the path."""
+    folder = tmp_path_factory.mktemp("canary")
+    (folder / f"{MODULE}.py").write_text(f"open({str(folder / 'touched')!r}, 'w')\n")
+    sys.path.insert(0, str(folder))
+    yield folder / "touched"
+    sys.path.remove(str(folder))
+
+
+@contextmanager
+def watched(canary):
+    global _armed
+    EVENTS.clear()
+    _armed = True
+    try:
+        yield
+    finally:
+        _armed = False
+        assert not EVENTS
+        assert not canary.exists()
+
+
+def codes(canary):
+    """Return texts that execute code where something evaluates, imports, formats or constructs them."""
+    python = f"open({str(canary)!r}, 'w')"
+    shell = f"touch {canary}"
+    module = str(canary.with_name(f"{MODULE}.py"))
+    return [
+        MODULE, f"{MODULE}:X", f"{MODULE}.part", module, f"{module[:-3]}", f"{MODULE}:guiderail/NarrowPassage",
+        "__main__", f"../{MODULE}", python, f"exec({python!r})", f"__import__('os').system({shell!r})",
+        f"__import__({MODULE!r})", f"().__class__.__base__.__subclasses__() or {python}", f"(lambda: {python})()",
+        "{0.__class__}", "{seed.__init__}", f"!!python/object/apply:os.system [{shell!r}]",
+        f"!!python/object/new:exec [{python!r}]", f"!!python/name:{MODULE}.x", f"!!python/module:{MODULE}",
+        f"$({shell})", f"`{shell}`", f"; {shell} #", f"| {shell}", f"%({shell})s",
+        f"{{{{ cycler.__init__.__globals__.os.popen({shell!r}) }}}}", f"<script>{python}</script>",
+        f"file://{module}", f"package://{MODULE}/x.sdf", f"<plugin filename={module!r} name='x'/>",
+        f"'''\n{python}\n'''", f"\\n{python}\\n", f"@{module}", f"env:{shell}", "${" + shell + "}", f"cmd:{shell}",
+        f'"\n  - !!python/object/apply:exec [{python!r}]\n',
+    ]  # fmt: skip
+
+
+def pickles(canary):
+    """Return contents of files that execute code where something unpickles them."""
+    one = pickle.dumps(Touch(canary))
+    array = io.BytesIO()
+    np.save(array, np.array([Touch(canary)], dtype=object), allow_pickle=True)
+    archive = io.BytesIO()
+    np.savez(archive, times=np.array([Touch(canary)], dtype=object), outputs=np.array([Touch(canary)], dtype=object))
+    torch = io.BytesIO()
+    with zipfile.ZipFile(torch, "w") as file:
+        file.writestr("archive/data.pkl", one)
+        file.writestr("archive/version", "3")
+    return [one, array.getvalue(), archive.getvalue(), torch.getvalue(), pickle.dumps({"weights": Touch(canary)})]
+
+
+@st.composite
+def with_code(draw, content, canary):
+    """Draw a file with code in it: in an entry or a key of a tree, in a text, or as a pickled object."""
+    code = draw(st.sampled_from(codes(canary)))
+    what = draw(st.sampled_from(["tree", "tree", "tree", "key", "text", "text", "line", "pickle", "inside"]))
+    if what in ("tree", "key") and (tree := _tree(content)) is not None:
+        inside = [path for path in places(tree) if path]
+        path = draw(st.sampled_from(inside))
+        holder, last = get(tree, path[:-1]), path[-1]
+        if what == "key" and isinstance(holder, dict):
+            holder[code] = holder.pop(last)
+        else:
+            holder[last] = draw(st.sampled_from([code, [code], {code: code}, {"imports": [code]}]))
+        if isinstance(tree, dict) and draw(st.booleans()):
+            tree["imports"] = [code]
+        if content.lstrip().startswith(b"{"):
+            return json.dumps(tree).encode()
+        return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True).encode()
+    if what in ("pickle", "inside"):
+        pickled = draw(st.sampled_from(pickles(canary)))
+        at = int(draw(st.floats(0, 1)) * len(content))
+        return pickled if what == "pickle" else content[:at] + pickled + content[at:]
+    at = int(draw(st.floats(0, 1)) * len(content))
+    if what == "line":
+        at = content.rfind(b"\n", 0, at) + 1
+    removed = draw(st.sampled_from([0, 0, 1, 8, 40]))
+    changed = content[:at] + code.encode() + content[at + removed :]
+    return edited(changed, draw(edits(2))) if draw(st.booleans()) else changed
+
+
+def _tree(content):
+    try:
+        tree = yaml.safe_load(content)
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError):
+        return None
+    return tree if isinstance(tree, dict | list) and any(path for path in places(tree)) else None
+
+
+# --- Files, and what reads them ---
+
+STUDY = b"""name: s
+task: NarrowPassage
+env: {guidance: kgrl}
+learner: {preset: tqc_fast, episodes: 2}
+methods: {a: {}, b: {policy: zero}}
+seeds: [0]
+eval_set: [{episodes: 2, file: "{name}-{digest}.csv"}]
+folder: "{method}-{seed}"
+"""
+TASK = {
+    "format": "guiderail part task 1", "name": "parts/pin",
+    "plug": {"source": "p.stl", "visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01,
+             "pieces": [{"file": "part.obj", "modulus": 1e9}]},
+    "socket": {"source": "s.stl", "visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01,
+               "pieces": [{"file": "part.obj"}]},
+    "motion": {"travel": 0.02, "rim": 0.01, "push": 0.004}, "demonstrations": {"file": "d.csv"},
+    "scenario": ["table.yaml"], "measured": {"clearance": 1},
+}  # fmt: skip
+SCENARIO = b"""station: simulation
+directives:
+- add_model: {name: table, file: file:///none.sdf}
+lcm_buses: {default: {lcm_url: "memq://"}}
+model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only}}
+"""
+CSV = b"time,x [m],y [m],z [m]\n0,0,0,0\n0.1,1,2,3\n0.2,2,3,4\n"
+BOX = b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\nmtllib m.mtl\n"
+
+
+def written(folder, files):
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
+def npz():
+    file = io.BytesIO()
+    np.savez(file, times=np.arange(3.0), outputs=np.ones((1, 3, 2)), names=np.array(["x", "y"]))
+    return file.getvalue()
+
+
+def run_files(folder):
+    run = RunFolder(folder)
+    run.write_config(CONFIGS[0])
+    save_checkpoint(run.checkpoint, ARRAYS, VALUES)
+    Policy(LAYERS, DESCRIPTION).save(folder)
+    write_step_log(run.steps / "episode-000000.parquet", pa.table({"episode": [0, 0], "step": [0, 1]}))
+    (folder / "episodes.csv").write_bytes(TABLE)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def read_run(folder):
+    run = RunFolder(folder)
+    for read in (run.config, run.episodes, lambda: Policy.load(folder), lambda: read_step_log(run.steps)):
+        attempt("execution, run folder", InputError, read)
+    attempt("execution, checkpoint", InputError, lambda: load_checkpoint(run.checkpoint))
+
+
+def read_study(folder):
+    def read():
+        study = load_study(folder / "study.yaml")
+        import_stored(study.imports, folder / "study.yaml")
+        run_study(study, folder / "study.yaml" / "below a file")
+
+    attempt("execution, study", InputError, read)
+
+
+def read_task(folder):
+    def read():
+        file = read_task_file(folder)
+        task_folder_digest(folder)
+        write_workcell(folder, file)
+
+    attempt("execution, task folder", InputError, read)
+
+
+def read_demonstrations(folder):
+    for path in folder.iterdir():
+        attempt("execution, demonstrations", InputError, lambda path=path: Demonstrations.load(path))
+    attempt("execution, table", InputError, lambda: import_recording(folder / "d.csv", folder / "new.npz"))
+    (folder / "new.npz").unlink(missing_ok=True)
+
+
+def check_certificate(folder):
+    """Check a certificate whose digests fit, as those of a forged one would."""
+    try:
+        claims = json.loads((folder / "certificate.json").read_bytes())
+        names = ("primitive.npz", "constraints.npz", "witness.npz")
+        claims["digests"] = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+        text = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
+        claims["digest"] = hashlib.sha256(text.encode()).hexdigest()
+        (folder / "certificate.json").write_text(json.dumps(claims))
+    except (ValueError, TypeError):
+        return
+    try:
+        checker.check(folder)
+    except Exception:  # its program prints any of them as a reason to refuse
+        return
+
+
+def read_recordings(folder):
+    new = folder / "new.npz"
+    for source in ("set", "it.mcap"):
+        attempt(f"execution, {source}", InputError, lambda source=source: import_recording(folder / source, new))
+        new.unlink(missing_ok=True)
+
+
+def recording_files(folder):
+    from guiderail.tools.datasets.formats.lerobot import write_lerobot
+    from guiderail.tools.datasets.formats.ros_bag import write_mcap
+
+    times = 0.1 * np.arange(4)
+    demonstrations = Demonstrations([times], [np.column_stack([times] * 6)])
+    write_lerobot(folder / "set", demonstrations)
+    write_mcap(folder / "bags", demonstrations)
+    (mcap,) = (folder / "bags").rglob("*.mcap")
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "set").rglob("*") if path.is_file()}
+    return files | {"it.mcap": mcap.read_bytes()}
+
+
+def read_part(folder):
+    attempt("execution, mesh", InputError, lambda: load_part(folder / "part.obj", "mm"))
+    attempt("execution, scenario", InputError, lambda: load_scenario(folder / "scenario.yaml"))
+
+
+CERTIFICATE = {"certificate.json": json.dumps({"format": "guiderail certificate 3", "assumes": ["x"]}).encode()}
+TASK_FILES = {
+    "task.yaml": yaml.safe_dump(TASK).encode(),
+    "part.obj": BOX,
+    "d.csv": CSV,
+    "table.yaml": b"directives: []\n",
+}
+MESHES = {"part.obj": BOX, "m.mtl": b"newmtl a\nmap_Kd t.png\n", "scenario.yaml": SCENARIO}
+KINDS = {
+    "run": (run_files, read_run),
+    "study": ({"study.yaml": STUDY}, read_study),
+    "task": (TASK_FILES, read_task),
+    "demonstrations": ({"d.csv": CSV, "d.npz": npz()}, read_demonstrations),
+    "certificate": (
+        CERTIFICATE | dict.fromkeys(("primitive.npz", "constraints.npz", "witness.npz"), npz()),
+        check_certificate,
+    ),
+    "recordings": (recording_files, read_recordings),
+    "meshes and scenarios": (MESHES, read_part),
+}
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files") / "folder"
+    folder.mkdir()
+    files, read = KINDS[request.param]
+    files = files(folder) if callable(files) else files
+    written(folder, files)
+    read(folder)  # imports what reading needs
+    return folder, files, read
+
+
+@given(st.data())
+def test_no_file_of_a_folder_is_executed(kind, canary, data):
+    folder, files, read = kind
+    name = data.draw(st.sampled_from(sorted(files)))
+    written(folder, {name: data.draw(with_code(files[name], canary))})
+    try:
+        with watched(canary):
+            read(folder)
+    finally:
+        written(folder, {name: files[name]})
+
+
+@given(st.data())
+def test_no_template_is_executed(canary, data):
+    content = data.draw(with_code(data.draw(st.sampled_from(TEMPLATES)).encode(), canary))
+    text = content.decode("utf-8", errors="replace")
+    with watched(canary):
+        attempt("execution, template", InputError, lambda: parse_template(text, "template"))
+
+
+@given(st.data())
+def test_no_option_is_executed(canary, data):
+    code = data.draw(st.sampled_from(codes(canary)))
+    options = [
+        "guidance",
+        "station",
+        "robot",
+        "kernel",
+        "demonstrations",
+        "difficulty",
+        "reward",
+        "observation",
+        "template",
+    ]
+    option = data.draw(st.sampled_from(options))
+    task = data.draw(st.sampled_from(["NarrowPassage", "BncConnector", "Pouring", "GridClamp", code]))
+    with watched(canary):
+        attempt("execution, options", InputError, lambda: check_environment(task, {option: as_value(code)}))
