@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
 from guiderail.diagrams.stations.station import ContactOptions
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.registry import did_you_mean
@@ -24,6 +25,7 @@ from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints
 
 FILE_NAME = "task.yaml"
+_FILE_NAME = re.compile(r"[\w()+ -][\w.()+ /-]*")  # of a file in the folder; the name is also written into XML
 FILE_FORMAT = "guiderail task 1"
 NAMESPACE = "parts"
 HARD: dict[str, Any] = {
@@ -278,6 +280,8 @@ def read_task_file(folder: Path) -> PartTaskFile:
         raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
     file = validate_options(PartTaskFile, data, str(path))
     for name in file.files:
+        if not _FILE_NAME.fullmatch(name) or ".." in name.split("/"):
+            raise InputError(f"{path} names {brief(name)}, which is no plain path inside {folder}: rename the file")
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or create the task again")
     return file

@@ -1,5 +1,8 @@
 """A task folder written by hand: a plug above a plate, and what is asked of the numbers in its file."""
 
+import shutil
+from contextlib import nullcontext
+
 import gymnasium
 import numpy as np
 import pytest
@@ -136,6 +139,33 @@ def test_missing_part_folder_is_named(tmp_path):
         read_task_file(tmp_path / "gone")
     with pytest.raises(InputError, match=f"there is no file or task folder {tmp_path}/gone to import: restore it"):
         import_modules([str(tmp_path / "gone")])
+
+
+@pytest.mark.parametrize(
+    ("name", "is_accepted"),
+    [
+        ("plug.obj", True),
+        ("meshes/plug (1).obj", True),
+        ("../plug.obj", False),
+        ("meshes/../../plug.obj", False),
+        ("/etc/hostname", False),
+        (".hidden", False),
+        ('x"/><plugin/>.obj', False),
+        ("a&b.obj", False),
+        ("a\nb.obj", False),
+    ],
+)
+def test_task_names_files_in_its_folder_only(name, is_accepted, tmp_path):
+    folder = write(tmp_path / "task")
+    (folder / "meshes").mkdir()
+    shutil.copy(folder / "plug.obj", tmp_path)
+    if is_accepted and name != "plug.obj":
+        shutil.copy(folder / "plug.obj", folder / name)
+    tree = yaml.safe_load((folder / "task.yaml").read_text())
+    tree["plug"]["visual"] = name
+    (folder / "task.yaml").write_text(yaml.safe_dump(tree))
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="no plain path inside"):
+        read_task_file(folder)
 
 
 def test_models_are_written_once_and_failures_are_refused(tmp_path):

@@ -136,17 +136,17 @@ def pickles(canary):
 def with_code(draw, content, canary):
     """Draw a file with code in it: in an entry or a key of a tree, in a text, or as a pickled object."""
     code = draw(st.sampled_from(codes(canary)))
-    what = draw(st.sampled_from(["tree", "tree", "tree", "key", "text", "text", "line", "pickle", "inside"]))
-    if what in ("tree", "key") and (tree := _tree(content)) is not None:
+    what = draw(st.sampled_from(["tree", "tree", "imports", "key", "text", "text", "line", "pickle", "inside"]))
+    if what in ("tree", "key", "imports") and (tree := _tree(content)) is not None:
         inside = [path for path in places(tree) if path]
         path = draw(st.sampled_from(inside))
         holder, last = get(tree, path[:-1]), path[-1]
-        if what == "key" and isinstance(holder, dict):
+        if what == "imports" and isinstance(tree, dict):
+            tree["imports"] = [code]
+        elif what == "key" and isinstance(holder, dict):
             holder[code] = holder.pop(last)
         else:
             holder[last] = draw(st.sampled_from([code, [code], {code: code}, {"imports": [code]}]))
-        if isinstance(tree, dict) and draw(st.booleans()):
-            tree["imports"] = [code]
         if content.lstrip().startswith(b"{"):
             return json.dumps(tree).encode()
         return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True).encode()
