@@ -7,7 +7,7 @@ OUTSIDE := .venv-outside
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling fci newest outside clean
+.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling fci outside newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -88,7 +88,7 @@ $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@
 
-# metaworld and robosuite need an older MuJoCo than this package's extra: neither Drake nor that extra is installed here.
+# metaworld needs an older MuJoCo than this package's extra: neither Drake nor that extra is installed here.
 $(OUTSIDE)/.ready: pyproject.toml research/outside_envs/requirements.txt
 	$(PYTHON) -m venv $(OUTSIDE)
 	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check -r research/outside_envs/requirements.txt -e .

@@ -4,7 +4,7 @@
     python -m research.outside_envs.learn peg --guidance kgrl --baselines --out DIR
     python -m research.outside_envs.learn table --out DIR
 
-`make outside` makes the environment with metaworld, robosuite and their version of MuJoCo.
+`make outside` makes the environment with metaworld and its version of MuJoCo.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-TASKS = ("peg", "assembly", "nut")
+TASKS = ("peg", "assembly")
 TOLERANCE = 1e-9  # of a constraint [unit of the output]
 HELD_OUT_SEED = 10_000
 
