@@ -82,9 +82,9 @@ class CartesianImpedanceController(LeafSystem):
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
     is not connected, commands never time out. ``max_wrench`` is (8,), [fx fy fz tx ty tz] along the axes of the gains,
-    norm of the force and norm of the torque [N, Nm]; it lowers the bound and cannot raise it. ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench``
-    is (6,), force first, in the axes of T. ``saturation`` (1,) is 1 while the wrench or a motor is at its limit.
-    ``command_timed_out`` (1,) is 1 while no valid command is available.
+    norm of the force and norm of the torque [N, Nm]; it lowers the bound and cannot raise it. ``generalized_force`` is
+    (n,), joint torques [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` (1,) is 1
+    while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid command is available.
 
     Args:
         plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.

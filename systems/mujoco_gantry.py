@@ -85,9 +85,10 @@ class MujocoGantry(LeafSystem):
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
     output of the static plant; ``body_poses`` contains the same poses with the simulated ones of tool and workpiece.
-    ``state`` is (12,), the pose and its velocity. ``geometry_poses`` contains the poses of all frames with geometry. ``wrench`` is the filtered wrench y, (6,), force
-    first, in N and Nm. ``impedance_wrench`` is (6,), the forces and torques of the six motors in the order of the pose.
-    Positions, velocities and warm start of the engine and the state of the filter are declared state.
+    ``state`` is (12,), the pose and its velocity. ``geometry_poses`` contains the poses of all frames with geometry.
+    ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is (6,), the forces and
+    torques of the six motors in the order of the pose. Positions, velocities and warm start of the engine and the state
+    of the filter are declared state.
 
     If the engine diverges, the update raises a `DivergedError`. The engine's automatic reset is disabled, because it
     would move the tool to the target.

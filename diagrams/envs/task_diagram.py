@@ -76,6 +76,15 @@ class Symmetry:
             ):
                 raise ValueError("each matrix of a symmetry is a signed permutation")
 
+    def padded(self, count: int) -> Symmetry:
+        """Return the same symmetry of an observation with `count` more numbers at its end, which do not change."""
+        if count == 0:
+            return self
+        size = self.observations.shape[1]
+        observations = np.tile(np.eye(size + count), (len(self.observations), 1, 1))
+        observations[:, :size, :size] = self.observations
+        return Symmetry(observations, self.actions)
+
     @classmethod
     def of_signs(cls, observation: ArrayLike, action: ArrayLike) -> Symmetry:
         """Return the symmetry that multiplies each observed number (n,) and each action (A,) by 1 or −1."""

@@ -11,14 +11,15 @@ from pydantic import Field, field_validator
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
-from guiderail.diagrams.envs.observation import affine
-from guiderail.diagrams.envs.options import Numbers, Options, ResetOptions
+from guiderail.diagrams.envs.observation import ObservationTerm, affine
+from guiderail.diagrams.envs.options import Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
-from guiderail.diagrams.tasks.task import Task
+from guiderail.diagrams.tasks.task import EpisodeConstant, Task
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
+from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE
+from guiderail.models.objects.insertion import COLLISION_FORCE, MIN_CONTACT_FORCE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -27,12 +28,52 @@ from guiderail.systems.relative_poses import RelativePoses
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimeters
 
 
-class ForceOptions(Options):
-    """Options of a task with a force limit, `force_limit`."""
+FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]
+# Center and scale of an observed force limit [N]; they do not depend on the range, so that a policy can be evaluated
+# with another one.
+LIMIT_CENTER, LIMIT_SCALE = 20.0, 10.0
 
+
+class ForceOptions(Options):
+    """Options of a task with a force limit."""
+
+    force_limit: Number = Field(
+        COLLISION_FORCE,
+        ge=FORCE_LIMITS[0],
+        le=FORCE_LIMITS[1],
+        description="force that ends an episode as a collision [N]",
+    )
+    force_limit_range: Numbers | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description="sample the force limit of every episode between these two, and let the policy observe it [N]; "
+        "default: force_limit",
+    )
     bounded_force: bool = Field(
         True, description="limit the impedance, so that its force cannot pass force_limit; without it: 40 N per axis"
     )
+
+    @field_validator("force_limit_range")
+    @classmethod
+    def _check_limits(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and not FORCE_LIMITS[0] <= value[0] <= value[1] <= FORCE_LIMITS[1]:
+            raise ValueError(
+                f"give two forces from {FORCE_LIMITS[0]:g} to {FORCE_LIMITS[1]:g} N, the smaller one first"
+            )
+        return value
+
+    @property
+    def largest_force_limit(self) -> float:
+        """Largest force limit of an episode [N]."""
+        return self.force_limit if self.force_limit_range is None else self.force_limit_range[1]
+
+
+def max_wrench(force_limit: float) -> np.ndarray:
+    """Return the value (8,) of a station's `max_wrench` with which its force stays below a limit [N]."""
+    bound = Impedance().with_max_force(force_limit).bound
+    assert bound is not None
+    return bound.numbers
 
 
 class InsertionReset(ResetOptions):
@@ -75,8 +116,33 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
-        On hardware it is what `observable_success` computes from the robot's own pose, if the task defines that.
+        On hardware it is what `observable_success` computes from the robot's own pose, if the task defines that. A
+        sampled force limit is a signal as well, `force_limit`, and the station's bound.
         """
+        return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
+
+    def _add_force_limit(self, builder: DiagramBuilder, station: Station) -> dict[str, OutputPort]:
+        sampled = self._force_limit_range
+        if sampled is None:
+            return {}
+        # The smallest one applies until a reset samples another, as on hardware.
+        limit = EpisodeConstant(builder, "force_limit", 1, np.array(sampled[:1]))
+        self.episode_constants["force_limit"] = limit
+        if station.HasInputPort("max_wrench"):
+            bound = EpisodeConstant(builder, "max_wrench", MAX_WRENCH_SIZE, max_wrench(sampled[0]))
+            builder.Connect(bound.port, station.GetInputPort("max_wrench"))
+            self.episode_constants["max_wrench"] = bound
+        return {"force_limit": limit.port}
+
+    @property
+    def _force_limit_range(self) -> tuple[float, ...] | None:
+        return getattr(self.options, "force_limit_range", None)
+
+    def force_limit_terms(self) -> tuple[ObservationTerm, ...]:
+        """Return the term of the observation that is the force limit, if it is sampled; no symmetry changes it."""
+        return () if self._force_limit_range is None else (ObservationTerm("force_limit", LIMIT_CENTER, LIMIT_SCALE),)
+
+    def _add_workpiece_pose(self, builder: DiagramBuilder, station: Station) -> dict[str, OutputPort]:
         if not station.HasOutputPort("body_poses"):
             observable = self.observable_success()
             if observable is None:
@@ -104,7 +170,13 @@ class InsertionTask(Task):
         return Impedance().with_max_force(self.collision.above)
 
     def force_limit(self) -> TerminationTerm:
-        """Return the term that ends an episode as a collision above the force `collision.above` [N]."""
+        """Return the term that ends an episode as a collision above `collision.above` [N], or above a sampled limit."""
+        if self._force_limit_range is not None:
+            return TerminationTerm(
+                "collision",
+                {"contact_force": 1, "force_limit": 1},
+                lambda contact_force, force_limit: contact_force[0] > force_limit[0],
+            )
         limit = self.collision.above
         return TerminationTerm("collision", {"contact_force": 1}, lambda contact_force: contact_force[0] > limit)
 
@@ -115,7 +187,15 @@ class InsertionTask(Task):
         fixture, workpiece = self.offsets.draw(rng, options)
         self.set_part_offsets(station, context, fixture, workpiece)
         station.set_pose(context, self.start_pose(rng))
-        return {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
+        sampled: dict[str, Any] = {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
+        if self._force_limit_range is not None:
+            lowest, highest = self._force_limit_range
+            limit = float(rng.uniform(lowest, highest))
+            self.episode_constants["force_limit"].set(context, np.array([limit]))
+            if "max_wrench" in self.episode_constants:
+                self.episode_constants["max_wrench"].set(context, max_wrench(limit))
+            sampled["force_limit"] = limit
+        return sampled
 
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Move fixture and workpiece of a `MovableWorkcell` by their offsets.

@@ -36,9 +36,10 @@ ScriptedPolicy = Callable[[np.ndarray], np.ndarray]
 class EpisodeConstant:
     """Episode-constant signal, set at reset, usable by observations, rewards and terminations."""
 
-    def __init__(self, builder: DiagramBuilder, name: str, size: int):
-        """Add its source to the builder; the values are zero until a reset sets them."""
-        self._source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(size)))
+    def __init__(self, builder: DiagramBuilder, name: str, size: int, default: np.ndarray | None = None):
+        """Add its source to the builder; until a reset sets them, the values are `default`, (size,), or zero."""
+        values = np.zeros(size) if default is None else np.array(default, dtype=float)
+        self._source = builder.AddNamedSystem(name, ConstantVectorSource(values))
 
     @property
     def port(self) -> OutputPort:

@@ -11,7 +11,10 @@ STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(
 BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 1e5)  # [x y z Rx Ry Rz]
 
 
-def governed(desired, velocity=np.zeros(6), pose=np.zeros(6), max_wrench=None):
+REST = np.zeros(6)
+
+
+def governed(desired, velocity=REST, pose=REST, max_wrench=None):
     system = ReferenceGovernor(STIFFNESS, DAMPING, 1.5, 0.01, BOUND)
     context = system.CreateDefaultContext()
     system.get_desired_pose_input_port().FixValue(context, desired)

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.diagrams.tasks.insertion import ForceOptions
+from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, in_ring
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
@@ -101,7 +101,7 @@ class BncOptions(FixtureOffsetOptions, ForceOptions):
     )
     bound: Number = Field(ALIGNMENT, ge=0.5 * MM, le=6.0 * MM, description="bound of a command's |x| and |y| [m]")
     force_limit: Number = Field(
-        COLLISION_FORCE, ge=5, le=60, description="force that ends an episode as a collision [N]"
+        COLLISION_FORCE, ge=5, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
     )
     mouth_chamfer: Number = Field(
         NOMINAL.mouth_chamfer, ge=0.05 * MM, le=0.6 * MM, description="chamfer of the plug's mouth and slots [m]"

@@ -135,7 +135,7 @@ class BncConnector(DemonstratedInsertion):
         self.offsets = BncUncertainty(
             o.fixture_offset, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn
         )
-        self.collision = Threshold("contact_force", o.force_limit)
+        self.collision = Threshold("contact_force", o.largest_force_limit)
         self._workcell = o.workcell()
         self.num_steps = NUM_STEPS if o.demonstrations in DEMONSTRATIONS else self.reference().num_steps
 
@@ -162,7 +162,7 @@ class BncConnector(DemonstratedInsertion):
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
-        return observation_terms(self.config.observation, self.num_steps)
+        return *observation_terms(self.config.observation, self.num_steps), *self.force_limit_terms()
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
@@ -174,12 +174,13 @@ class BncConnector(DemonstratedInsertion):
 
     def symmetry(self) -> Symmetry:
         """Return half a turn about the jack's axis."""
-        return Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()])
+        signs = Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()])
+        return signs.padded(len(self.force_limit_terms()))
 
     def near_symmetry(self) -> Symmetry:
         """Return quarter turns and reflections too, which hold while the plug stands on the rim."""
         sides = sides_of_the_rim(self.config.observation, self.action_dims())
-        return self.symmetry() if sides is None else Symmetry(*sides)
+        return self.symmetry() if sides is None else Symmetry(*sides).padded(len(self.force_limit_terms()))
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:

@@ -17,7 +17,7 @@ from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, 
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
-from guiderail.diagrams.tasks.insertion import ForceOptions, InsertionTask
+from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions, InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
@@ -49,7 +49,7 @@ class GridClampOptions(ForceOptions):
         START_HEIGHT, min_length=2, max_length=2, description="least and greatest start height [m]"
     )
     force_limit: Number = Field(
-        COLLISION_FORCE, ge=8, le=60, description="force that ends an episode as a collision [N]"
+        COLLISION_FORCE, ge=8, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
     )
     seconds: Number = Field(10.0, ge=2, le=30, description="duration of an episode [s]")
     hole_chamfer: Number = Field(NOMINAL.hole_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the holes [m]")
@@ -217,7 +217,7 @@ def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> 
     lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in, with at
     most `snap_force` [N].
     """
-    position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:] * SCALE[3:]
+    position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:6] * SCALE[3:]
     command = position - force / STIFFNESS  # the impedance's spring separates it from the measured position
     if position[2] > ON_TABLE + NEAR:
         velocity = np.array([*(LANE_GAIN * (np.array([-LANE_ENDS, LANES[0]]) - position[:2])), -SPEED])
@@ -270,7 +270,7 @@ class GridClamp(InsertionTask):
     def __init__(self, config: EnvConfig):
         super().__init__(config)
         self.offsets = GridClampUncertainty(self.options.fixture_offset)
-        self.collision = Threshold("contact_force", self.options.force_limit)
+        self.collision = Threshold("contact_force", self.options.largest_force_limit)
         # The default is 100 actions at 10 Hz; the thesis's episodes take 140 on average.
         self.num_steps = round(self.options.seconds / CONTROL_PERIOD)
         self._workcell = self.options.workcell()
@@ -298,8 +298,10 @@ class GridClamp(InsertionTask):
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return the clamp's position in the hole's frame and the force."""
         first_three = (0, 1, 2)
-        return ObservationTerm("pose", CENTER[:3], SCALE[:3], first_three), ObservationTerm(
-            "wrench", 0.0, SCALE[3:], first_three
+        return (
+            ObservationTerm("pose", CENTER[:3], SCALE[:3], first_three),
+            ObservationTerm("wrench", 0.0, SCALE[3:], first_three),
+            *self.force_limit_terms(),
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:

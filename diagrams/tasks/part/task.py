@@ -32,7 +32,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.objects.insertion import COLLISION_FORCE, COMMAND_SCALE, HISTORY_VARIANCE, LEVER_SCALE
+from guiderail.models.objects.insertion import COMMAND_SCALE, HISTORY_VARIANCE, LEVER_SCALE
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
@@ -70,9 +70,6 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
-    )
-    force_limit: Number = Field(
-        COLLISION_FORCE, ge=1, le=60, description="force that ends an episode as a collision [N]"
     )
 
 
@@ -134,7 +131,7 @@ class PartInsertion(DemonstratedInsertion):
     def __init__(self, config: EnvConfig):
         super().__init__(config)
         self.offsets = PartUncertainty(self.options)
-        self.collision = Threshold("contact_force", self.options.force_limit)
+        self.collision = Threshold("contact_force", self.options.largest_force_limit)
         self.num_steps = self.reference().num_steps
 
     def workcell(self) -> PartWorkcell:
@@ -176,7 +173,8 @@ class PartInsertion(DemonstratedInsertion):
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
-        return observation_terms(self.config.observation, self.num_steps, center, scale, WRENCH_SCALE)
+        terms = observation_terms(self.config.observation, self.num_steps, center, scale, WRENCH_SCALE)
+        return *terms, *self.force_limit_terms()
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return the terms of `config.reward`."""
@@ -198,7 +196,9 @@ class PartInsertion(DemonstratedInsertion):
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
         every = sides_of_the_rim(self.config.observation, self.action_dims())
         chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
-        return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
+        if every is None or not chosen:
+            return None
+        return Symmetry(every[0][chosen], every[1][chosen]).padded(len(self.force_limit_terms()))
 
     @classmethod
     def is_seated(cls, plug: np.ndarray) -> bool:

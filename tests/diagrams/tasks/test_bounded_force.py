@@ -64,6 +64,42 @@ def test_impedance_follows_force_limit(limit):
     assert EnvConfig.resolve("GridClamp", {"bounded_force": False}).make_task().impedance() is None
 
 
+@pytest.mark.parametrize("station", ["gantry", "arm", "mujoco"])
+def test_sampled_limit_is_observed_and_bounds_the_force(station):
+    """Bang-bang actions; the impedance of the station itself is bounded for the largest limit only."""
+    env = make_env("BncConnector", difficulty="hard", guidance="kgrl", station=station, force_limit_range=(8.0, 25.0))
+    rng, limits = np.random.default_rng(0), []
+    for seed in (1, 5):
+        observation, info = env.reset(seed=seed)
+        limits.append(info["force_limit"])
+        assert observation[-1] == pytest.approx((limits[-1] - 20.0) / 10.0, abs=1e-6)
+        over = False
+        while not over:
+            action = rng.choice([-1.0, 1.0], 2)
+            *_, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+        assert info["termination"] != "collision"
+        assert 0.5 * limits[-1] < env.trace.force.max() < limits[-1]
+    env.close()
+    assert min(limits) >= 8.0
+    assert max(limits) - min(limits) > 3.0
+
+
+def test_symmetries_leave_observed_limit_unchanged():
+    env = make_env("BncConnector", difficulty="hard", guidance="kgrl", force_limit_range=(8.0, 25.0))
+    size = env.observation_space.shape[0]
+    for symmetry in (env.task.symmetry, env.task.near_symmetry):
+        for matrix in symmetry.observations:
+            np.testing.assert_array_equal(matrix[-1], np.eye(size)[-1])
+            np.testing.assert_array_equal(matrix[:, -1], np.eye(size)[-1])
+
+
+@pytest.mark.parametrize("given", [(25.0, 8.0), (0.5, 8.0), (8.0, 61.0)])
+def test_range_of_limits_is_refused_when_invalid(given):
+    with pytest.raises(InputError, match="two forces from 1 to 60 N"):
+        EnvConfig.resolve("GridClamp", {"force_limit_range": given})
+
+
 def test_station_raises_when_it_takes_no_impedance():
     def build():
         raise AssertionError("must not be built")
