@@ -7,7 +7,7 @@ OUTSIDE := .venv-outside
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants injections scaling fci outside newest clean
+.PHONY: help demo test lint docs build bench gallery results kills fuzz forces mutants injections scaling fci outside newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -54,6 +54,9 @@ fuzz: $(VENV)/.ready  ## random files and arguments, minutes
 
 mutants: $(VENV)/.ready  ## mutation testing of the safety code, hours
 	$(BIN)/python tests/harness/mutation/mutate.py --results mutants.json
+
+forces: $(VENV)/.ready  ## adversarial actions against the force limit, an hour
+	$(BIN)/python tests/harness/force_adversary.py --steps 100000
 
 injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 	$(BIN)/python tests/harness/injections/inject.py --injections 500

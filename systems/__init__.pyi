@@ -8,6 +8,7 @@ from .command_disturbance import CommandDisturbance as CommandDisturbance
 from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_detector import ContactDetector as ContactDetector
+from .energy_tank import EnergyTank as EnergyTank
 from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
 from .episode_monitor import TerminationTerm as TerminationTerm

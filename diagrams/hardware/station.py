@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.hardware.driver import Driver, PoseDriver, find_driver, safety_limits
 from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_rate_limiter, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.stations.impedance_control import add_controller
+from guiderail.diagrams.stations.impedance_control import add_controller, add_energy_tank
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import Impedance, Station, export_station_ports, to_wrench_order
 from guiderail.diagrams.stations.workcell import Workcell
@@ -159,6 +159,10 @@ class HardwareStation(Station):
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period))
         rate_limiter = builder.AddNamedSystem("rate_limiter", make_rate_limiter(self.driver, period))
         controller, impedance_monitor = add_controller(builder, model, self.impedance, period, compensate_gravity=False)
+        tank = add_energy_tank(builder, self.impedance, period, controller.get_pose_output_port())
+        if tank is not None:
+            builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
+            builder.Connect(tank.get_admitted_wrench_output_port(), controller.get_max_wrench_input_port())
         self._limiter = builder.AddNamedSystem("limiter", TorqueSafetyLimiter(model.plant, self.limits, period=period))
 
         status, heartbeat, limiter = self._status, self._heartbeat, self._limiter
@@ -174,7 +178,10 @@ class HardwareStation(Station):
             (safe_pose, rate_limiter.get_desired_pose_input_port()),
             (pose, rate_limiter.get_pose_input_port()),
             (limiter.get_blend_factor_output_port(), rate_limiter.get_blend_factor_input_port()),
-            (rate_limiter.get_limited_pose_output_port(), controller.get_desired_pose_input_port()),
+            (
+                rate_limiter.get_limited_pose_output_port(),
+                (tank or controller).get_desired_pose_input_port(),
+            ),
             (controller.get_impedance_wrench_output_port(), impedance_monitor.get_impedance_wrench_input_port()),
             (controller.get_generalized_force_output_port(), limiter.get_torque_input_port()),
             (state, limiter.get_estimated_state_input_port()),
@@ -205,7 +212,7 @@ class HardwareStation(Station):
             contact_force=impedance_monitor.get_contact_force_output_port(),
             saturation=controller.get_saturation_output_port(),
             command_timed_out=limiter.get_not_following_output_port(),
-            max_wrench=None if self.impedance.bound is None else controller.get_max_wrench_input_port(),
+            max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
         )
         builder.ExportOutput(limiter.get_fault_output_port(), "fault")
         builder.ExportOutput(limiter.get_arm_state_output_port(), "arm_state")

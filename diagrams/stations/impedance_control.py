@@ -14,8 +14,13 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.energy_tank import EnergyTank
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.reference_governor import ReferenceGovernor
+
+TANK_CAPACITY = 5.0  # [J] a multiple of the work of an insertion; only an adversary empties it
+# Least mass [kg] and moment of inertia [kg m²] that a damper is designed for: less dissipation refills a tank less.
+LEAST_MASS, LEAST_INERTIA = 1.5, 2e-3
 
 
 def add_controller(
@@ -48,6 +53,20 @@ def add_controller(
     return controller, monitor
 
 
+def add_energy_tank(
+    builder: DiagramBuilder, impedance: Impedance, period: float, pose: OutputPort
+) -> EnergyTank | None:
+    """Add the tank in front of a bounded impedance, sampled with `period` [s]; without a bound there is none."""
+    if impedance.bound is None:
+        return None
+    stiffness, masses = np.array(impedance.stiffness), np.repeat([LEAST_MASS, LEAST_INERTIA], 3)
+    damping = 2.0 * impedance.damping_ratio * np.sqrt(stiffness * masses)
+    tank = EnergyTank(stiffness, damping, impedance.bound, capacity=TANK_CAPACITY, period=period)
+    builder.AddNamedSystem("tank", tank)
+    builder.Connect(pose, tank.get_pose_input_port())
+    return tank
+
+
 def add_impedance_control(
     builder: DiagramBuilder,
     controller_plant: ControllerPlant,
@@ -67,16 +86,20 @@ def add_impedance_control(
     )
     builder.Connect(state, controller.get_estimated_state_input_port())
     builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+    tank = add_energy_tank(builder, impedance, period, controller.get_pose_output_port())
+    if tank is not None:
+        builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
+        builder.Connect(tank.get_admitted_wrench_output_port(), controller.get_max_wrench_input_port())
     export_station_ports(
         builder,
-        controller.get_desired_pose_input_port(),
+        (tank or controller).get_desired_pose_input_port(),
         controller.get_command_time_input_port(),
         pose=controller.get_pose_output_port(),
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
         saturation=controller.get_saturation_output_port(),
         command_timed_out=controller.get_command_timed_out_output_port(),
-        max_wrench=None if impedance.bound is None else controller.get_max_wrench_input_port(),
+        max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
     )
     return controller.get_generalized_force_output_port()
 
@@ -93,7 +116,7 @@ def add_joint_impedance(
     wrench: OutputPort,
     impedance_wrench: OutputPort,
 ) -> OutputPort:
-    """Add watchdog, governor and monitor of six joints with an impedance, and export the ports of a station.
+    """Add watchdog, tank, governor and monitor of six joints with an impedance, and export the ports of a station.
 
     Args:
         builder: Builder of the station.
@@ -112,6 +135,7 @@ def add_joint_impedance(
     watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
     governor = None
+    tank = add_energy_tank(builder, impedance, time_step, pose)
     if impedance.bound is not None:
         stiffness = np.array(impedance.stiffness)
         governor = builder.AddNamedSystem(
@@ -128,10 +152,12 @@ def add_joint_impedance(
         contact_force=monitor.get_contact_force_output_port(),
         saturation=monitor.get_saturation_output_port(),
         command_timed_out=watchdog.get_command_timed_out_output_port(),
-        max_wrench=None if governor is None else governor.get_max_wrench_input_port(),
+        max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
     )
-    if governor is None:
+    if governor is None or tank is None:
         return watchdog.get_safe_pose_output_port()
-    builder.Connect(watchdog.get_safe_pose_output_port(), governor.get_desired_pose_input_port())
+    builder.Connect(watchdog.get_safe_pose_output_port(), tank.get_desired_pose_input_port())
+    builder.Connect(tank.get_reference_pose_output_port(), governor.get_desired_pose_input_port())
+    builder.Connect(tank.get_admitted_wrench_output_port(), governor.get_max_wrench_input_port())
     builder.Connect(state, governor.get_state_input_port())
     return governor.get_reference_pose_output_port()

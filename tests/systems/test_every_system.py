@@ -80,6 +80,7 @@ def built():
         systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),
         systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
         systems.PoseRateLimiter(period=PERIOD),
+        systems.EnergyTank(np.ones(6), np.ones(6), WrenchBound(np.ones(6), 1.0, 1.0), capacity=1.0, period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
         systems.FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),

@@ -1,0 +1,165 @@
+"""Energy tank that makes an impedance with a moving reference and a changing bound passive."""
+
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.energy_tank import admissible_share, spring_energy
+from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound
+from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+
+_REVERSED = [0, 1, 2, 5, 4, 3]  # order of a pose's coordinates in a wrench, and the reverse
+
+
+class _Admitted(NamedTuple):
+    """Reference (6,), limits (6,) in the order of a pose, and energy of the tank [J]."""
+
+    reference: np.ndarray
+    limits: np.ndarray
+    energy: float
+
+
+class EnergyTank(LeafSystem):
+    """Pass a reference and a bound on, as long as the energy that they add to the spring is in the tank.
+
+        T' = T + Σ D Δx² / h − (U(x_r', F') − U(x_r, F)) ≥ 0
+
+    U is the energy of the clipped spring at the measured pose x. A change of the reference x_r, or of the limits F, is
+    paid from the tank. What the damper dissipates, at least Σ D Δx² / h in a period h, refills it up to the capacity.
+    If the tank does not suffice, only a share of the change is passed on. A lower limit applies at once. The energy of
+    spring, tank and motion therefore grows by nothing but the work of the surroundings, which cannot extract more than
+    the initial content (Ferraguti, Secchi, Fantuzzi 2013).
+
+    .. pydrake_system::
+
+        name: EnergyTank
+        input_ports:
+        - desired_pose
+        - pose
+        - max_wrench (optional)
+        output_ports:
+        - reference_pose
+        - admitted_wrench
+        - energy
+
+    ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
+    desired pose that is not finite is passed on without a cost. ``max_wrench`` and ``admitted_wrench`` are (8,), [fx fy
+    fz tx ty tz], norm of the force and norm of the torque [N, Nm]. ``energy`` is (1,), the content [J].
+
+    Args:
+        stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
+        damping: Damping (6,) of each coordinate that dissipates at least [N s/m, Nm s/rad], not negative.
+        bound: Bound of the wrench.
+        capacity: Initial and largest content [J], positive.
+        period: Sampling period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(
+        self, stiffness: np.ndarray, damping: np.ndarray, bound: WrenchBound, *, capacity: float, period: float
+    ):
+        super().__init__()
+        check_period(period)
+        self._stiffness, self._damping = (np.array(values, dtype=float) for values in (stiffness, damping))
+        shapes_agree = self._stiffness.shape == self._damping.shape == (POSE_SIZE,)
+        if not shapes_agree or not (self._stiffness > 0.0).all() or not (self._damping >= 0.0).all():
+            raise InputError("an energy tank needs six positive stiffnesses and six dampings, none negative")
+        if not 0.0 < capacity < np.inf:
+            raise InputError(f"an energy tank's capacity must be positive, not {capacity} J")
+        self._bound, self._capacity, self._period = bound, capacity, period
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
+        self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
+        self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
+        self._last_reference = self.DeclareDiscreteState(POSE_SIZE)
+        self._last_limits = self.DeclareDiscreteState(POSE_SIZE)
+        self._last_pose = self.DeclareDiscreteState(POSE_SIZE)
+        self._content = self.DeclareDiscreteState([capacity])
+        inputs = {port.ticket() for port in (self._desired_pose_port, self._pose_port, self._max_wrench_port)}
+        states = (self._last_reference, self._last_limits, self._last_pose, self._content)
+        everything = inputs | {self.discrete_state_ticket(state) for state in states}
+        self._admitted = declare_cache(self, "admitted", self._calc_admitted, prerequisites_of_calc=everything)
+        admitted = {self._admitted.ticket()}
+        self._reference_pose_port = self.DeclareVectorOutputPort(
+            "reference_pose", POSE_SIZE, self._calc_reference_pose, prerequisites_of_calc=admitted
+        )
+        self._admitted_wrench_port = self.DeclareVectorOutputPort(
+            "admitted_wrench", MAX_WRENCH_SIZE, self._calc_admitted_wrench, prerequisites_of_calc=admitted
+        )
+        self._energy_port = self.DeclareVectorOutputPort(
+            "energy", 1, self._calc_energy, prerequisites_of_calc={self.discrete_state_ticket(self._content)}
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (6,)")
+    get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
+    get_reference_pose_output_port = output_getter("reference_pose", "reference that the tank admits, (6,)")
+    get_admitted_wrench_output_port = output_getter("admitted_wrench", "bound that the tank admits, (8,)")
+    get_energy_output_port = output_getter("energy", "energy in the tank, (1,) [J]")
+
+    def _requested_bound(self, context: Context) -> WrenchBound:
+        if not self._max_wrench_port.HasValue(context):
+            return self._bound
+        return self._bound.lowered_to(self._max_wrench_port.Eval(context))
+
+    def _calc_admitted(self, context: Context) -> _Admitted:
+        pose, desired = self._pose_port.Eval(context), self._desired_pose_port.Eval(context)
+        reference, last_limits, last_pose, content = (
+            context.get_discrete_state(state).value()
+            for state in (self._last_reference, self._last_limits, self._last_pose, self._content)
+        )
+        if not np.isfinite(desired).all():
+            desired = reference
+        requested = self._requested_bound(context).axes[_REVERSED]
+        limits, K = np.minimum(last_limits, requested), self._stiffness
+        moved = _difference(pose, last_pose)
+        dissipated = float(self._damping @ moved**2) / self._period
+        energy = min(self._capacity, float(content[0]) + dissipated)
+        error, desired_error = _difference(reference, pose), _difference(desired, pose)
+        released = spring_energy(K, last_limits, error) - spring_energy(K, limits, error)
+        share = admissible_share(K, (limits, requested), (error, desired_error), energy + released)
+        if share == 1.0:
+            following, admitted = desired, requested
+        else:
+            following = pose + error + share * (desired_error - error)
+            admitted = limits + share * (requested - limits)
+        added = spring_energy(K, admitted, _difference(following, pose)) - spring_energy(K, last_limits, error)
+        return _Admitted(following, admitted, min(self._capacity, max(energy - added, 0.0)))
+
+    def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
+        desired = self._desired_pose_port.Eval(context)
+        output.SetFromVector(self._admitted.Eval(context).reference if np.isfinite(desired).all() else desired)
+
+    def _calc_admitted_wrench(self, context: Context, output: BasicVector) -> None:
+        bound = self._requested_bound(context)
+        output.SetFromVector([*self._admitted.Eval(context).limits[_REVERSED], bound.force, bound.torque])
+
+    def _calc_energy(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._content).value())
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        pose = self._pose_port.Eval(context)
+        discrete_state.set_value(self._last_reference, pose)
+        discrete_state.set_value(self._last_limits, self._requested_bound(context).axes[_REVERSED])
+        discrete_state.set_value(self._last_pose, pose)
+        discrete_state.set_value(self._content, [self._capacity])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        admitted = self._admitted.Eval(context)
+        discrete_state.set_value(self._last_reference, admitted.reference)
+        discrete_state.set_value(self._last_limits, admitted.limits)
+        discrete_state.set_value(self._last_pose, self._pose_port.Eval(context))
+        discrete_state.set_value(self._content, [admitted.energy])
+
+
+def _difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return first − second of two poses (6,), angles in [−π, π)."""
+    difference = first - second
+    difference[3:] = (difference[3:] + np.pi) % (2.0 * np.pi) - np.pi
+    return difference

@@ -1,0 +1,105 @@
+"""Adversarial actions against the force limit: random, held, extreme and bang-bang, on every station and guidance.
+
+    python tests/harness/force_adversary.py --steps 100000            # an hour on one core; 0 stops are expected
+    python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
+
+Prints a line of JSON for each case: control steps, terminations, the largest impedance force and measured contact force
+in relation to the episode's limit, and the least content of the energy tank. Exit code 1 if an episode ended by force.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+from guiderail.diagrams.envs.make import make_env
+
+GUIDANCE = {"BncConnector": ("kgrl", "skgrl", "residual"), "GridClamp": ("sct", "residual")}
+STATIONS = ("gantry", "arm", "mujoco")
+ATTACKS = ("random", "held", "extreme", "bang_bang")
+SEED = 2_100_000
+
+
+def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.ndarray]:
+    """Return a function that returns the next action (size,) of an attack."""
+    held = rng.uniform(-1.0, 1.0, size) if kind == "held" else rng.choice([-1.0, 1.0], size)
+    if kind in ("held", "extreme"):
+        return lambda: held
+    if kind == "random":
+        return lambda: rng.uniform(-1.0, 1.0, size)
+    return lambda: rng.choice([-1.0, 1.0], size)
+
+
+def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
+    """Attack one environment for a number of control steps; return the outcome."""
+    env = make_env(task, action_repeat=5, **options)
+    done, endings, force, contact, energy = 0, Counter[str](), 0.0, 0.0, np.inf
+    for episode in itertools.count():
+        rng = np.random.default_rng([SEED, episode])
+        act = attack(ATTACKS[episode % len(ATTACKS)], rng, env.action_space.shape[0])
+        *_, info = env.reset(seed=SEED + episode, options={"new_run": True})
+        limit, over = info.get("force_limit", env.task.declaration.collision.above), False
+        while not over:
+            *_, terminated, truncated, info = env.step(act())
+            over = terminated or truncated
+        endings[info["termination"]] += 1
+        done += info["control_steps"]
+        force = max(force, float(env.trace.force.max()) / limit)
+        contact = max(contact, float(np.linalg.norm(env.trace.signals["wrench"][:, :3], axis=1).max()) / limit)
+        energy = min(energy, tank_content(env))
+        if done >= steps:
+            break
+    env.close()
+    return {
+        "steps": done,
+        "endings": dict(endings),
+        "force_per_limit": round(force, 3),
+        "contact_per_limit": round(contact, 3),
+        "tank_J": round(energy, 2),
+    }
+
+
+def tank_content(env: object) -> float:
+    """Return the energy in the station's tank [J]; infinite if it has none."""
+    station = env.task.diagram.GetSubsystemByName("station")
+    if not station.HasSubsystemNamed("tank"):
+        return np.inf
+    tank = station.GetSubsystemByName("tank")
+    return float(tank.get_energy_output_port().Eval(tank.GetMyContextFromRoot(env.simulator.get_context()))[0])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the program; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=100_000, help="control steps, of all cases together")
+    parser.add_argument("--bounded", choices=("true", "false"), default="true", help="bounded_force of the environments")
+    parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
+    parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
+    given = parser.parse_args(arguments)
+    cases = [
+        (task, {"guidance": guidance, "station": station, "difficulty": difficulty} | limits)
+        for task in GUIDANCE
+        for guidance in GUIDANCE[task]
+        for station in STATIONS
+        for difficulty in ("standard", "hard")
+        for limits in ({}, {"force_limit_range": (8.0, 25.0)})
+        if given.task in (None, task) and given.station in (None, station) and not (limits and difficulty == "standard")
+    ]
+    stops = total = 0
+    for task, options in cases:
+        found = run_case(task, max(given.steps // len(cases), 1), bounded_force=given.bounded == "true", **options)
+        stops += found["endings"].get("collision", 0)
+        total += found["steps"]
+        print(json.dumps({"task": task, **options, **found}), flush=True)
+    print(json.dumps({"steps": total, "stops": stops}))
+    return 1 if stops else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

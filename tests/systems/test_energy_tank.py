@@ -1,0 +1,114 @@
+"""Adversarial test of passivity: references, bounds and the surroundings conspire to extract energy."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench_bound import WrenchBound
+from guiderail.systems import EnergyTank
+
+STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(3, 95.0), np.full(3, 0.5)]
+BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 3.0, 3.0, 3.0]), 20.0, 5.2)
+PERIOD = 0.01
+
+
+class Tank:
+    """Tank without a diagram: `step` runs one period and returns the force along x."""
+
+    def __init__(self, capacity=0.5):
+        self.system = EnergyTank(STIFFNESS, DAMPING, BOUND, capacity=capacity, period=PERIOD)
+        self.context = self.system.CreateDefaultContext()
+        self.put(np.zeros(6), np.zeros(6), BOUND.numbers)
+        events = self.system.AllocateDiscreteVariables()
+        self.system._reset(self.context, events)
+        self.context.SetDiscreteState(events)
+
+    def put(self, desired, pose, bound):
+        self.system.get_desired_pose_input_port().FixValue(self.context, desired)
+        self.system.get_pose_input_port().FixValue(self.context, pose)
+        self.system.get_max_wrench_input_port().FixValue(self.context, bound)
+
+    def step(self, desired, pose, bound):
+        """Return reference and limit of x, and the content after the update."""
+        self.put(desired, pose, bound)
+        reference = self.system.get_reference_pose_output_port().Eval(self.context)
+        limit = self.system.get_admitted_wrench_output_port().Eval(self.context)
+        self.context.SetDiscreteState(self.system.EvalUniquePeriodicDiscreteUpdate(self.context))
+        return reference, limit, self.system.get_energy_output_port().Eval(self.context)[0]
+
+
+def extracted(capacity, *, with_tank, seed=0):
+    """Return the energy [J] that a moving obstacle gains along x, while an adversary moves the reference behind it."""
+    tank, rng, x, gained, contents = Tank(capacity), np.random.default_rng(seed), 0.0, 0.0, []
+    for _ in range(600):
+        forward = rng.uniform() < 0.8
+        speed = rng.uniform(0.0, 0.05) * (1.0 if forward else -1.0)
+        desired = np.r_[x + 0.1 if forward else x, np.zeros(5)]  # pushes the obstacle along, lets it come back
+        bound = BOUND.numbers * (1.0 if forward else 0.1)
+        reference, limit, content = tank.step(desired, np.r_[x, np.zeros(5)], bound)
+        contents.append(content)
+        if not with_tank:
+            reference, limit = desired, bound
+        for _ in range(10):  # the obstacle moves within the period
+            force = np.clip(STIFFNESS[0] * (reference[0] - x), -limit[0], limit[0]) - DAMPING[0] * speed
+            gained += force * speed * PERIOD / 10
+            x += speed * PERIOD / 10
+    return gained, min(contents)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_surroundings_extract_at_most_the_content(seed):
+    gained, content = extracted(0.2, with_tank=True, seed=seed)
+    assert -1e-9 <= content < 0.01  # the adversary emptied it
+    assert gained <= 0.2 * 1.02
+    assert extracted(0.2, with_tank=False, seed=seed)[0] > 0.4
+
+
+def test_full_tank_passes_reference_and_bound_unchanged():
+    tank, desired, pose = Tank(5.0), np.full(6, 0.012), np.full(6, 0.01)
+    reference, wrench, _ = tank.step(desired, pose, 0.5 * BOUND.numbers)
+    np.testing.assert_array_equal(reference, desired)
+    np.testing.assert_array_equal(wrench, 0.5 * BOUND.numbers)
+
+
+def test_lower_bound_applies_at_once_when_the_tank_is_empty():
+    tank, far, pose = Tank(1e-6), np.r_[0.1, np.zeros(5)], np.zeros(6)
+    tank.step(far, pose, BOUND.numbers)
+    reference, wrench, _ = tank.step(far, pose, 0.1 * BOUND.numbers)
+    np.testing.assert_array_equal(wrench[:6], 0.1 * BOUND.axes)
+    assert 0.0 < reference[0] < 1e-3
+    _, wrench, content = tank.step(far, pose, BOUND.numbers)
+    assert content >= 0.0
+
+
+def test_motion_refills_the_tank_up_to_its_capacity():
+    tank = Tank(0.02)
+    _, _, low = tank.step(np.r_[0.005, np.zeros(5)], np.zeros(6), BOUND.numbers)
+    assert low == pytest.approx(0.02 - 0.5 * 1500.0 * 0.005**2)
+    moved = np.r_[0.005, np.zeros(5)]
+    _, _, content = tank.step(moved, moved, BOUND.numbers)
+    assert content == 0.02
+
+
+def test_pose_that_is_not_finite_costs_nothing():
+    """A controller behind the tank notices it, and holds its last valid pose."""
+    tank, desired = Tank(), np.r_[0.001, np.zeros(5)]
+    *_, before = tank.step(desired, np.zeros(6), BOUND.numbers)
+    reference, _, content = tank.step(np.full(6, np.nan), np.zeros(6), BOUND.numbers)
+    assert np.isnan(reference).all()
+    assert content == before
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
+        ({"capacity": 0.0}, "capacity must be positive"),
+        ({"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_tank_raises_when_an_argument_is_invalid(change, words):
+    arguments = {"stiffness": STIFFNESS, "damping": DAMPING, "bound": BOUND, "capacity": 1.0, "period": 0.01} | change
+    stiffness, damping, bound = (arguments.pop(name) for name in ("stiffness", "damping", "bound"))
+    with pytest.raises(InputError, match=words):
+        EnergyTank(stiffness, damping, bound, **arguments)
