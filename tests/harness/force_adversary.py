@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100_000, help="control steps, of all cases together")
-    parser.add_argument("--bounded", choices=("true", "false"), default="true", help="bounded_force of the environments")
+    parser.add_argument("--bounded", choices=("true", "false"), default="true", help="option bounded_force")
     parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
     parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
     given = parser.parse_args(arguments)
