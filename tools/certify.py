@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,9 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
-from guiderail.models.certificate.adversary import QUANTITIES, Adversary
+from guiderail.models.certificate.adversary import QUANTITIES, Adversary, AttackResult
 from guiderail.models.certificate.bounds import CertifiedBounds, certify
-from guiderail.models.certificate.files import CERTIFICATE, certificate_files
+from guiderail.models.certificate.files import CERTIFICATE, certificate_files, compare_subject
 from guiderail.models.certificate.lagrange_bounds import Budget
 from guiderail.models.certificate.loop import Bounds, CertifiedLoop
 from guiderail.models.common.errors import InputError, brief
@@ -32,6 +34,7 @@ GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
 SEARCH_STEPS = 100_000  # steps of the adversary that determines the budgets
 BUDGET_MARGIN = 1.5  # budgets relative to the adversary's worst corrections
 MIN_EXCESS = ((0.01,), (0.1,))  # smallest budgets of excess, in actions: at one step, and in total
+MIN_KEY_BYTES = 16  # as the checker demands
 ROUNDING = 1.0 + 1e-6  # an adversary may reach an exact bound up to rounding
 
 
@@ -42,6 +45,7 @@ def certify_skill(
     out: Path | None = None,
     start_within: float | None = None,
     attack: int = 0,
+    key: Path | None = None,
 ) -> dict[str, Any]:
     """Write a certificate and check it in a separate process.
 
@@ -53,6 +57,7 @@ def certify_skill(
             the task declares, plus the error of a measured pose.
         attack: Number of steps in which an adversary tries to leave the bounds; its results are written to
             `attack.csv`.
+        key: File of the key that signs the certificate; None: no signature.
 
     Returns:
         Numbers of the regimes, the certificate's path and the checker's verdict; after an attack also the table's rows
@@ -61,41 +66,29 @@ def certify_skill(
     Raises:
         InputError: If there is no such run or task, or its guidance cannot be certified.
     """
-    task, arguments, about = _find_subject(subject, environment)
-    options = check_environment(task, arguments)
-    guidance = str(options["guidance"])
     if attack < 0:
         raise InputError(f"an attack has a number of steps, not {attack}")
-    if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
-        raise InputError(
-            f"guidance={guidance!r} follows no law that is certified: it takes {' or '.join(GUIDANCE)}, with a "
-            "history of commands and of one length (neither adaptive_history nor history_source=measured)"
-        )
+    skill = _find_skill(subject, environment, start_within)
+    signing_key = _read_key(key)
     if out is None:
         if not Path(subject).is_dir():
             raise InputError("say where the certificate of a task goes with --out")
         out = Path(subject) / "certificate"
-    loop = _make_loop(task, options, start_within)
-    primitive = loop.primitive
+    loop, primitive = skill.loop, skill.loop.primitive
     budget = None
     if primitive.history:
-        every_step = np.ones(primitive.num_steps, bool)
-        worst = Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
+        worst = _search_budget(loop)
         budget = Budget(BUDGET_MARGIN * worst.excess + np.array(MIN_EXCESS), BUDGET_MARGIN * worst.residue)
     certified = certify(loop, budget)
-    impedance = EnvConfig.resolve(task, options).make_task().impedance()
-    if impedance is None and primitive.num_outputs == len(Impedance().stiffness):
-        impedance = Impedance()
-    stiffness = None if impedance is None else options.get("stiffness_factor", 1.0) * np.array(impedance.stiffness)
-    limits = None if impedance is None else np.array(impedance.limits)
-    for name, content in certificate_files(loop, certified, stiffness, limits, about).items():
+    files = certificate_files(loop, certified, skill.stiffness, skill.limits, skill.about, signing_key)
+    for name, content in files.items():
         write_atomically(out / name, content)
     start_time = time.perf_counter()
-    process = subprocess.run([sys.executable, checker.__file__, str(out)], capture_output=True, text=True)
+    verdict = _run_checker(out, key)
     seconds = time.perf_counter() - start_time
     result: dict[str, Any] = {
         "certificate": str(out / CERTIFICATE),
-        "checker": (process.stdout or process.stderr).strip(),
+        "checker": verdict,
         "checker_seconds": round(seconds, 1),
         "start_within": loop.start_within.tolist(),
         "steps": primitive.num_steps,
@@ -106,11 +99,126 @@ def certify_skill(
         regimes["budgeted"] = certified.budgeted.bounds
     for regime, bounds in regimes.items():
         result |= {f"{regime}_{name}": value for name, value in _extremes(bounds).items()}
-    if limits is not None:
-        result["force"] = float(np.linalg.norm(limits[:3]))
+    if skill.limits is not None:
+        result["force"] = float(np.linalg.norm(skill.limits[:3]))
     if attack:
         result |= _attack(loop, certified, attack, out)
     return result
+
+
+def verify_certificate(
+    subject: str,
+    environment: Mapping[str, Any],
+    folder: Path,
+    *,
+    start_within: float | None = None,
+    key: Path | None = None,
+) -> dict[str, Any]:
+    """Check a certificate and compare all that it takes as given with a skill.
+
+    The checker proves that the bounds follow from the primitive, the constraints, the impedance and the budget in the
+    files. Here these are computed again from the skill, and the search for the budget is repeated.
+
+    Args:
+        subject: Folder of a run, or name of a task.
+        environment: As in `certify_skill`.
+        folder: Folder of the certificate.
+        start_within: As in `certify_skill`.
+        key: File of the key that must have signed the certificate; None: a signature is not checked.
+
+    Returns:
+        The certificate's path and the verdict, "yes" or "no" with the reason.
+
+    Raises:
+        InputError: As `certify_skill`, or if the folder has no certificate.
+    """
+    _read_key(key)
+    skill = _find_skill(subject, environment, start_within)
+    if not (folder / CERTIFICATE).is_file():
+        raise InputError(f"there is no {CERTIFICATE} in {folder}: name the folder of a certificate")
+    verdict = _run_checker(folder, key)
+    if verdict == "yes":
+        files = {name: (folder / name).read_bytes() for name in (CERTIFICATE, *checker.ARRAYS)}
+        different = compare_subject(files, skill.loop, skill.stiffness, skill.limits, skill.about)
+        if different is not None:
+            verdict = f"no: its {different} is not that of {subject}"
+        elif (budgeted := json.loads(files[CERTIFICATE])["budgeted"]) is not None:
+            worst = _search_budget(skill.loop)
+            for name in checker.BUDGETS:
+                if (getattr(worst, name) > np.array(budgeted[name])).any():
+                    verdict = f"no: corrections of {subject} exceed its budget of {name}"
+    return {"certificate": str(folder / CERTIFICATE), "checker": verdict}
+
+
+@dataclass(frozen=True)
+class _Skill:
+    """Subject of a certificate.
+
+    Attributes:
+        loop: Primitive in its loop.
+        stiffness: Stiffness of the impedance, or None.
+        limits: Limits of the impedance's wrench, or None.
+        about: Description.
+    """
+
+    loop: CertifiedLoop
+    stiffness: np.ndarray | None
+    limits: np.ndarray | None
+    about: dict[str, Any]
+
+
+def _find_skill(subject: str, environment: Mapping[str, Any], start_within: float | None) -> _Skill:
+    """Return the skill of a run or a task.
+
+    Raises:
+        InputError: If there is no such run or task, or its guidance cannot be certified.
+    """
+    task, arguments, about = _find_subject(subject, environment)
+    options = check_environment(task, arguments)
+    guidance = str(options["guidance"])
+    if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
+        raise InputError(
+            f"guidance={guidance!r} follows no law that is certified: it takes {' or '.join(GUIDANCE)}, with a "
+            "history of commands and of one length (neither adaptive_history nor history_source=measured)"
+        )
+    loop = _make_loop(task, options, start_within)
+    impedance = EnvConfig.resolve(task, options).make_task().impedance()
+    if impedance is None and loop.primitive.num_outputs == len(Impedance().stiffness):
+        impedance = Impedance()
+    if impedance is None:
+        return _Skill(loop, None, None, about)
+    stiffness = options.get("stiffness_factor", 1.0) * np.array(impedance.stiffness)
+    return _Skill(loop, stiffness, np.array(impedance.limits), about)
+
+
+def _search_budget(loop: CertifiedLoop) -> AttackResult:
+    """Return what the corrections of a loop with a history need, as far as a search of `SEARCH_STEPS` steps finds."""
+    every_step = np.ones(loop.primitive.num_steps, bool)
+    return Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
+
+
+def _run_checker(folder: Path, key: Path | None) -> str:
+    """Return what the checker prints, which runs in a process of its own."""
+    command = [sys.executable, checker.__file__, str(folder), *([] if key is None else [str(key)])]
+    process = subprocess.run(command, capture_output=True, text=True)
+    return (process.stdout or process.stderr).strip()
+
+
+def _read_key(key: Path | None) -> bytes | None:
+    """Return the content of a key file.
+
+    Raises:
+        InputError: If it cannot be read or is too short.
+    """
+    if key is None:
+        return None
+    try:
+        content = key.read_bytes()
+    except OSError as error:
+        raise InputError(f"the key {key} can't be read ({error.strerror})") from error
+    if len(content) < MIN_KEY_BYTES:
+        raise InputError(f"a key has at least {MIN_KEY_BYTES} bytes: head -c 32 /dev/urandom > {key}")
+    return content
 
 
 def _make_loop(task: str, options: Mapping[str, Any], start_within: float | None) -> CertifiedLoop:

@@ -28,11 +28,14 @@ import numpy as np
 from guiderail.models.certificate.lagrange_bounds import Budget, BudgetedBounds, bound_within_budget
 from guiderail.models.certificate.loop import Bounds, CertifiedLoop, reach, single_output_bounds
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.constraints import LinearConstraints
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 CELLS = {1: 16, 2: 24, 3: 3}  # number of actions → number of cells along each; 1 for more actions
 MAX_ACTIONS = 6  # largest number of actions whose corners are enumerated
 ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
+BORDER = 1e-6  # slack, relative to its terms, up to which a constraint counts as active
+CORNER_MARGIN = 1e-8  # margin of the corrections at corners, so that the checker's rounding cannot make them infeasible
 
 
 @dataclass(frozen=True)
@@ -135,19 +138,21 @@ def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.n
         spread = history_map @ generators[n : past + n].reshape(history_map.shape[1], generators.shape[2])
         spread[:, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
         size = np.abs(spread).sum(axis=1)
-        can_be_active[n] = bool((value - size < lower).any() or (value + size > upper).any())
+        # A constraint that is almost reached counts, so that the checker's rounding cannot decide.
+        near = BORDER * (np.abs(value - [[*lower], [*upper]]) + size)
+        can_be_active[n] = bool((value - size < lower + near[0]).any() or (value + size > upper - near[1]).any())
     return can_be_active
 
 
 def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds (2, N, O) of corrected commands, NaN at other steps, and the multipliers that prove them."""
-    primitive = loop.primitive
+    primitive = _with_margin(loop.primitive)
     bounds, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
     actions, cells = action_cells(loop.gains)
     for n in map(int, np.flatnonzero(can_be_active)):
         predictions = [primitive.predict(n, action) for action in actions]
         multipliers.append([prediction.multipliers for prediction in predictions])
-        rows, lower, upper = primitive.free_constraints(n)
+        rows, lower, upper = loop.primitive.free_constraints(n)  # without the margin, for the least norms
         rank = next((len(one.correction) for one in predictions if one.correction is not None), 0)
         corrections = np.array([np.zeros(rank) if one.correction is None else one.correction for one in predictions])
         free, sizes = actions @ rows.T, primitive.output_sizes(n)
@@ -161,6 +166,23 @@ def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.nda
             ranges.append([outputs[cell].min(axis=0) - radius, outputs[cell].max(axis=0) + radius])
         bounds[0, n], bounds[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
     return bounds, np.array(multipliers) if multipliers else _no_multipliers(primitive)
+
+
+def _with_margin(primitive: LcNsKmp) -> LcNsKmp:
+    """Return the primitive with constraints tightened by `CORNER_MARGIN`.
+
+    Raises:
+        InputError: If constraints leave no room for it.
+    """
+    constraints = primitive.constraints
+    tighter = np.where((constraints.G != 0.0).any(axis=-1), constraints.c + CORNER_MARGIN, constraints.c)
+    try:
+        tightened = LinearConstraints(constraints.G, tighter)
+    except InputError as error:
+        raise InputError("constraints that leave less than 20 nm of room can't be certified: widen them") from error
+    settings = {name: getattr(primitive, name) for name in ("lambda_", "beta", "horizon", "solver")}
+    # The motion without constraints is that of the primitive, whose deviation was accepted.
+    return LcNsKmp(primitive.reference, primitive.kernel, constraints=tightened, max_deviation=np.inf, **settings)
 
 
 def _min_norms(

@@ -1,26 +1,53 @@
-"""Check a certificate with NumPy alone: `python checker.py FOLDER`; exit code 0: yes, 1: no, 2: no such files.
+"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0: yes, 1: no, 2: no such files.
 
 It bounds all sequences of actions, W h being what the history h implies of the window and C the kernel given h:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
+
+Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
+must leave room for it (docs/concepts/robustness.md has the argument). The files hold nothing that is not checked, or
+compared with the skill by `guiderail certify SKILL --verify FOLDER`: what the certificate is about, the primitive, the
+impedance and the budget. The digest detects accidents only, as anyone can compute it; a signature needs the key.
 """
 
 import hashlib
+import hmac
 import itertools
 import json
 import sys
+import zipfile
+from decimal import Decimal, getcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 Arrays = dict[str, np.ndarray]
-KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: np.exp(-np.longdouble(0.5 / length**2) * d**2)}
+Real = np.longdouble
+KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / (2 * length * length)).exp()}
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
-AGREEMENT = 1e-4  # largest difference from a claim, relative to the largest value of the quantity
-TOLERANCE = 1e-7  # largest violation by a correction, relative to the size of the constraint
+BUDGETS = ("excess", "residue")
+AGREEMENT = 1e-4  # largest excess of a claim over what it has to be, relative to the largest value of the quantity
+BORDER = 1e-5  # slack, relative to its terms, up to which a constraint may be called active
+COMMAND_TOLERANCE = 1e-9  # largest violation of a command, as the primitive checks it, rows of unit norm
 ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
+getcontext().prec = 60
+EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
+MAX_BYTES = 2**30  # of the arrays of one file
 # First half of the SHA-256 of the assumptions: six sentences always, one for a budget, one for another period
-ASSUMED = ["e5158d7dbfb9eb94f8416c6dc4d2ff18", "a655ad2b35cbf716049b5b81125193c9", "a36592ef1fbc0ffbb0d3964081e759de"]
+ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
+# Arrays of each file: kind, and shape in terms of steps, outputs, rows of constraints and rounds of multipliers
+ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
+    "primitive.npz": {
+        **{"means": ("f", "NO"), "covariances": ("f", "NOO"), "gains": ("f", "O"), "start": ("f", "O")},
+        **{"start_within": ("f", "O"), "clock": ("f", ""), "length_scale": ("f", ""), "lambda": ("f", "")},
+        **{"beta": ("f", ""), "history_variance": ("f", ""), "horizon": ("i", ""), "history": ("i", "")},
+    },
+    "constraints.npz": {"G": ("f", "NFO"), "c": ("f", "NF")},
+    "witness.npz": {"active": ("b", "N"), "multipliers": ("f", "TCHF")},
+}
+LAGRANGE = {
+    **{"lagrange_steps": ("i", "32NOR"), "lagrange_outputs": ("i", "32NOR"), "lagrange_multipliers": ("f", "32NOR")}
+}
 
 
 class Rejected(Exception):
@@ -33,112 +60,239 @@ def require(condition: Any, words: str) -> None:
         raise Rejected(words)
 
 
-def read(folder: Path) -> tuple[Arrays, Arrays, dict[str, Any]]:
-    """Return primitive and constraints, witness and claims; reject a file that differs from its digest."""
-    claims = json.loads((folder / "certificate.json").read_text())
-    text = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
-    require(hashlib.sha256(text.encode()).hexdigest() == claims.get("digest"), "certificate.json was changed")
-    files: dict[str, Arrays] = {}
-    for name in ("primitive.npz", "constraints.npz", "witness.npz"):
-        content = (folder / name).read_bytes()
-        require(hashlib.sha256(content).hexdigest() == claims["digests"].get(name), f"{name} was changed")
+def canonical(claims: dict[str, Any], *left_out: str) -> str:
+    """Return the only accepted text of claims, without some of the fields."""
+    return json.dumps({k: v for k, v in claims.items() if k not in left_out}, sort_keys=True, allow_nan=False)
+
+
+def read(folder: Path, key: bytes | None) -> tuple[Arrays, Arrays, dict[str, Any]]:
+    """Return primitive and constraints, witness and claims; reject files that are not exactly as they must be."""
+    text = (folder / "certificate.json").read_text(encoding="utf-8")
+    claims = json.loads(text)
+    require(type(claims) is dict and text == canonical(claims), "certificate.json is not in canonical form")
+    has_budget, names = claims.get("budgeted") is not None, ["about", "always", "assumes", "budgeted", "digest"]
+    names += ["digests", "format", "free", "impedance", "kernel", "period"] + ["signature"] * ("signature" in claims)
+    require(sorted(claims) == sorted(names), f"its fields are not {', '.join(names)}")
+    digest = hashlib.sha256(canonical(claims, "digest", "signature").encode()).hexdigest()
+    require(claims["digest"] == digest, "certificate.json was changed")
+    if key is not None:
+        require(len(key) >= 16, "a key has 16 bytes at least")
+        signature = hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
+        signed = isinstance(claims.get("signature"), str) and hmac.compare_digest(claims["signature"], signature)
+        require(signed, "the signature is missing, or not of this key")
+    require(
+        type(claims["digests"]) is dict and sorted(claims["digests"]) == sorted(ARRAYS), "digests are not the files'"
+    )
+    files, sizes = {}, {"3": 3, "2": 2}
+    for name, expected in ARRAYS.items():
+        expected = {**expected, **(LAGRANGE if has_budget and name == "witness.npz" else {})}
+        require(hashlib.sha256((folder / name).read_bytes()).hexdigest() == claims["digests"][name], f"{name} changed")
+        with zipfile.ZipFile(folder / name) as archive:
+            require(sorted(archive.namelist()) == sorted(f"{k}.npy" for k in expected), f"{name} has other arrays")
+            require(sum(info.file_size for info in archive.infolist()) <= MAX_BYTES, f"{name} is too large")
         with np.load(folder / name, allow_pickle=False) as arrays:
-            files[name] = {key: arrays[key] for key in arrays.files}
-        require(all(np.isfinite(each).all() for each in files[name].values()), f"{name} has values that are not finite")
+            files[name] = {k: arrays[k] for k in expected}
+        for k, (kind, shape) in expected.items():
+            array, dtype = files[name][k], {"f": np.dtype("<f8"), "i": np.dtype("<i8"), "b": np.dtype(bool)}[kind]
+            require(array.dtype == dtype and array.ndim == len(shape), f"{k} is not of its type and dimension")
+            require(np.isfinite(array).all(), f"{k} has values that are not finite")
+            fits = all(sizes.setdefault(letter, n) == n for letter, n in zip(shape, array.shape, strict=True))
+            require(fits, f"{k} has another shape than the other arrays imply")
     return {**files["primitive.npz"], **files["constraints.npz"]}, files["witness.npz"], claims
 
 
+def numbers(value: Any, shape: tuple[int, ...], what: str, may_be_null: bool = False) -> np.ndarray:
+    """Return lists of numbers as an array, null as NaN; reject anything else, such as whole numbers, text and bools."""
+    if shape:
+        require(type(value) is list and len(value) == shape[0], f"{what} has another shape")
+        return np.array([numbers(one, shape[1:], what, may_be_null) for one in value]).reshape(shape)
+    require(type(value) is float or (may_be_null and value is None), f"{what} has something that is no number")
+    return np.array(np.nan if value is None else value)
+
+
+def fields(value: Any, names: tuple[str, ...], what: str) -> Any:
+    """Return a dictionary with exactly these keys."""
+    require(type(value) is dict and sorted(value) == sorted(names), f"{what} has not the fields {', '.join(names)}")
+    return value
+
+
 def solve(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Compute A⁻¹ B of a positive definite A in extended precision."""
-    n, M = len(A), np.hstack([A, B])
-    for j, rest in enumerate(~np.eye(n, dtype=bool)):
-        M[j] /= M[j, j]
-        M[rest] -= np.outer(M[rest, j], M[j])
-    return M[:, n:]
+    """Compute A⁻¹ B of positive definite matrices A (…, n, n) in their precision, which may be extended."""
+    M = np.concatenate([A, B], axis=-1)
+    for j, rest in enumerate(~np.eye(A.shape[-1], dtype=bool)):
+        M[..., j, :] /= M[..., j, j, None].copy()
+        M[..., rest, :] -= M[..., rest, j, None] * M[..., None, j, :]
+    return M[..., A.shape[-1] :]
+
+
+def cholesky(A: np.ndarray) -> np.ndarray:
+    """Compute the lower factor of a positive definite matrix in its precision."""
+    L = np.zeros_like(A)
+    for j in range(len(A)):
+        L[j:, j] = (A[j:, j] - L[j:, :j] @ L[j, :j]) / np.sqrt(A[j, j] - L[j, :j] @ L[j, :j])
+    return L
+
+
+def forward(L: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Compute L⁻¹ B of a lower triangular matrix in its precision."""
+    X = B.copy()
+    for j in range(len(L)):
+        X[j] = (X[j] - L[j, :j] @ X[:j]) / L[j, j]
+    return X
+
+
+def extended(matrix: np.ndarray) -> np.ndarray:
+    """Return a matrix of decimal numbers in extended precision."""
+    result = np.zeros(matrix.shape, dtype=Real)
+    for place, value in np.ndenumerate(matrix):
+        result[place] = Real(str(value))
+    return result
 
 
 class Primitive:
     """Problem 4.5 at every step."""
 
     def __init__(self, p: Arrays, kernel: str):
-        self.means, self.covariances = p["means"], p["covariances"]
-        self.steps, self.outputs = self.means.shape
-        self.past, self.horizon = int(p["history"]), int(p["horizon"])
+        self.means, self.covariances, self.G, self.c = p["means"], p["covariances"], p["G"], p["c"]
+        (self.steps, self.outputs), self.past, self.horizon = self.means.shape, int(p["history"]), int(p["horizon"])
         self.beta, self.hbar = float(p["beta"]), float(p["lambda"]) + float(p["beta"])
-        self.noise, self.length_scale = self.hbar * float(p["history_variance"]), float(p["length_scale"])
-        self.kernel, self.inputs = KERNELS[kernel], p["inputs"].astype(np.longdouble)
-        clock, times = np.diff(self.inputs.astype(float)), self.past + self.steps + self.horizon
-        require(len(clock) == times - 1 and np.allclose(clock, clock[0]), "the clock is not even, or not the steps'")
-        self.G, self.c = (np.broadcast_to(p[k], (self.steps, *p[k].shape[-n:])) for k, n in (("G", 2), ("c", 1)))
-        self.known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        valid = [self.steps >= 2, self.past >= 0, self.horizon >= 0, self.beta >= 0, p["lambda"] >= 0, self.hbar > 0]
+        valid += [p["clock"] > 0, p["length_scale"] > 0, p["history_variance"] > 0, (p["start_within"] >= 0).all()]
+        require(all(valid), "a parameter of the primitive is out of range")
+        norms = np.linalg.norm(self.G, axis=2)
+        is_row = (np.abs(norms - 1) <= 8 * EPS) | (((self.G == 0).all(axis=2)) & (self.c <= 0))
+        require(is_row.all(), "rows of constraints are not of unit norm")
+        require((self.covariances == self.covariances.transpose(0, 2, 1)).all(), "covariances are not symmetric")
+        np.linalg.cholesky(self.covariances)  # raises an error unless they are positive definite
+        eye = np.broadcast_to(np.eye(self.outputs, dtype=Real), self.covariances.shape)
+        self.precisions = solve(self.covariances.astype(Real), eye)
+        # The kernel is the same in every window: it is conditioned on the history in 60 digits, once.
+        n, P, length = self.past + self.horizon + 1, self.past, Decimal(float(p["length_scale"]))
+        along = [KERNELS[kernel](k * Decimal(float(p["clock"])), length) for k in range(n)]
+        k = np.array(along, dtype=object)[np.abs(np.arange(n)[:, None] - np.arange(n))]
+        noise = Decimal(self.hbar) * Decimal(float(p["history_variance"]))
+        V = forward(chol := cholesky(k[:P, :P] + np.diag([noise] * P)), k[:P, P:])
+        W = forward(chol[::-1, ::-1].T, V[::-1])[::-1].T
+        F = self.factor(k[P:, P:] - V.T @ V)
+        self.W, self.F = (extended(each) for each in (W, F))
+        scale = 1 / np.sqrt(np.einsum("noo->no", self.covariances))
+        conditions = np.linalg.cond(self.covariances * scale[:, :, None] * scale[:, None])
+        self.covariance_error = 4 * self.outputs * (3 * self.outputs + 1) * EXTENDED * conditions
 
-    def features(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Compute W (H+1, P), and features F (H+1, r) of the kernel given the history, F Fᵀ = C."""
-        P, t = self.past, self.inputs[n : n + self.past + self.horizon + 1]
-        key = np.round((t - t[0]).astype(float), 12).tobytes()
-        if key not in self.known:
-            k = self.kernel(t[:, None] - t[None, :], self.length_scale)
-            W = solve(k[:P, :P] + self.noise * np.eye(P, dtype=k.dtype), k[:P, P:]).T
-            values, vectors = np.linalg.eigh((k[P:, P:] - W @ k[:P, P:]).astype(float))
-            kept = values > 1e-15 * values[-1]
-            self.known[key] = W.astype(float), vectors[:, kept] * np.sqrt(values[kept])
-        return self.known[key]
+    def factor(self, C: np.ndarray) -> np.ndarray:
+        """Compute F with F Fᵀ = C up to rounding, by pivoted elimination."""
+        left, columns = C.diagonal().copy(), np.zeros((len(C), 0), dtype=object)
+        for _ in range(len(C)):
+            i = int(np.argmax(left))
+            if left[i] <= Decimal(EXTENDED) * max(C.diagonal()):
+                break
+            columns = np.column_stack([columns, (C[i] - columns @ columns[i]) / left[i].sqrt()])
+            left = left - columns[:, -1] ** 2
+            left[i] = 0
+        return columns
 
-    def window(self, n: int) -> tuple[np.ndarray, ...]:
-        """Compute the window's maps of history and action, offset, L with S = L Lᵀ, constraint rows and bounds."""
-        W, F = self.features(n)
+    def window(self, n: int) -> tuple[Any, ...]:
+        """Compute the window's maps of history and action, offset, L with S = L Lᵀ, rows, bounds and a bound on errors.
+
+        The last one is a function of the history without actions and its generators (P outs), (P outs, K).
+        """
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
-        precision, F_bar = np.linalg.inv(self.covariances[at]), np.kron(F, np.eye(outs))
-        M = np.einsum("ja,jb,jop->aobp", F, F, precision).reshape(F.shape[1] * outs, -1)
-        L = np.linalg.solve(np.linalg.cholesky((M + M.T) / 2 + self.hbar * np.eye(len(M))), F_bar.T).T
-        weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), outs, -1), precision).reshape(F_bar.shape[0], -1)
-        history = (W_bar := np.kron(W, np.eye(outs))) - L @ (weigh.T @ W_bar)
-        rows = np.einsum("jfo,jk->jfko", self.G[at], np.eye(len(at))).reshape(-1, F_bar.shape[0])
-        return history, self.beta * L @ L[:outs].T, L @ (weigh.T @ self.means[at].ravel()), L, rows, self.c[at].ravel()
+        eye, precision, r = np.eye(outs, dtype=Real), self.precisions[at], self.F.shape[1] * self.outputs
+        M = np.einsum("ja,jb,jop->aobp", self.F, self.F, precision).reshape(r, r) + self.hbar * np.eye(r, dtype=Real)
+        L = forward(cholesky(M), np.kron(self.F, eye).T).T
+        weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), outs, r), precision).reshape(-1, r)
+        W, mean = np.kron(self.W, eye), self.means[at].ravel().astype(Real)
+        history, action, offset = W - L @ (weigh.T @ W), self.beta * L @ L[:outs].T, L @ (weigh.T @ mean)
+        # Cholesky's error depends on the least eigenvalue λ of M with a unit diagonal: 4 r (r + H) ε ‖L‖ ‖Lᵀb‖ / λ.
+        root = np.sqrt(M.diagonal())
+        least = float(np.linalg.eigvalsh((M / root / root[:, None]).astype(float))[0])
+        require(least > 1e-8, f"step {n}: the problem is too badly conditioned")
+        share, inverse = 4 * r * (r + len(at)) * EXTENDED / least, self.covariance_error[at].max()
+        sizes, weights = np.linalg.norm(L.astype(float), axis=1), np.abs(weigh.T).astype(float)
+        precise, spread_W = np.abs(precision).astype(float), np.abs(W).astype(float)
+
+        def error(past: np.ndarray, reached: np.ndarray) -> np.ndarray:
+            values = np.column_stack([np.abs(mean - W @ past), np.abs(W.astype(float) @ reached.astype(float))])
+            values = values.astype(float)
+            weighed = np.einsum("jop,jpk->jok", precise, values.reshape(len(at), outs, -1)).reshape(values.shape)
+            pulled, whitened = np.linalg.norm(weights @ values, axis=0), np.sqrt((values * weighed).sum(axis=0))
+            whole = (np.abs(past) + np.abs(reached).sum(axis=1)).astype(float)
+            noise = 4 * (r + self.past + 4) * EXTENDED * (spread_W @ whole + np.abs(mean).astype(float))
+            noise += EPS * self.past * (spread_W @ np.abs(reached).astype(float)).sum(axis=1) * share  # of `values`
+            return sizes * (share * pulled.sum() + inverse * whitened.sum() + np.linalg.norm(weights @ noise)) + noise
+
+        rows = np.einsum("jfo,jk->jfko", self.G[at], np.eye(len(at))).reshape(-1, len(at) * outs)
+        return history, action, offset, L.astype(float), rows, self.c[at].ravel(), error, share * self.beta * sizes
 
     def caps(self) -> tuple[np.ndarray, np.ndarray]:
         """Return lower and upper bounds (N, outs) by the constraints that involve a single output."""
         alone = ((self.G != 0).sum(axis=2) == 1)[..., None]
         cap = self.c[..., None] / np.where(self.G == 0, 1, self.G)
         least = np.where(alone & (self.G > 0), cap, -np.inf).max(axis=1, initial=-np.inf)
-        return least, np.where(alone & (self.G < 0), cap, np.inf).min(axis=1, initial=np.inf)
+        most = np.where(alone & (self.G < 0), cap, np.inf).min(axis=1, initial=np.inf)
+        return least - COMMAND_TOLERANCE, most + COMMAND_TOLERANCE
 
     def reach(self, p: Arrays, witness: Arrays) -> tuple[np.ndarray, ...]:
-        """Compute free motion, generators, bounds of corrected commands (2, N, outs) or NaN, and maps of histories."""
+        """Compute free motion, generators, their errors, bounds of corrected commands or NaN, and maps of histories."""
         P, N, outs = self.past, self.steps, self.outputs
-        moved, claimed = np.flatnonzero(p["gains"]), witness["active"].astype(bool)
-        require(claimed.shape == (N,) and (p["start_within"] >= 0).all(), "missing steps, or a negative start_within")
-        middle, spread = np.zeros((P + N, outs)), np.zeros((P + N, outs, N * (A := len(moved)) + outs))
+        moved, claimed = np.flatnonzero(p["gains"]), witness["active"]
+        A = len(moved)
+        middle, spread = (np.zeros((P + N, outs, *n), dtype=Real) for n in ((), (N * A + outs,)))
         middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
-        corrected, maps = np.full((2, N, outs), np.nan), np.zeros((N, outs, P * outs))
+        corrected, maps = np.full((2, N, outs), np.nan), np.zeros((N, outs, P * outs), dtype=Real)
+        echo = np.zeros((P + N, outs, N * outs))
+        wrong, made = np.zeros((P + N, outs)), np.zeros(N * outs)  # errors of commands, and those made at each step
+        require(claimed.sum() == len(witness["multipliers"]) or P > 0, "there are not multipliers for each active step")
         for n in range(N):
-            history, action, offset, L, rows, c = self.window(n)
-            maps[n], y = history[:outs], history @ middle[n : P + n].ravel() + offset
-            g = history @ spread[n : P + n].reshape(P * outs, N * A + outs)
-            g[:, n * A : (n + 1) * A] += (by := action[:, moved] * p["gains"][moved])
-            middle[P + n], spread[P + n] = y[:outs], g[:outs]
-            touches = not (rows @ y - np.abs(rows @ g).sum(axis=1) >= c - TOLERANCE).all()
-            require(claimed[n] or not touches, f"step {n}: a constraint can be active there")
+            history, action, offset, L, rows, c, error, action_error = self.window(n)
+            past, reached = middle[n : P + n].ravel(), spread[n : P + n].reshape(P * outs, N * A + outs)
+            by, size = (action[:, moved] * p["gains"][moved]).astype(float), np.abs(reached).astype(float).sum(axis=1)
+            maps[n], y, first = history[:outs], history @ past + offset, history[:outs] @ reached
+            first[:, n * A : (n + 1) * A] += by[:outs]
+            far, fault = np.abs(history).astype(float), error(past, reached)
+            pushed = np.abs(p["gains"][moved]) @ np.linalg.norm(L[moved], axis=1)
+            fault += action_error * pushed + EPS * np.abs(by).sum(axis=1)
+            # An error at one step reaches a later one by the impulse responses of the loop.
+            earlier = echo[n : P + n, :, : n * outs].reshape(P * outs, n * outs)
+            echo[P + n, :, : n * outs] = history[:outs].astype(float) @ earlier
+            echo[P + n, np.arange(outs), np.arange(n * outs, (n + 1) * outs)] = 1
+            made[n * outs : (n + 1) * outs] = 2 * fault[:outs]
+            middle[P + n], spread[P + n], wrong[P + n] = y[:outs], first, np.abs(echo[P + n]) @ made
+            # The rest of the window is computed in double precision.
+            history, y = history.astype(float), y.astype(float)
+            g = history @ reached.astype(float)
+            g[:, n * A : (n + 1) * A] += by
+            terms = np.abs(y) + np.abs(g).sum(axis=1)
+            fault += far @ wrong[n : P + n].ravel() + (P * outs + 4) * EPS * (far @ size) + (N * A + outs) * EPS * terms
+            away, reach = rows @ y - c, np.abs(rows @ g).sum(axis=1)
+            slack, about = away - reach, np.abs(away) + reach
+            room = np.abs(rows) @ fault + 4 * (N * A + outs) * EPS * (np.abs(rows) @ terms + np.abs(c))
+            require(claimed[n] or (slack >= room).all(), f"step {n}: a constraint can be active there")
+            require(not claimed[n] or (slack <= room + BORDER * about).any(), f"step {n}: no constraint can be active")
             if claimed[n] and P == 0:
                 alphas = witness["multipliers"][claimed[:n].sum()]
-                corrected[:, n] = cells(n, y, by, L[:outs], (rows @ L, rows, c), alphas)
+                corrected[:, n] = cells(n, y, by, L[:outs], (rows @ L, rows, c, room), alphas)
         if P:
-            tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"].reshape(-1, outs) != 0).any(axis=0)
+            require(witness["multipliers"].size == 0, "multipliers prove nothing with a history")
+            tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"] != 0).any(axis=(0, 1))
             reached = np.linalg.matrix_power(tied + np.eye(outs), outs) @ reached > 0
             unknown = np.logical_or.accumulate(claimed)[:, None] & reached
             corrected[0, unknown], corrected[1, unknown] = -np.inf, np.inf
-        return middle, spread, corrected, maps
+        return middle, spread, wrong, corrected, maps
 
     def bounds(self, p: Arrays, found: tuple[np.ndarray, ...], period: float) -> dict[str, Arrays]:
         """Compute the quantities (N, outs) of the first two regimes."""
-        (middle, spread, corrected, _), P, N, outs = found, self.past, self.steps, self.outputs
-        size, off, (least, greatest) = np.abs(spread).sum(axis=2), ~np.isnan(corrected[0]), self.caps()
+        (middle, spread, wrong, corrected, _), P, N, outs = found, self.past, self.steps, self.outputs
+        wrong = wrong + 4 * spread.shape[2] * EXTENDED * (np.abs(middle) + np.abs(spread).sum(axis=2))
+        size, off, (least, greatest) = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0]), self.caps()
         free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
         for order, name in ((1, "speed"), (2, "acceleration")):
             change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(spread, order, axis=0)).sum(axis=2)
+            for k, times in enumerate(((1, 1), (1, 2, 1))[order - 1]):
+                change += times * wrong[k : len(wrong) - order + k]
             free[name] = np.concatenate([np.zeros((order, outs)), change])[-N:] / period**order
-        low = np.where(off, np.maximum(corrected[0], least), free["lower"])
-        high = np.where(off, np.minimum(corrected[1], greatest), free["upper"])
+        low = np.where(off, np.maximum(corrected[0] - wrong[P:], least), free["lower"])
+        high = np.where(off, np.minimum(corrected[1] + wrong[P:], greatest), free["upper"])
         always = {"lower": low, "upper": high}
         low, high = (np.vstack([p["start"] + side * p["start_within"]] * 2 + [y]) for side, y in ((-1, low), (1, high)))
         off = np.vstack([np.zeros((2, outs), bool), off])
@@ -150,46 +304,58 @@ class Primitive:
             always[name] = np.where(moves, new / period ** (order + 1), free[name])
         return {"free": free, "always": always}
 
-    def budgeted(self, p: Arrays, w: Arrays, claims: Any, reached: tuple[np.ndarray, ...]) -> Arrays:
+    def budgeted(self, p: Arrays, w: Arrays, budgets: list[np.ndarray], reached: Any, period: float) -> Arrays:
         """Compute the quantities of the third regime; any multipliers of constraints at other steps prove bounds."""
-        (middle, spread, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
+        (middle, spread, wrong, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
         first, U = int(np.argmax(w["active"])), np.flatnonzero(p["gains"] == 0)
-        A, late, more = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)))
-        budgets = [np.array(claims["budgeted"]["excess"]), np.array(claims["budgeted"]["residue"])[:, U]]
+        A, late, more = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)), dtype=Real)
         (at, of, alphas), (low, high) = (w[f"lagrange_{k}"] for k in ("steps", "outputs", "multipliers")), self.caps()
-        valid = [np.isfinite(alphas), at >= 0, of >= 0, budgets[0] >= 0, budgets[1] >= 0, P > 0 and w["active"].any()]
+        valid = [at >= 0, at < N, of >= 0, of < outs, P > 0, w["active"].any(), (budgets[0][1] >= budgets[0][0]).all()]
+        valid += [budgets[0][0] >= 0.01, budgets[1][0] >= 0, budgets[1][1] >= budgets[1][0]]
+        valid += [budgets[1][:, p["gains"] != 0] == 0]
         require(all(np.all(each) for each in valid), "invalid budgets or multipliers")
+        budgets = [budgets[0], budgets[1][:, U]]
         for n in range(first, N):
             more[P + n] = maps[n] @ more[n : P + n].reshape(P * outs, more.shape[2])
             more[P + n, U, (n - first) * len(U) + np.arange(len(U))] = 1
         spread, most = np.concatenate([spread, more], axis=2), np.zeros((3, 2, N, outs))
+        changes = [np.diff(spread, order, axis=0).astype(float) for order in range(3)]
+        moved, sizes = [np.diff(middle, order, axis=0) for order in range(3)], np.abs(changes[0]).sum(axis=2)
         for order, side, n in itertools.product(range(3), range(2), range(first, N)):
             k, o, alpha = at[order, side, n], of[order, side, n], alphas[order, side, n]
-            sign, row = 1 - 2 * side, slice(P + n - order, P + n + 1)
-            g = sign * np.diff(spread[row], order, axis=0)[0] - np.einsum("or,orc->oc", alpha, spread[P + k, o])
+            sign, row = 1 - 2 * side, P + n - order
+            g = sign * changes[order][row] - np.einsum("or,orc->oc", alpha, changes[0][P + k, o])
             margin = np.where(alpha > 0, high[k, o], low[k, o]) - middle[P + k, o]
-            value = sign * np.diff(middle[row], order, axis=0)[0] + np.abs(g[:, : N * A + outs]).sum(axis=1)
+            value = sign * moved[order][row] + np.abs(g[:, : N * A + outs]).sum(axis=1)
             value += (alpha * np.where(alpha == 0, 0, margin)).sum(axis=1)
+            faults = wrong[row : P + n + 1].sum(axis=0) * (1, 1, 2)[order]
+            value += faults + (np.abs(alpha) * wrong[P + k, o]).sum(axis=1)
+            terms = np.abs(changes[order][row]).sum(axis=1) + (np.abs(alpha) * sizes[P + k, o]).sum(axis=1)
+            value += 8 * g.shape[1] * EPS * terms
             for part, budget in zip((g[:, first * A : N * A], g[:, N * A + outs :]), budgets, strict=True):
                 spent = np.clip(budget[1] - np.arange(late)[:, None] * budget[0], 0, budget[0])
                 value += (np.sort(np.abs(part).reshape(outs, late, -1), axis=1)[:, ::-1] * spent).sum(axis=(1, 2))
             most[order, side, n] = value
-        moves = [most[order].max(axis=0) / claims["period"] ** order for order in (1, 2)]
+        moves = [most[order].max(axis=0) / period**order for order in (1, 2)]
         return dict(zip(QUANTITIES, (np.maximum(-most[0, 1], low), np.minimum(most[0, 0], high), *moves), strict=True))
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
     """Bound the commands of step n by cells; v is within ‖v̄‖² − ‖v‖² of the mean v̄ of the corners' corrections."""
-    (rows_L, rows, c), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
-    along = round(len(alphas) ** (1 / A)) - 1
+    (rows_L, rows, c, room), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
+    along = round(len(alphas) ** (1 / max(A, 1))) - 1
     fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
     require(fine, f"step {n}: these are not the multipliers of every corner of the actions")
     places = np.array(list(itertools.product(range(along + 1), repeat=A)))
     free = y + (2.0 * places / along - 1.0) @ by.T
     v, short = alphas @ rows_L, c - free @ rows.T
-    slack = v @ rows_L.T - short + TOLERANCE * (1 + np.abs(c))
-    require((slack >= 0).all(), f"step {n}: the correction violates a constraint")
+    # Feasible in spite of rounding: the interpolation of feasible corrections is feasible for the actions between.
+    sizes = np.abs(alphas) @ (np.abs(rows_L) @ np.abs(rows_L).T)
+    require(
+        (v @ rows_L.T - short >= room + 8 * len(c) * EPS * sizes).all(), f"step {n}: a correction violates a constraint"
+    )
     least, commands, norms = alphas @ short.T, free[:, :outs] + v @ L.T, np.linalg.norm(L, axis=1)
+    least = least - alphas @ room[:, None] - 8 * len(c) * EPS * alphas @ np.abs(short).T
     weights = (along + 1) ** np.arange(A)[::-1]
     near = np.array(list(itertools.product((0, 1), repeat=A))) @ weights
     i = (places[(places < along).all(axis=1)] @ weights)[:, None] + near  # corners of every cell
@@ -202,48 +368,78 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
     return (commands[i].min(axis=1) - radius).min(axis=0), (commands[i].max(axis=1) + radius).max(axis=0)
 
 
-def compare(claims: dict[str, Any], found: dict[str, Arrays]) -> None:
-    """Reject a claim that differs from the computed quantities, and name the worst step."""
+def compare(claims: dict[str, Arrays], found: dict[str, Arrays]) -> None:
+    """Reject a claim that is tighter than the computed quantity, or much wider, and name the worst step."""
     for regime, name in itertools.product(found, QUANTITIES):
-        claimed = np.array(claims[regime][name], dtype=float)  # null is NaN: unbounded
-        own = np.where(np.isinf(found[regime][name]), np.nan, found[regime][name])
-        fits = claimed.shape == own.shape and (np.isnan(claimed) == np.isnan(own)).all()
-        require(fits, f"{regime} {name} has other shapes or unbounded entries")
-        scale = np.maximum(np.nan_to_num(np.abs(own)).max(axis=0), 1e-9)
-        wrong = np.nan_to_num(np.abs(claimed - own), posinf=np.inf) / scale
-        n, o = np.unravel_index(int(wrong.argmax()), wrong.shape)
-        require(wrong[n, o] <= AGREEMENT, f"step {n}: {regime} {name} of output {o} is {own[n, o]:.6g}, not as claimed")
+        own, claimed, sign = found[regime][name], claims[regime][name], -1.0 if name == "lower" else 1.0
+        require((np.isnan(claimed) == np.isinf(own)).all(), f"{regime} {name} has other unbounded entries")
+        own = np.where(np.isinf(own), np.nan, own)
+        room = AGREEMENT * np.maximum(np.nan_to_num(np.abs(own)).max(axis=0), 1e-9)
+        for wrong, word in ((sign * (own - claimed), "tighter"), (sign * (claimed - own) - room, "wider")):
+            n, o = np.unravel_index(int(np.nan_to_num(wrong, nan=-np.inf).argmax()), wrong.shape)
+            values = f"{own[n, o]:.6g}, and claimed {word}: {claimed[n, o]:.6g}"
+            require(not wrong[n, o] > 0, f"step {n}: {regime} {name} of output {o} is {values}")
 
 
-def check(folder: Path) -> None:
-    """Raise `Rejected` unless the certificate in a folder holds."""
-    p, witness, claims = read(folder)
-    require(claims["format"] == "guiderail certificate 3" and 0 < claims["period"] < np.inf, "wrong format or period")
-    require(claims["kernel"] in KERNELS, f"the kernel is {claims['kernel']!r}, not one of {list(KERNELS)}")
-    primitive, period = Primitive(p, claims["kernel"]), float(claims["period"])
-    given = True, "budgeted" in claims, abs(period / np.diff(p["inputs"]).mean() - 1) > 1e-6
-    texts = ["\n".join(claims["assumes"][:6]), *claims["assumes"][6:]]
+def check_forces(impedance: Any, found: dict[str, Arrays] | None, regimes: tuple[str, ...], outputs: int) -> None:
+    """Reject forces that do not follow from the impedance and the bounds on commands, which may be unknown yet."""
+    if impedance is None:
+        return
+    fields(impedance, ("stiffness", "limits", "force", "rest_force"), "impedance")
+    stiffness, limits = (numbers(impedance[k], (outputs,), k) for k in ("stiffness", "limits"))
+    require((stiffness > 0).all() and (limits > 0).all(), "stiffness and limits are not positive")
+    at_rest = fields(impedance["rest_force"], tuple(regime for regime in regimes if regime != "free"), "rest_force")
+    claims: dict[str, Any] = {"force": (np.linalg.norm(limits[:3]), numbers(impedance["force"], (), "force"))}
+    for regime, claim in at_rest.items():
+        claimed: Any = numbers(claim, (), "rest_force")
+        own = claimed
+        if found is not None:
+            ranges = found[regime]["upper"].max(axis=0) - found[regime]["lower"].min(axis=0)
+            own = np.asarray(np.linalg.norm(np.minimum(limits, stiffness * ranges)[:3]))
+        claims[f"{regime} rest_force"] = own, claimed
+    for name, (own, claim) in claims.items():
+        require(own <= claim <= own * (1 + 4 * AGREEMENT), f"{name} is {own:.6g} N, not {claim:.6g} N")
+
+
+def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
+    """Raise `Rejected` unless the certificate in a folder holds, and is signed with the key if there is one.
+
+    Returns the claims. Which skill they are about is compared by `guiderail certify SKILL --verify FOLDER`.
+    """
+    p, witness, claims = read(folder, key)
+    require(claims["format"] == "guiderail certificate 4", "wrong format")
+    require(type(claims["kernel"]) is str and claims["kernel"] in KERNELS, f"the kernel is none of {list(KERNELS)}")
+    require(type(claims["about"]) is dict and "task" in claims["about"], "it does not name its task")
+    period = float(numbers(claims["period"], (), "period"))
+    require(period > 0, "the period is not positive")
+    given = True, claims["budgeted"] is not None, abs(period - p["clock"]) > 1e-6 * p["clock"]
+    sentences = claims["assumes"]
+    require(type(sentences) is list and all(type(each) is str for each in sentences), "assumes is no list of sentences")
+    texts = ["\n".join(sentences[:6]), *sentences[6:]]
     digests = [hashlib.sha256(text.encode()).hexdigest()[:32] for text in texts]
     require(digests == list(itertools.compress(ASSUMED, given)), "it does not state the required assumptions")
+    (steps, outputs), A = p["means"].shape, int((p["gains"] != 0).sum())
+    claimed = {}
+    for regime in ("free", "always", *(["budgeted"] if claims["budgeted"] is not None else [])):
+        names = (*QUANTITIES, *BUDGETS) if regime == "budgeted" else QUANTITIES
+        values = fields(claims[regime], names, regime)
+        claimed[regime] = {k: numbers(values[k], (steps, outputs), f"{regime} {k}", True) for k in QUANTITIES}
+    check_forces(claims["impedance"], None, tuple(claimed), outputs)
+    primitive = Primitive(p, claims["kernel"])
     found = primitive.bounds(p, reached := primitive.reach(p, witness), period)
-    if "budgeted" in claims:
-        third, before = primitive.budgeted(p, witness, claims, reached), np.cumsum(witness["active"])[:, None] == 0
+    if claims["budgeted"] is not None:
+        budgets = [numbers(claims["budgeted"][k], (2, n), k) for k, n in zip(BUDGETS, (A, outputs), strict=True)]
+        third = primitive.budgeted(p, witness, budgets, reached, period)
+        before = np.cumsum(witness["active"])[:, None] == 0
         found["budgeted"] = {name: np.where(before, found["free"][name], third[name]) for name in QUANTITIES}
-    compare(claims, found)
-    if "limits" in claims:
-        stiffness, limits = np.array(claims["stiffness"]), np.array(claims["limits"])
-        forces = [("force", np.linalg.norm(limits[:3]), claims["force"])]
-        for regime in set(found) - {"free"}:
-            ranges = found[regime]["upper"].max(axis=0) - found[regime]["lower"].min(axis=0)
-            rest = np.linalg.norm(np.minimum(limits, stiffness * ranges)[:3])
-            forces.append((f"{regime} rest_force", rest, claims[regime]["rest_force"]))
-        for name, own, claimed in forces:
-            require(abs(claimed - own) <= AGREEMENT * own, f"{name} is {own:.6g} N, not {claimed:.6g} N")
+    compare(claimed, found)
+    check_forces(claims["impedance"], found, tuple(claimed), outputs)
+    return claims
 
 
 if __name__ == "__main__":
     try:
-        check(Path(sys.argv[1]))
+        check(Path(sys.argv[1]), Path(sys.argv[2]).read_bytes() if len(sys.argv) > 2 else None)
         print("yes")
     except Exception as reason:  # files may hold anything
         print("no:", reason if isinstance(reason, Rejected) else f"the files make no sense, {reason!r}")

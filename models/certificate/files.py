@@ -1,10 +1,11 @@
 """Files of a certificate: the primitive, its constraints, the certified bounds, and the data that prove them."""
 
 import hashlib
+import hmac
 import json
 from collections.abc import Mapping
 from io import BytesIO
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,20 +16,21 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import kernel_name
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 3"
+FORMAT = "guiderail certificate 4"
+OUTWARD = 1e-5  # margin of all claims for the rounding of primitive and checker, relative to the largest value
 # The checker has digests of these sentences in `ASSUMED`.
 ASSUMPTIONS = (
     "actions are numbers in [-1, 1], as the environment and the skill's diagram clip them, held for any time",
     "the skill is executed from its first step to its last with the given period, and begins at rest within the start",
     "the history consists of commands, and its length is constant",
-    "the quadratic program is solved if a constraint is active: a fallback repeats the last command and is counted",
+    "the quadratic program is solved if a constraint is active: a fallback is within the constraints and is counted",
     "the impedance has the given stiffness and saturates at its limits; forces are its own, without impacts",
     "`rest_force` holds for a robot at rest between the least and the greatest command",
 )
 BUDGET = (
     "`budgeted` holds for sequences whose corrections satisfy two budgets, each at one step and in total: their excess "
-    "over actions of [-1, 1], and their displacement of outputs that no action moves. An adversary reached at most two "
-    "thirds of them; that they are satisfied is not proven"
+    "over actions of [-1, 1], and their displacement of outputs that no action moves. A search of 100,000 steps needed "
+    "at most two thirds of them; that they are satisfied is not proven, and a longer search can exceed them"
 )
 OTHER_CLOCK = (
     "the period differs from the clock of the primitive: it is executed slower or faster than it was demonstrated"
@@ -42,6 +44,7 @@ def certificate_files(
     stiffness: np.ndarray | None,
     limits: np.ndarray | None,
     about: Mapping[str, Any],
+    key: bytes | None = None,
 ) -> dict[str, bytes]:
     """Return the content of each file of a certificate by its name.
 
@@ -50,37 +53,21 @@ def certificate_files(
         certified: Bounds of the loop.
         stiffness: Stiffness (6,) of the impedance that executes it; None if the robot has none.
         limits: Limits (6,) of the impedance's wrench; None if the robot has none.
-        about: Further information, such as the run that the certificate is about.
+        about: Task, and further information such as the run that the certificate is about; texts.
+        key: Key of the signature, at least 16 bytes; None for no signature.
 
     Raises:
-        InputError: If the checker does not know the primitive's kernel.
+        InputError: If the checker does not know the primitive's kernel, or its clock is not even.
     """
-    primitive = loop.primitive
-    kernel: Any = primitive.kernel
-    name = kernel_name(kernel)
-    if name not in checker.KERNELS:
-        raise InputError(f"the checker of certificates has no kernel {kernel}: choose {' or '.join(checker.KERNELS)}")
-    reference, constraints = primitive.reference, primitive.constraints
-    arrays = {
-        "inputs": reference.inputs(np.arange(-primitive.history, primitive.num_steps + primitive.horizon)),
-        "means": reference.means,
-        "covariances": reference.covariances,
-        "length_scale": kernel.length_scale,
-        "lambda": primitive.lambda_,
-        "beta": primitive.beta,
-        "horizon": primitive.horizon,
-        "history": primitive.history,
-        "history_variance": primitive.history_variance,
-        "gains": loop.gains,
-        "start": loop.start,
-        "start_within": loop.start_within,
-    }
+    name = _checked_kernel(loop)
+    primitive_arrays, constraint_arrays = _subject_arrays(loop)
+    clock = float(primitive_arrays["clock"])
     witness = {"active": certified.can_be_active, "multipliers": certified.multipliers}
     if certified.budgeted is not None:
         witness |= {f"lagrange_{key}": getattr(certified.budgeted, key) for key in ("steps", "outputs", "multipliers")}
     files = {
-        PRIMITIVE: _npz(arrays),
-        CONSTRAINTS: _npz({"G": constraints.G, "c": constraints.c}),
+        PRIMITIVE: _npz(primitive_arrays),
+        CONSTRAINTS: _npz(constraint_arrays),
         WITNESS: _npz(witness),
     }
     claims: dict[str, Any] = {
@@ -89,9 +76,11 @@ def certificate_files(
         "assumes": list(ASSUMPTIONS),
         "digests": {file: hashlib.sha256(content).hexdigest() for file, content in files.items()},
         "kernel": name,
-        "period": loop.period,
+        "period": float(loop.period),
         "free": _as_lists(certified.free),
         "always": _as_lists(certified.always),
+        "budgeted": None,
+        "impedance": None,
     }
     regimes = {"always": certified.always}
     if certified.budgeted is not None:
@@ -100,31 +89,105 @@ def certificate_files(
         assumed = {"excess": budget.excess.tolist(), "residue": budget.residue.tolist()}
         claims["budgeted"] = _as_lists(certified.budgeted.bounds) | assumed
         claims["assumes"].append(BUDGET)
-    clock = np.diff(reference.inputs(np.array([0, primitive.num_steps - 1])))[0] / (primitive.num_steps - 1)
     if abs(loop.period - clock) > CLOCK_TOLERANCE * clock:
         claims["assumes"].append(OTHER_CLOCK)
     if stiffness is not None and limits is not None:
-        claims |= {"stiffness": list(map(float, stiffness)), "limits": list(map(float, limits))}
-        claims["force"] = float(np.linalg.norm(limits[:3]))
+        rest_force = {}
         for regime, bounds in regimes.items():
-            at_rest = np.minimum(limits, np.asarray(stiffness) * (bounds.upper.max(axis=0) - bounds.lower.min(axis=0)))
-            claims[regime]["rest_force"] = float(np.linalg.norm(at_rest[:3]))
-    claims["digest"] = digest(claims)
-    return {**files, CERTIFICATE: json.dumps(claims).encode()}
+            largest = np.asarray(stiffness) * (bounds.upper.max(axis=0) - bounds.lower.min(axis=0))
+            rest_force[regime] = (1.0 + OUTWARD) * float(np.linalg.norm(np.minimum(limits, largest)[:3]))
+        claims["impedance"] = {
+            "stiffness": list(map(float, stiffness)),
+            "limits": list(map(float, limits)),
+            "force": (1.0 + OUTWARD) * float(np.linalg.norm(limits[:3])),
+            "rest_force": rest_force,
+        }
+    return {**files, CERTIFICATE: seal(claims, key)}
 
 
-def digest(claims: Mapping[str, Any]) -> str:
-    """Compute the digest of the content of `certificate.json` except for the digest itself."""
-    content = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()
+def seal(claims: Mapping[str, Any], key: bytes | None = None) -> bytes:
+    """Return the text of claims with their digest, which anyone can compute, and a signature if there is a key."""
+    content = {name: value for name, value in claims.items() if name not in ("digest", "signature")}
+    content["digest"] = hashlib.sha256(checker.canonical(content).encode()).hexdigest()
+    if key is not None:
+        content["signature"] = hmac.new(key, content["digest"].encode(), hashlib.sha256).hexdigest()
+    return checker.canonical(content).encode()
+
+
+def compare_subject(
+    files: Mapping[str, bytes],
+    loop: CertifiedLoop,
+    stiffness: np.ndarray | None,
+    limits: np.ndarray | None,
+    about: Mapping[str, Any],
+) -> str | None:
+    """Return the name of the first thing in which a certificate differs from the skill it should be about, or None.
+
+    Compared is all that a checker takes as given, except for the budget: the description of the skill, its kernel,
+    period, impedance, primitive, gains, start and constraints.
+
+    Args:
+        files: Content of each file of a certificate that the checker accepts.
+        loop: As in `certificate_files`, of the skill.
+        stiffness: As in `certificate_files`.
+        limits: As in `certificate_files`.
+        about: As in `certificate_files`.
+    """
+    claims = json.loads(files[CERTIFICATE])
+    claimed = {name: claims[name] for name in ("about", "kernel", "period")}
+    claimed |= {name: (claims["impedance"] or {}).get(name) for name in ("stiffness", "limits")}
+    own: dict[str, Any] = {"about": dict(about), "kernel": _checked_kernel(loop), "period": float(loop.period)}
+    own |= {"stiffness": stiffness, "limits": limits}
+    own |= {name: list(map(float, own[name])) for name in ("stiffness", "limits") if own[name] is not None}
+    different = [name for name, value in own.items() if claimed[name] != value]
+    for file, arrays in zip((PRIMITIVE, CONSTRAINTS), _subject_arrays(loop), strict=True):
+        with np.load(BytesIO(files[file])) as written:
+            different += [name for name, value in arrays.items() if not np.array_equal(written[name], value)]
+    return next(iter(different), None)
+
+
+def _checked_kernel(loop: CertifiedLoop) -> str:
+    """Return the name of the primitive's kernel, and refuse one without a checker."""
+    kernel: Any = loop.primitive.kernel
+    name = kernel_name(kernel)
+    if name is None or name not in checker.KERNELS:
+        raise InputError(f"the checker of certificates has no kernel {kernel}: choose {' or '.join(checker.KERNELS)}")
+    return name
+
+
+def _subject_arrays(loop: CertifiedLoop) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the arrays of the primitive in its loop, and those of its constraints at every step."""
+    primitive, kernel = loop.primitive, cast(Any, loop.primitive.kernel)
+    reference = primitive.reference
+    if not reference.uniform:
+        raise InputError("a certificate needs a primitive with an even clock: resample the demonstrations")
+    arrays = {
+        "clock": float((reference.times[-1] - reference.times[0]) / (primitive.num_steps - 1)),
+        "means": reference.means,
+        "covariances": reference.covariances,
+        "length_scale": float(kernel.length_scale),
+        "lambda": primitive.lambda_,
+        "beta": primitive.beta,
+        "horizon": primitive.horizon,
+        "history": primitive.history,
+        "history_variance": primitive.history_variance,
+        "gains": np.asarray(loop.gains, dtype=float),
+        "start": np.asarray(loop.start, dtype=float),
+        "start_within": np.asarray(loop.start_within, dtype=float),
+    }
+    G, c = primitive.constraints.window(np.arange(primitive.num_steps))
+    return arrays, {"G": G, "c": c}
 
 
 def _as_lists(bounds: Bounds) -> dict[str, Any]:
-    """Return bounds as lists, None for an infinite bound."""
-    return {
-        name: [[float(x) if np.isfinite(x) else None for x in row] for row in getattr(bounds, name)]
-        for name in ("lower", "upper", "speed", "acceleration")
-    }
+    """Return bounds, widened by the margin for rounding, as lists with None for an infinite bound."""
+    lists = {}
+    for name in ("lower", "upper", "speed", "acceleration"):
+        values = getattr(bounds, name)
+        margin = OUTWARD * np.abs(np.where(np.isfinite(values), values, 0.0)).max(axis=0)
+        widened = values - margin if name == "lower" else values + margin
+        lists[name] = [[float(x) if np.isfinite(x) else None for x in row] for row in widened]
+    return lists
 
 
 def _npz(arrays: Mapping[str, Any]) -> bytes:

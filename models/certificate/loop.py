@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 
@@ -70,7 +71,7 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds (N, O) by the constraints that involve a single output."""
+    """Return lower and upper bounds (N, O) by the constraints that involve a single output, and their tolerance."""
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))
     lower, upper = np.full((2, primitive.num_steps, primitive.num_outputs), [[[-np.inf]], [[np.inf]]])
@@ -82,4 +83,4 @@ def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
                 lower[n, o] = max(lower[n, o], bound)
             else:
                 upper[n, o] = min(upper[n, o], bound)
-    return lower, upper
+    return lower - TOLERANCE, upper + TOLERANCE

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
+from guiderail.models.primitives.deviation import MAX_DEVIATION, check_deviation
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
 from guiderail.models.primitives.prediction import BatchPrediction, Modification, Prediction
@@ -48,13 +49,19 @@ class LcNsKmp:
         constraints: Constraints G y ≥ c at every future point; none by default.
         solver: "daqp", "piqp" or "osqp".
         cache_bytes: Memory limit of factored steps, after which the oldest is dropped [bytes].
+        max_deviation: Largest accepted `deviation`; infinity accepts all.
 
     Raises:
-        InputError: If an argument is out of range, sizes do not match, or the history's variance is too small for its
-            length.
+        InputError: If an argument is out of range, sizes do not match, the history's variance is too small for its
+            length, or the motion misses the demonstrations (`check_deviation`).
+
+    Warns:
+        UserWarning: If `deviation` exceeds one.
 
     Attributes:
         reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: Arguments.
+        deviation: RMS distance of the motion without actions from the reference mean [standard deviations], see
+            `measure_deviation`.
         cached_bytes: Memory of the factored steps [bytes].
     """
 
@@ -70,6 +77,7 @@ class LcNsKmp:
         constraints: LinearConstraints | None = None,
         solver: str = "daqp",
         cache_bytes: int = 2**29,
+        max_deviation: float = MAX_DEVIATION,
     ):
         for name, value in (("lambda_", lambda_), ("beta", beta)):
             if not (np.isfinite(value) and value >= 0):
@@ -103,6 +111,8 @@ class LcNsKmp:
         self._history_shape = (self.history, reference.num_outputs)
         if self.history:
             self._features(0)  # refuses a history that the kernel cannot be conditioned on
+        strength = self.lambda_, self.beta
+        self.deviation = check_deviation(reference, self.kernel, *strength, self.horizon, max_deviation)
 
     @property
     def num_outputs(self) -> int:

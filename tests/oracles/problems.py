@@ -77,6 +77,7 @@ def random_problem(
         history=int(P),
         history_variance=float(history_variance * scale.min() ** 2),
         constraints=LinearConstraints(G, c),
+        max_deviation=np.inf,
     )
     history = None
     if P:

@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
 from guiderail.models.common.errors import InputError
-from guiderail.tools.certify import _declared_start, certify_skill
+from guiderail.tools.certify import _declared_start, certify_skill, verify_certificate
 from guiderail.tools.environments import check_environment
 
 
@@ -23,6 +23,33 @@ def test_certify_skill_writes_an_accepted_certificate(tmp_path):
     assert all(row["violations"] == 0 for row in rows)
     assert all(row["ratio"] < 1.2 for row in rows if row["constraint"] == "never active")
     assert (tmp_path / "attack.csv").exists()
+
+
+def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 800)
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    environment, folder = {"guidance": "skgrl"}, tmp_path / "certificate"
+    assert certify_skill("NarrowPassage", environment, out=folder, key=key)["checker"] == "yes"
+    assert verify_certificate("NarrowPassage", environment, folder, key=key)["checker"] == "yes"
+    for other, words in (
+        ({"guidance": "skgrl", "action_scale": 2.0}, "no: its about is not that of NarrowPassage"),
+        ({"guidance": "kgrl"}, "no: its about"),
+    ):
+        assert verify_certificate("NarrowPassage", other, folder)["checker"].startswith(words)
+    assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
+    monkeypatch.setattr("guiderail.tools.certify.BUDGET_MARGIN", 0.1)
+    monkeypatch.setattr("guiderail.tools.certify.MIN_EXCESS", ((0.01,), (0.01,)))
+    certify_skill("NarrowPassage", environment, out=folder)
+    assert "exceed its budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
+    assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
+    with pytest.raises(InputError, match="name the folder of a certificate"):
+        verify_certificate("NarrowPassage", environment, tmp_path)
+    key.write_bytes(b"short")
+    with pytest.raises(InputError, match="at least 16 bytes"):
+        certify_skill("NarrowPassage", environment, out=folder, key=key)
+    with pytest.raises(InputError, match="can't be read"):
+        certify_skill("NarrowPassage", environment, out=folder, key=tmp_path / "none")
 
 
 def test_certify_skill_accepts_demonstrations_alone(tmp_path):

@@ -212,6 +212,8 @@ def certify(
         option("Largest start offset of the robot, in the outputs' units.  [default: that of a reset]"),
     ] = None,
     attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
+    verify: Annotated[Path | None, option("Folder of a certificate: check it and compare it with the skill.")] = None,
+    key: Annotated[Path | None, option("Key file: signs the certificate, or checks its signature.")] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
@@ -221,10 +223,15 @@ def certify(
     The certificate lists its assumptions. It can be checked on any machine: python checker.py FOLDER needs NumPy alone.
     An attack shows how tight the bounds are: the table compares them with the worst commands an adversary found.
     """
-    from guiderail.tools.certify import certify_skill
+    from guiderail.tools.certify import certify_skill, verify_certificate
 
-    task = cli.find_task(subject, imports)[0]
-    result = certify_skill(task, cli.parse_environment(env), out=out, start_within=start_within, attack=attack)
+    task, environment = cli.find_task(subject, imports)[0], cli.parse_environment(env)
+    if verify is not None and (out is not None or attack):
+        raise InputError("--verify writes nothing and attacks nothing: give it without --out and --attack")
+    if verify is not None:
+        result = verify_certificate(task, environment, verify, start_within=start_within, key=key)
+    else:
+        result = certify_skill(task, environment, out=out, start_within=start_within, attack=attack, key=key)
     rows = result.get("attack", [])
     if as_json:
         typer.echo(to_json(result))

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
 from guiderail.tools.datasets.paths import ENDINGS, load_demonstrations, path_exists
 from guiderail.tools.files import check_picture
+
+_MAX_COMPONENTS = 8  # of the mixture with which demonstrations are compared with a default primitive
 
 
 def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | None:
@@ -44,7 +46,7 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
 
 
 def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
-    """Read demonstrations and return their number, durations, ranges and spread.
+    """Read demonstrations and return their number, durations, ranges, spread, and how a default primitive follows them.
 
     Args:
         file: File of demonstrations, or a folder of files.
@@ -80,7 +82,22 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         "widest": spread.max(axis=0).round(6).tolist(),
     }
     summary |= {} if draw is None else {"picture": str(draw)}
-    return summary | (fit_primitive(demonstrations) if fit else {})
+    return summary | (fit_primitive(demonstrations) if fit else _follow_by_default(common))
+
+
+def _follow_by_default(common: Demonstrations) -> dict[str, Any]:
+    """Return the deviation of a default primitive from resampled demonstrations, and a remark if it is large."""
+    from guiderail.models.primitives.deviation import describe_deviation, measure_deviation
+
+    outputs = np.stack(common.outputs)
+    components = min(_MAX_COMPONENTS, len(common.times[0]) // 4)
+    if components < 1:
+        return {}
+    floor = _variance_floor(outputs.reshape(-1, outputs.shape[-1]))
+    reference = ReferenceTrajectory.from_demonstrations(common, components, floor=floor)
+    deviation, miss = measure_deviation(reference, SquaredExponential(), lambda_=6.0, beta=6.0, horizon=40)
+    remark = {} if deviation <= 1.0 else {"remark": describe_deviation(deviation, miss)}
+    return {"default_deviation": float(f"{deviation:.4g}"), **remark}
 
 
 def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
@@ -89,12 +106,11 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
     Raises:
         InputError: If there are too few demonstrations.
     """
-    from guiderail.models.primitives import LcNsKmp
-    from guiderail.models.primitives.fit import fit, share_within_spread
+    from guiderail.models.primitives.fit import fit
 
     floor = _variance_floor(np.concatenate(demonstrations.outputs))
     chosen = fit(demonstrations, floor=floor)
-    share = share_within_spread(LcNsKmp(chosen.reference))
+    share = estimated_share(chosen.reference, SquaredExponential(), lambda_=6.0, beta=6.0)
     verdict = "follows the demonstrations" if share >= MIN_SHARE else "LEAVES the demonstrations: use these values"
     return {
         "components": chosen.components,

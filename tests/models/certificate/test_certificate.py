@@ -3,9 +3,12 @@
 import ast
 import hashlib
 import io
+import itertools
 import json
 import runpy
 import sys
+import warnings
+import zipfile
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +19,14 @@ import pytest
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.certificate.bounds import certify
-from guiderail.models.certificate.files import BUDGET, CERTIFICATE, OTHER_CLOCK, certificate_files, digest
+from guiderail.models.certificate.files import (
+    BUDGET,
+    CERTIFICATE,
+    OTHER_CLOCK,
+    certificate_files,
+    compare_subject,
+    seal,
+)
 from guiderail.models.certificate.lagrange_bounds import Budget, MultiplierSearch, residue_generators
 from guiderail.models.certificate.loop import CertifiedLoop, reach
 from guiderail.models.common.errors import InputError
@@ -188,9 +198,13 @@ def test_any_multiplier_proves_a_bound(change):
         assert (seen.upper[n] <= highest + 1e-9).all()
 
 
-def files(made, found):
-    stiffness, limits = np.array([1500.0, 1500.0]), np.array([40.0, 40.0])
-    return certificate_files(made, found, stiffness, limits, {"task": "none"})
+IMPEDANCE = np.array([1500.0, 1500.0]), np.array([40.0, 40.0])
+ABOUT = {"task": "none", "environment": {"guidance": "kgrl"}}
+KEY = bytes(range(32))
+
+
+def files(made, found, key=None):
+    return certificate_files(made, found, *IMPEDANCE, ABOUT, key)
 
 
 def write(folder, contents):
@@ -214,9 +228,15 @@ def signed(contents, **changed):
         inner = claims
         for parent in parents:
             inner = inner[parent]
-        inner[last] = change(inner[last])
-    claims["digest"] = digest(claims)
-    return {**contents, CERTIFICATE: json.dumps(claims).encode()}
+        value = change(inner.get(last))
+        if value is DROPPED:
+            del inner[last]
+        else:
+            inner[last] = value
+    return {**contents, CERTIFICATE: seal(claims)}
+
+
+DROPPED = object()
 
 
 def altered(contents, name, **changed):
@@ -224,7 +244,7 @@ def altered(contents, name, **changed):
     with np.load(io.BytesIO(contents[name])) as arrays:
         values = {key: arrays[key].copy() for key in arrays.files}
     for key, change in changed.items():
-        values[key] = change(values[key])
+        values[key] = change(values.get(key))
     written = io.BytesIO()
     np.savez(written, **values)
     return {**contents, name: written.getvalue()}
@@ -250,19 +270,45 @@ def faster(contents, factor, *left_out):
             rows = claims[regime][name]
             claims[regime][name] = [[None if x is None else x / factor**order for x in row] for row in rows]
     claims["assumes"] = [sentence for sentence in claims["assumes"] if sentence not in left_out]
-    claims["digest"] = digest(claims)
-    return {**contents, CERTIFICATE: json.dumps(claims).encode()}
+    return {**contents, CERTIFICATE: seal(claims)}
 
 
 def constrained_by_nothing(contents):
     """Return a certificate with a NaN constraint and the claims of an unconstrained loop."""
     none = altered(contents, "constraints.npz", c=lambda c: np.nan * c)
     none = altered(none, "witness.npz", active=np.zeros_like, multipliers=lambda alphas: alphas[:0])
+    return signed(none, always=lambda _: json.loads(contents[CERTIFICATE])["free"])
+
+
+def tightened(contents, share):
+    """Return a certificate with all bounds tightened by a share of the largest."""
     claims = json.loads(contents[CERTIFICATE])
-    free, stiffness, limits = (claims[name] for name in ("free", "stiffness", "limits"))
-    ranges = np.max(free["upper"], axis=0) - np.min(free["lower"], axis=0)
-    at_rest = float(np.linalg.norm(np.minimum(limits, np.array(stiffness) * ranges)))
-    return signed(none, always=lambda _: free | {"rest_force": at_rest})
+    for regime in ("free", "always", "budgeted"):
+        for name in checker.QUANTITIES if claims[regime] else ():
+            values = np.array(claims[regime][name], dtype=float)
+            change = share * np.nan_to_num(np.abs(values)).max(axis=0) * (1 if name == "lower" else -1)
+            rows = (values + change).tolist()
+            claims[regime][name] = [[None if x != x else x for x in row] for row in rows]
+    return {**contents, CERTIFICATE: seal(claims)}
+
+
+def as_text(contents, change):
+    """Return a certificate whose text is changed."""
+    return {**contents, CERTIFICATE: change(contents[CERTIFICATE].decode()).encode()}
+
+
+def every_step_active(contents):
+    """Return a certificate that calls every step active, with multipliers of zero where there were none."""
+    with np.load(io.BytesIO(contents["witness.npz"])) as witness:
+        active, multipliers = witness["active"], witness["multipliers"]
+    padded = np.zeros((STEPS, *multipliers.shape[1:]))
+    padded[active] = multipliers
+    changed = altered(contents, "witness.npz", active=np.ones_like, multipliers=lambda _: padded)
+    return signed(changed)
+
+
+def unlimited(impedance):
+    return {**impedance, "limits": [1.0, 1.0], "force": 2**0.5, "rest_force": {"always": 2**0.5}}
 
 
 TAMPERED = {
@@ -274,9 +320,57 @@ TAMPERED = {
     "an acceleration": lambda c: signed(c, free__acceleration=at((20, 0), factor=0.9)),
     "the period": lambda c: signed(c, period=lambda period: 2.0 * period),
     "a bound that is left out": lambda c: signed(c, always__upper=lambda rows: rows[:-1]),
-    "the limits of force": lambda c: signed(c, limits=lambda limits: [0.5 * x for x in limits]),
-    "the force": lambda c: signed(c, force=lambda force: 0.9 * force),
-    "the stiffness": lambda c: signed(c, stiffness=lambda stiffness: [0.01 * x for x in stiffness]),
+    "the limits of force": lambda c: signed(c, impedance__limits=lambda limits: [0.5 * x for x in limits]),
+    "the limits, left out": lambda c: signed(c, impedance__limits=lambda limits: DROPPED),
+    "the limits, null": lambda c: signed(c, impedance__limits=lambda limits: None),
+    "limits below zero": lambda c: signed(c, impedance__limits=lambda limits: [-40.0, -40.0]),
+    "the force": lambda c: signed(c, impedance__force=lambda force: 0.9 * force),
+    "the force, by a little": lambda c: signed(c, impedance__force=lambda force: (1 - 3e-5) * force),
+    "the stiffness": lambda c: signed(c, impedance__stiffness=lambda stiffness: [0.01 * x for x in stiffness]),
+    "the force at rest": lambda c: signed(c, impedance__rest_force__always=lambda force: 0.99 * force),
+    "a force at rest of a regime without one": lambda c: signed(c, impedance__rest_force__free=lambda _: 1.0),
+    "a force at rest in another place": lambda c: signed(c, free__rest_force=lambda _: 1.0),
+    "an unknown claim": lambda c: signed(c, peak_force=lambda _: 1.0),
+    "an unknown claim of a regime": lambda c: signed(c, always__jerk=lambda _: [[0.0, 0.0]] * STEPS),
+    "a regime, left out": lambda c: signed(c, free=lambda _: DROPPED),
+    "a budget from nowhere": lambda c: signed(c, budgeted=lambda _: {"excess": [[0.0], [0.0]]}),
+    "a number as text": lambda c: signed(c, period=lambda period: str(period)),
+    "numbers as text": lambda c: signed(c, always__upper=lambda rows: [[str(x) for x in row] for row in rows]),
+    "a number as a bool": lambda c: signed(c, always__upper=lambda rows: [[True, *rows[0][1:]], *rows[1:]]),
+    "a whole number": lambda c: signed(c, always__upper=lambda rows: [[1, *rows[0][1:]], *rows[1:]]),
+    "a bound replaced by null": lambda c: signed(c, always__upper=lambda rows: [[None, *rows[0][1:]], *rows[1:]]),
+    "a key twice": lambda c: as_text(
+        c, lambda text: text.replace('"about": ', '"about": {"task": "easy"}, "about": ', 1)
+    ),
+    "a claim twice": lambda c: as_text(c, lambda text: text.replace('"always": ', '"always": {}, "always": ', 1)),
+    "another text of the same numbers": lambda c: as_text(c, lambda text: json.dumps(json.loads(text), indent=1)),
+    "NaN": lambda c: as_text(c, lambda text: text.replace('"period": 0.02', '"period": NaN')),
+    "everything, by less than a ten-thousandth": lambda c: tightened(c, 0.9e-4),
+    "everything, by little more than rounding": lambda c: tightened(c, 2e-5),
+    "every step active": every_step_active,
+    "an active step that is not": lambda c: signed(altered(c, "witness.npz", active=lambda t: t[::-1].copy())),
+    "a tiny row": lambda c: signed(altered(c, "constraints.npz", G=lambda G: 1e-9 * G, c=lambda c: 1e-9 * c)),
+    "a tiny row with a large bound": lambda c: signed(
+        altered(c, "constraints.npz", G=lambda G: 1e-9 * G, c=lambda c: 1e-9 * (c + 0.22))
+    ),
+    "a large row": lambda c: signed(altered(c, "constraints.npz", G=lambda G: 1e9 * G, c=lambda c: 1e9 * c)),
+    "a row of zeros": lambda c: signed(altered(c, "constraints.npz", G=np.zeros_like)),
+    "the clock": lambda c: signed(altered(c, "primitive.npz", clock=lambda clock: 1e-14 * clock)),
+    "an uneven clock": lambda c: signed(altered(c, "primitive.npz", clock=lambda clock: clock * np.arange(STEPS))),
+    "a clock that stands": lambda c: signed(altered(c, "primitive.npz", clock=np.zeros_like)),
+    "an unknown array": lambda c: signed(altered(c, "primitive.npz", inputs=lambda _: np.arange(STEPS + 10.0))),
+    "a history in fractions": lambda c: signed(altered(c, "primitive.npz", history=lambda h: h + 0.5)),
+    "a covariance that is not symmetric": lambda c: signed(
+        altered(c, "primitive.npz", covariances=at((30, 0, 1), plus=1e-6))
+    ),
+    "single precision": lambda c: signed(altered(c, "primitive.npz", means=lambda m: m.astype(np.float32))),
+    "multipliers of other corners": lambda c: signed(
+        altered(c, "witness.npz", multipliers=lambda a: a[:, ::-1].copy())
+    ),
+    "multipliers below zero": lambda c: signed(altered(c, "witness.npz", multipliers=lambda a: -a)),
+    "the format": lambda c: signed(c, format=lambda _: "guiderail certificate 3"),
+    "no task": lambda c: signed(c, about=lambda about: {"run": "?"}),
+    "assumptions as text": lambda c: signed(c, assumes=lambda them: "\n".join(them)),
     "a mean": lambda c: signed(altered(c, "primitive.npz", means=at((30, 0), plus=0.02))),
     "a covariance": lambda c: signed(altered(c, "primitive.npz", covariances=at((30, 0, 0), factor=3.0))),
     "the gains": lambda c: signed(altered(c, "primitive.npz", gains=lambda gains: 1.1 * gains)),
@@ -326,15 +420,56 @@ def test_checker_rejects_a_changed_certificate(honest, tmp_path, what):
         checker.check(write(tmp_path, TAMPERED[what](honest)))
 
 
+# Alterations that only a comparison with the skill detects.
+SUBJECT = {
+    "about": lambda c: signed(c, about=lambda _: {"task": "easier", "environment": {"guidance": "kgrl"}}),
+    "limits": lambda c: signed(c, impedance=unlimited),
+    "stiffness": lambda c: signed(c, impedance=lambda _: None),
+}
+
+
+@pytest.mark.parametrize("what", SUBJECT)
+def test_comparison_with_the_skill_detects_what_a_checker_takes_as_given(honest, tmp_path, what):
+    made, contents = skill(0, 0.25, tied=0.5), honest
+    assert compare_subject(contents, made, *IMPEDANCE, ABOUT) is None
+    assert compare_subject(SUBJECT[what](contents), made, *IMPEDANCE, ABOUT) == what
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"gains": np.array([0.1, 0.0])}, "gains"),
+        ({"start_within": np.zeros(2)}, "start_within"),
+        ({"period": 0.03}, "period"),
+        ({"primitive": skill(0, 0.26, tied=0.5).primitive}, "c"),
+        ({"primitive": skill(0, 0.25, tied=0.4).primitive}, "covariances"),
+    ],
+)
+def test_comparison_names_what_differs_from_the_skill(honest, change, name):
+    assert compare_subject(honest, replace(skill(0, 0.25, tied=0.5), **change), *IMPEDANCE, ABOUT) == name
+
+
+def without_budget(claims):
+    return [[0.0 * x for x in row] for row in claims]
+
+
 BUDGETED = {
     "a bound": lambda c: signed(c, budgeted__upper=at((50, 1), plus=-0.05)),
     "a speed": lambda c: signed(c, budgeted__speed=at((50, 0), factor=0.9)),
-    "the force at rest": lambda c: signed(c, budgeted__rest_force=lambda force: 0.9 * force),
+    "the force at rest": lambda c: signed(c, impedance__rest_force__budgeted=lambda force: 0.9 * force),
     "the excess": lambda c: signed(c, budgeted__excess=lambda rows: [[0.5 * x for x in row] for row in rows]),
     "the residue": lambda c: signed(c, budgeted__residue=lambda rows: [[0.5 * x for x in row] for row in rows]),
+    "no excess": lambda c: signed(c, budgeted__excess=without_budget),
+    "no residue": lambda c: signed(c, budgeted__residue=without_budget),
+    "no budget": lambda c: signed(c, budgeted__excess=without_budget, budgeted__residue=without_budget),
+    "a total below a step's": lambda c: signed(c, budgeted__excess=lambda rows: [[2.0 * rows[1][0]], rows[1]]),
+    "the residue of an output that moves": lambda c: signed(c, budgeted__residue=at((1, 0), plus=1.0)),
     "a budget below zero": lambda c: signed(c, budgeted__residue=lambda rows: [[-x for x in row] for row in rows]),
     "a Lagrange multiplier": lambda c: signed(altered(c, "witness.npz", lagrange_multipliers=lambda p: 1.1 * p)),
+    "a step before the first": lambda c: signed(altered(c, "witness.npz", lagrange_steps=lambda k: k - STEPS)),
+    "a step past the last": lambda c: signed(altered(c, "witness.npz", lagrange_steps=lambda k: k + STEPS)),
     "what it assumes": lambda c: signed(c, assumes=lambda them: [one for one in them if one != BUDGET]),
+    "the regime, left out": lambda c: signed(c, budgeted=lambda _: None),
     "the regime": lambda c: signed(
         c, budgeted=lambda claims: c and json.loads(c[CERTIFICATE])["always"] | claims_of(c)
     ),
@@ -351,6 +486,26 @@ def claims_of(contents):
 def test_checker_rejects_a_changed_budgeted_regime(budgeted, tmp_path, what):
     with pytest.raises((checker.Rejected, ValueError)):
         checker.check(write(tmp_path, BUDGETED[what](budgeted)))
+
+
+def test_signature_needs_the_key(tmp_path):
+    made = skill(0)
+    contents = files(made, certify(made), KEY)
+    checker.check(write(tmp_path, contents))
+    checker.check(tmp_path, KEY)
+    with pytest.raises(checker.Rejected, match="not of this key"):
+        checker.check(tmp_path, KEY[::-1])
+    with pytest.raises(checker.Rejected, match="16 bytes"):
+        checker.check(tmp_path, KEY[:15])
+    # Anyone can compute the digest of other claims, and even keep the signature of the first ones.
+    claims = json.loads(contents[CERTIFICATE])
+    claims["about"] = {"task": "easier"}
+    forged = json.loads(seal(claims))
+    for signature in ({}, {"signature": claims["signature"]}, {"signature": 3}):
+        (tmp_path / CERTIFICATE).write_text(checker.canonical(forged | signature))
+        checker.check(tmp_path)
+        with pytest.raises(checker.Rejected, match="signature is missing"):
+            checker.check(tmp_path, KEY)
 
 
 def test_certificate_states_a_period_unlike_the_clock(tmp_path):
@@ -373,16 +528,28 @@ def told(folder, capsys, monkeypatch):
 
 
 NONE = {
-    "a list": lambda c: {**c, CERTIFICATE: b"[]"},
-    "a number": lambda c: {**c, CERTIFICATE: b"3"},
     "half of it": lambda c: {**c, CERTIFICATE: c[CERTIFICATE][:100]},
     "no text": lambda c: {**c, CERTIFICATE: bytes(range(256))},
-    "digests as a list": lambda c: signed(c, digests=lambda digests: []),
     "no arrays": lambda c: signed({**c, "witness.npz": b"none"}),
     "half of an archive": lambda c: signed({**c, "witness.npz": c["witness.npz"][:-50]}),
-    "a word for a number": lambda c: signed(altered(c, "primitive.npz", horizon=lambda _: "long")),
     "nothing": lambda c: {},
 }
+
+
+MALFORMED = {
+    "a list": lambda c: {**c, CERTIFICATE: b"[]"},
+    "a number": lambda c: {**c, CERTIFICATE: b"3"},
+    "digests as a list": lambda c: {**c, CERTIFICATE: seal(json.loads(c[CERTIFICATE]) | {"digests": []})},
+    "a word for a number": lambda c: signed(altered(c, "primitive.npz", horizon=lambda _: "long")),
+}
+
+
+@pytest.mark.parametrize("what", MALFORMED)
+def test_checker_rejects_content_that_is_not_a_certificates(honest, what, tmp_path, capsys, monkeypatch):
+    code, out = told(write(tmp_path, MALFORMED[what](honest)), capsys, monkeypatch)
+    assert code == 1
+    assert out.startswith("no: ")
+    assert out.count("\n") == 1
 
 
 @pytest.mark.parametrize("what", NONE)
@@ -402,7 +569,7 @@ def test_checker_exits_with_0_or_1(honest, tmp_path, capsys, monkeypatch):
 
 def test_checker_is_short_and_imports_numpy_only():
     source = Path(checker.__file__).read_text()
-    assert len(source.splitlines()) <= 250
+    assert len(source.splitlines()) <= 450
     imported = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -410,3 +577,138 @@ def test_checker_is_short_and_imports_numpy_only():
         elif isinstance(node, ast.ImportFrom):
             imported.add(str(node.module))
     assert {name for name in imported if name.split(".")[0] not in sys.stdlib_module_names} == {"numpy"}
+
+
+@cache
+def small(history):
+    """Return a short constrained loop, its bounds and its certificate."""
+    phase = np.linspace(0.0, 1.0, 14)
+    means = np.column_stack([0.2 * np.sin(np.pi * phase), phase])
+    covariances = np.tile(np.array([[0.01, 0.002], [0.002, 0.01]]), (14, 1, 1))
+    constraints = LinearConstraints.box([-0.21, -np.inf], [0.21, np.inf])
+    reference = ReferenceTrajectory(PERIOD * np.arange(14), means, covariances)
+    primitive = LcNsKmp(reference, horizon=4, history=history, constraints=constraints)
+    gains = authority_gains(primitive, outputs=np.array([0]))
+    made = CertifiedLoop(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
+    found = certify(made, Budget(np.array([[0.2], [0.5]]), np.array([[0.0, 0.01], [0.0, 0.05]])))
+    assert found.can_be_active.any()
+    return made, found, files(made, found)
+
+
+def leaves(value, path=()):
+    """Yield the paths of a JSON value: every field, and of a list the first, a middle and the last element."""
+    if path:
+        yield path
+    if isinstance(value, dict):
+        for key in value:
+            yield from leaves(value[key], (*path, key))
+    elif isinstance(value, list) and value:
+        for i in sorted({0, len(value) // 2, len(value) - 1}):
+            yield from leaves(value[i], (*path, i))
+
+
+RETYPED = {float: str, str: lambda text: [text], list: lambda rows: dict(enumerate(map(str, rows))), dict: list}
+
+
+def altered_claims(contents):
+    """Yield names and certificates with one field of the claims dropped, scaled, retyped or duplicated."""
+    claims = json.loads(contents[CERTIFICATE])
+    for path in leaves(claims):
+        if path[0] in ("digest", "digests"):
+            continue
+        for kind in ("dropped", "scaled up", "scaled down", "retyped", "duplicated"):
+            changed = json.loads(contents[CERTIFICATE])
+            *parents, last = path
+            inner = changed
+            for parent in parents:
+                inner = inner[parent]
+            value = inner[last]
+            if kind == "dropped":
+                del inner[last]
+            elif kind.startswith("scaled"):
+                factor = 1.5 if kind == "scaled up" else 1.0 - 0.9e-4
+                if type(value) is not float or value == 0.0:
+                    continue
+                inner[last] = factor * value
+            elif kind == "retyped":
+                inner[last] = RETYPED.get(type(value), str)(value)
+            elif isinstance(last, int):
+                inner.insert(last, value)
+            else:
+                text = json.dumps(changed, sort_keys=True)
+                field = f"{json.dumps(last)}: {json.dumps(value, sort_keys=True)}"
+                yield f"{path} {kind}", {**contents, CERTIFICATE: text.replace(field, f"{field}, {field}", 1).encode()}
+                continue
+            yield f"{path} {kind}", {**contents, CERTIFICATE: seal(changed)}
+
+
+def altered_arrays(contents):
+    """Yield names and certificates with one array dropped, scaled, retyped or duplicated, and new digests."""
+    for name in checker.ARRAYS:
+        with np.load(io.BytesIO(contents[name])) as arrays:
+            values = {key: arrays[key] for key in arrays.files}
+        for key, value in values.items():
+            changes = {
+                "dropped": None,
+                "scaled up": 1.5 * value
+                if value.dtype.kind == "f"
+                else value + 1
+                if value.dtype.kind == "i"
+                else ~value,
+                "scaled down": (1.0 - 0.9e-4) * value if value.dtype.kind == "f" else 0 * value,
+                "retyped": value.astype(str),
+                "in another precision": value.astype(np.float32 if value.dtype.kind == "f" else np.int16),
+                "duplicated": np.concatenate([np.atleast_1d(value)] * 2),
+                "of another dimension": value[None],
+            }
+            for kind, other in changes.items():
+                if other is not None and other.dtype == value.dtype and np.array_equal(other, value):
+                    continue
+                kept = {k: v for k, v in ({**values, key: other}).items() if v is not None}
+                written = io.BytesIO()
+                np.savez(written, **kept)
+                yield f"{name} {key} {kind}", signed({**contents, name: written.getvalue()})
+            written = io.BytesIO(contents[name])
+            with zipfile.ZipFile(written, "a") as archive, warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                archive.writestr(f"{key}.npy", archive.read(f"{key}.npy"))
+            yield f"{name} {key} twice", signed({**contents, name: written.getvalue()})
+
+
+def holds(found, contents, other):
+    """Return True if an altered certificate claims no more than what was certified."""
+    claims, before = (json.loads(each[CERTIFICATE]) for each in (other, contents))
+    regimes = {"free": found.free, "always": found.always}
+    if found.budgeted is not None:
+        regimes["budgeted"] = found.budgeted.bounds
+        for name in ("excess", "residue"):
+            if not (np.array(claims["budgeted"][name]) <= np.array(before["budgeted"][name])).all():
+                return False
+    for (regime, bounds), name in itertools.product(regimes.items(), checker.QUANTITIES):
+        claimed, own = np.array(claims[regime][name], dtype=float), getattr(bounds, name)
+        bounded = ~np.isnan(claimed)
+        if not ((claimed - own)[bounded] * (-1.0 if name == "lower" else 1.0) >= 0.0).all():
+            return False
+    return all(claims[k] == before[k] for k in ("about", "assumes", "kernel", "period", "impedance"))
+
+
+@pytest.mark.parametrize("history", [0, 3])
+def test_no_alteration_of_a_field_is_accepted_unless_its_claims_hold(history, tmp_path):
+    made, found, contents = small(history)
+    checker.check(write(tmp_path, contents))
+    assert compare_subject(contents, made, *IMPEDANCE, ABOUT) is None
+    tried = accepted = 0
+    for name, other in itertools.islice((*altered_claims(contents), *altered_arrays(contents)), 0, None, 5):
+        tried += 1
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                checker.check(write(tmp_path, other))
+        except Exception:
+            continue
+        if compare_subject(other, made, *IMPEDANCE, ABOUT) is not None:
+            continue
+        accepted += 1
+        assert holds(found, contents, other), name
+    assert tried >= 100
+    assert accepted <= 0.1 * tried

@@ -105,9 +105,9 @@ def test_share_is_low_when_a_primitive_leaves_the_spread():
     """The share falls if the kernel cuts the corner, or if λ pulls the motion to zero."""
     good = LcNsKmp(hook(), SquaredExponential(0.1), 0.05, 0.05)
     assert share_within_spread(good) == 1.0
-    too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(22.4), 6.0, 6.0)
+    too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(22.4), 6.0, 6.0, max_deviation=np.inf)
     assert share_within_spread(too_wide) < 0.7
-    too_strong = LcNsKmp(hook(), SquaredExponential(0.1), 1e5, 1e5)
+    too_strong = LcNsKmp(hook(), SquaredExponential(0.1), 1e5, 1e5, max_deviation=np.inf)
     assert share_within_spread(too_strong) < 0.2
     for primitive in (good, too_wide, too_strong):
         kernel, hbar = primitive.kernel, primitive.lambda_

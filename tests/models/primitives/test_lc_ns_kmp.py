@@ -1,6 +1,7 @@
 """LcNsKmp solves problem 4.5 and refuses invalid arguments."""
 
 import tracemalloc
+import warnings
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from guiderail.models.primitives import (
     SquaredExponential,
     pose_demonstrations,
 )
+from guiderail.models.primitives.deviation import MAX_DEVIATION, MAX_MISS, measure_deviation
+from guiderail.models.primitives.fit import motion_without_actions
 from oracles.dense import Extended
 from oracles.problems import Problem, random_problem
 
@@ -273,6 +276,7 @@ def test_bounds_hold_in_badly_scaled_problems(variances, period, history):
         history=history,
         history_variance=1e-10,
         constraints=LinearConstraints.box([-0.002, -0.5], [t[-1] / 2, 0.5]),
+        max_deviation=np.inf,
     )
     rng = np.random.default_rng(0)
     past = np.zeros((history, 2)) if history else None
@@ -435,3 +439,56 @@ def test_constructor_refuses_invalid_arguments(changes, names):
 def test_predict_refuses_invalid_arguments(step, action, history, names):
     with pytest.raises(InputError, match=names):
         LcNsKmp(**small(history=3)).predict(step, action, history)
+
+
+@pytest.mark.parametrize("unit", [1.0, 10.0, 1000.0])
+def test_primitive_measures_how_far_it_is_from_its_demonstrations(unit):
+    """λ and β in meters miss demonstrations in millimeters."""
+    t = np.linspace(0.0, 4.0, 60)
+    means = unit * np.column_stack([0.3 + 0.1 * np.sin(2.0 * t), 0.2 * t])
+    reference = ReferenceTrajectory(t, means, np.tile((0.01 * unit) ** 2 * np.eye(2), (60, 1, 1)))
+    if unit == 1000.0:
+        with pytest.raises(InputError, match="check the unit of the outputs"):
+            LcNsKmp(reference)
+    elif unit == 10.0:
+        with pytest.warns(UserWarning, match="standard deviations away from its demonstrations"):
+            primitive = LcNsKmp(reference)
+        assert 1.0 < primitive.deviation < MAX_DEVIATION
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            primitive = LcNsKmp(reference)
+        assert primitive.deviation < 1.0
+        errors = (motion_without_actions(primitive) - means) / 0.01
+        steps = np.unique(np.linspace(0, 59, 16).astype(int))
+        assert primitive.deviation == pytest.approx(np.sqrt((errors[steps] ** 2).mean()))
+
+
+@pytest.mark.parametrize("is_refused", [True, False])
+@pytest.mark.parametrize("limit", ["max_deviation", "MAX_MISS"])
+def test_primitive_is_refused_beyond_both_limits(monkeypatch, limit, is_refused):
+    """A motion may be many tiny standard deviations away, or far away within large ones."""
+    t = np.linspace(0.0, 4.0, 60)
+    reference = ReferenceTrajectory(t, 1000.0 * np.column_stack([t, t]), np.tile(100.0 * np.eye(2), (60, 1, 1)))
+    deviation, miss = measure_deviation(reference, SquaredExponential(0.5), 6.0, 6.0, 40)
+    assert deviation > MAX_DEVIATION
+    assert miss > MAX_MISS
+    arguments = {}
+    if limit == "max_deviation":
+        arguments["max_deviation"] = np.nextafter(deviation, 0.0) if is_refused else deviation
+    else:
+        monkeypatch.setattr(
+            "guiderail.models.primitives.deviation.MAX_MISS", np.nextafter(miss, 0.0) if is_refused else miss
+        )
+    if is_refused:
+        with pytest.raises(InputError, match="standard deviations away from its demonstrations"):
+            LcNsKmp(reference, **arguments)
+    else:
+        with pytest.warns(UserWarning, match="of an output's range"):
+            assert LcNsKmp(reference, **arguments).deviation == deviation
+
+
+def test_outputs_that_do_not_move_are_not_missed():
+    t = np.linspace(0.0, 4.0, 60)
+    reference = ReferenceTrajectory(t, np.zeros((60, 2)), np.tile(1e-20 * np.eye(2), (60, 1, 1)))
+    assert measure_deviation(reference, SquaredExponential(0.5), 6.0, 6.0, 40) == (0.0, 0.0)

@@ -1,0 +1,95 @@
+"""Distance of a primitive's motion from its demonstrations, which shows a wrong unit or regularization."""
+
+import warnings
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.constraints import LinearConstraints
+from guiderail.models.primitives.features import window_features
+from guiderail.models.primitives.kernels import Kernel
+from guiderail.models.primitives.reference import ReferenceTrajectory
+from guiderail.models.primitives.window import StepFactor, Window
+
+MAX_DEVIATION = 10.0
+"""Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
+MAX_MISS = 0.1
+"""Distance, relative to the range of an output, up to which a larger deviation is accepted: spreads may be tiny."""
+_EVALUATED = 16  # number of steps at which this distance is measured
+
+
+def measure_deviation(
+    reference: ReferenceTrajectory, kernel: Kernel, lambda_: float, beta: float, horizon: int
+) -> tuple[float, float]:
+    """Compute the RMS distance of a motion from its reference mean, in two units.
+
+    The motion is that of a primitive without actions, history and constraints. λ and β weigh outputs in their unit:
+    values for meters miss demonstrations in millimeters.
+
+    Args:
+        reference: As in `LcNsKmp`.
+        kernel: As in `LcNsKmp`.
+        lambda_: As in `LcNsKmp`.
+        beta: As in `LcNsKmp`.
+        horizon: As in `LcNsKmp`.
+
+    Returns:
+        The distance in standard deviations of the reference, and the largest one of an output relative to its range.
+    """
+    steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
+    can_share = kernel.stationary and reference.uniform
+    squared, errors, features = [], [], None
+    for step in steps.tolist():
+        window = np.arange(step, step + horizon + 1)
+        held = np.minimum(window, reference.num_steps - 1)
+        if features is None or not can_share:
+            inputs = reference.inputs(window)
+            features = window_features(kernel, inputs[:0], inputs, 0.0)
+        G, c = LinearConstraints.none(reference.num_outputs).window(held)
+        free = Window(reference.means[held], reference.covariances[held], G, c)
+        error = StepFactor(free, features, lambda_, beta).output_offset - reference.means[step]
+        squared.append(error @ np.linalg.solve(reference.covariances[step], error) / reference.num_outputs)
+        errors.append(error)
+    sizes, ranges = np.sqrt(np.mean(np.square(errors), axis=0)), np.ptp(reference.means, axis=0)
+    with np.errstate(divide="ignore"):
+        miss = np.divide(sizes, ranges, out=np.zeros_like(sizes), where=sizes > 0.0)
+    return float(np.sqrt(np.mean(squared))), float(miss.max())
+
+
+def describe_deviation(deviation: float, miss: float) -> str:
+    """Return a sentence on a deviation above one and what to do."""
+    return (
+        f"without actions the primitive is {deviation:.3g} standard deviations away from its demonstrations (RMS), and "
+        f"{miss:.2g} of an output's range: check the unit of the outputs (defaults are for meters and seconds), or "
+        "let guiderail dataset validate FILE --fit choose length_scale, lambda_ and beta"
+    )
+
+
+def check_deviation(
+    reference: ReferenceTrajectory,
+    kernel: Kernel,
+    lambda_: float,
+    beta: float,
+    horizon: int,
+    max_deviation: float = MAX_DEVIATION,
+) -> float:
+    """Return the first number of `measure_deviation`; warn if it exceeds one.
+
+    Args:
+        reference: As in `LcNsKmp`.
+        kernel: As in `LcNsKmp`.
+        lambda_: As in `LcNsKmp`.
+        beta: As in `LcNsKmp`.
+        horizon: As in `LcNsKmp`.
+        max_deviation: Largest accepted one [standard deviations].
+
+    Raises:
+        InputError: If it exceeds `max_deviation`, and the second number `MAX_MISS`.
+    """
+    deviation, miss = measure_deviation(reference, kernel, lambda_, beta, horizon)
+    if not deviation <= 1.0:
+        advice = describe_deviation(deviation, miss)
+        if not (deviation <= max_deviation or miss <= MAX_MISS):
+            raise InputError(advice)
+        warnings.warn(advice, UserWarning, stacklevel=3)
+    return deviation
