@@ -1,4 +1,5 @@
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,17 +33,16 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     environment, folder = {"guidance": "skgrl"}, tmp_path / "certificate"
     assert certify_skill("NarrowPassage", environment, out=folder, key=key)["checker"] == "yes"
     assert verify_certificate("NarrowPassage", environment, folder, key=key)["checker"] == "yes"
-    for other, words in (
-        ({"guidance": "skgrl", "action_scale": 2.0}, "no: its about is not that of NarrowPassage"),
-        ({"guidance": "kgrl"}, "no: its about"),
-    ):
-        assert verify_certificate("NarrowPassage", other, folder)["checker"].startswith(words)
-    assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
-    monkeypatch.setattr("guiderail.tools.certify.BUDGET_MARGIN", 0.1)
-    monkeypatch.setattr("guiderail.tools.certify.MIN_EXCESS", ((0.01,), (0.01,)))
-    certify_skill("NarrowPassage", environment, out=folder)
-    assert "exceed its budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
+    key.write_bytes(bytes(32))
     assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
+    monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # it takes seconds
+    for other in ({"guidance": "skgrl", "action_scale": 2.0}, {"guidance": "kgrl"}):
+        verdict = verify_certificate("NarrowPassage", other, folder)["checker"]
+        assert verdict == "no: its about is not that of NarrowPassage"
+    assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
+    needed = SimpleNamespace(excess=np.full((2, 2), 9.0), residue=np.zeros((2, 2)))
+    monkeypatch.setattr("guiderail.tools.certify._search_budget", lambda loop: needed)
+    assert "exceed its budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
     with pytest.raises(InputError, match="name the folder of a certificate"):
         verify_certificate("NarrowPassage", environment, tmp_path)
     key.write_bytes(b"short")
