@@ -139,7 +139,9 @@ def fit(
     make = partial(make_kernel, kernel, parameters=kernel_parameters)
     candidates = _validate(reference, folds, outputs, horizon, _grid(resampled, length_scale, lambda_), make)
     selected = _select(candidates)
-    primitive = LcNsKmp(reference, make(selected.length_scale), selected.lambda_, selected.lambda_, horizon)
+    primitive = LcNsKmp(
+        reference, make(selected.length_scale), selected.lambda_, selected.lambda_, horizon, max_deviation=np.inf
+    )
     share = share_within_spread(primitive)
     return Selection(
         reference=reference,
