@@ -2,8 +2,8 @@
 
     python -m research.pretrained [NAME...] [--out runs/pretrained]
 
-Each policy is learned on the arm at `difficulty="hard"` and evaluated on 100 held-out episodes with all baseline
-policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An interrupted
+The policies of contact tasks are learned on the arm at `difficulty="hard"`. Each is evaluated on 100 held-out episodes
+with all baseline policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An interrupted
 training is resumed.
 """
 
@@ -21,6 +21,7 @@ from guiderail.tools.pretrained import PRETRAINED_FOLDER
 
 ARM = {"station": "arm", "difficulty": "hard"}
 POLICIES: dict[str, dict[str, Any]] = {
+    "passage": {"task": "NarrowPassage", "guidance": "skgrl", "episodes": 60},
     "connector": {"task": "BncConnector", "guidance": "kgrl", "episodes": 60, **ARM},
     "clamp": {"task": "GridClamp", "guidance": "sct", "episodes": 60, **ARM},
     "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100, "difficulty": "hard"},

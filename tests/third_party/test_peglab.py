@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent / "peglab"
-LINES = 150
+LINES = 180
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,28 @@ def test_the_python_api_trains_it(lab):
     assert lab("-c", code).strip() == "peglab/Slot"
 
 
+def test_its_kernel_is_a_choice(lab):
+    words = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
+    own = ("--env", "kernel=peglab_rational_quadratic", "--env", "kernel_parameters={mixture: 2.0}")
+    guiderail(lab, *words, *own, "--out", "smoother")
+    assert "kernel: peglab_rational_quadratic" in (lab.folder / "smoother" / "config.yaml").read_text()
+
+
+def test_policies_are_judged_in_its_environment_of_other_origin(lab):
+    code = (
+        "import guiderail, peglab\n"
+        "evaluation = guiderail.evaluate(lambda point: -3 * point, peglab.Reach(), 8)\n"
+        "print(evaluation['success_rate'], evaluation.comparison.p < 0.05, *evaluation['baselines'])"
+    )
+    assert lab("-c", code).split() == ["1.0", "True", "zero", "uniform_random", "constant"]
+
+
+def test_its_function_is_a_policy_of_the_command(lab):
+    (lab.folder / "lab_policies.py").write_text("import numpy as np\ndef ahead(observation):\n    return np.ones(2)\n")
+    words = ("evaluate", "lab_policies.py:ahead", "--task", "peglab/Slot", "--episodes", "2", "--baselines", "none")
+    assert json.loads(guiderail(lab, *words, "--json"))["episodes"] == 2
+
+
 def test_it_is_replayed(lab, trained):
     guiderail(lab, "visualize", "run", "--episodes", "1", "--html", "page.html")
     assert "peglab/Slot" in (lab.folder / "page.html").read_text()
@@ -175,5 +197,6 @@ def test_task_in_a_file_works_without_installation(lab):
         lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl",
         "--algorithm", "peglab_hill_climbing", "--out", "mine",
     )  # fmt: skip
-    # The run remembers what it needs.
-    assert json.loads(guiderail(lab, "evaluate", "mine", "--episodes", "2", "--json"))["episodes"] == 2
+    # The run remembers what it needs, and imports it if that is trusted.
+    words = ("evaluate", "mine", "--episodes", "2", "--trust-imports", "--baselines", "none", "--json")
+    assert json.loads(guiderail(lab, *words))["episodes"] == 2

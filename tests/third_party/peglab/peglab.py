@@ -1,8 +1,9 @@
-"""Package of a lab: a task with its own workcell, a guidance and a learner with its own settings, in one file."""
+"""Package of a lab: task, guidance, kernel, a learner with its own settings, and an environment of other origin."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -76,6 +77,37 @@ def offset(prior: gr.PriorKnowledge) -> gr.Guidance:
     """Command the measured pose plus the action."""
     reach = prior.options["reach"]
     return gr.FunctionGuidance(prior, lambda action, pose, wrench: pose + reach * action, action_size=2)
+
+
+class RationalQuadratic:
+    """k(ζ, ζ') = 1 / (1 + ‖ζ − ζ'‖² / (2 a ℓ²))ᵃ."""
+
+    stationary = True
+
+    def __init__(self, length_scale: float, mixture: float = 1.0):
+        self.length_scale, self.mixture = length_scale, mixture
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        a, b = (np.reshape(x, (len(x), -1)) for x in (a, b))
+        squared = ((a[:, None] - b[None]) ** 2).sum(axis=-1)
+        return (1 + squared / (2 * self.mixture * self.length_scale**2)) ** -self.mixture
+
+
+class Reach(gymnasium.Env):
+    """Environment that uses nothing of guiderail: the action moves a point to the origin."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.point, self.left = self.np_random.uniform(-1, 1, 2), 10
+        return self.point.astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.point, self.left = self.point + 0.3 * np.clip(action, -1, 1), self.left - 1
+        distance = float(np.linalg.norm(self.point))
+        return self.point.astype(np.float32), -distance, distance < 0.1, not self.left, {"success": distance < 0.1}
 
 
 @dataclass(frozen=True)

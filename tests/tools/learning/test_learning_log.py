@@ -88,7 +88,8 @@ def test_wandb_logs_the_values_of_each_episode(tmp_path, monkeypatch):
     log.record(rows[:1], lambda: {"train/critic_loss": 0.1})
     log.record(rows, dict)
     log.close()
-    assert sent == [(7, {"rollout/return": 1.5, "train/critic_loss": 0.1}), (12, {"rollout/return": 2.5})]
+    first = {"rollout/return": 1.5, "rollout/steps": 7, "train/critic_loss": 0.1}
+    assert sent == [(7, first), (12, {"rollout/return": 2.5, "rollout/steps": 5})]
     assert runs[0]["name"] == "run"
     assert runs[0]["resume"] == "allow"
     assert runs[-1] == "finished"
