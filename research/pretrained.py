@@ -3,8 +3,8 @@
     python -m research.pretrained [NAME...] [--out runs/pretrained]
 
 The policies of contact tasks are learned on the arm at `difficulty="hard"`. Each is evaluated on 100 held-out episodes
-with all baseline policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An interrupted
-training is resumed.
+with all baseline policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An
+interrupted training is resumed.
 """
 
 from __future__ import annotations
