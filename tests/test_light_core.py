@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
@@ -56,6 +57,23 @@ def test_primitive_and_templates_run_without_extras():
     print(not {"pydrake", "torch", "pandas"} & set(sys.modules))
     """)
     assert printed.strip() == "True"
+
+
+def test_guided_env_runs_without_extras():
+    printed = run_light(f"""
+    sys.path.insert(0, {str(Path(__file__).parent)!r})
+    import numpy as np
+    from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
+    from guiderail import GuidedEnv, GuidedVectorEnv
+
+    env = GuidedEnv(
+        PointEnv(), demonstrations=demonstrations(), frame=lambda env, o: env.unwrapped.target, pose=pose,
+        to_action=to_action, guidance="skgrl", period=PERIOD,
+    )
+    env.reset(seed=0)
+    print(env.step(np.zeros(3))[4]["phase"], not {{"pydrake", "torch", "pandas"}} & set(sys.modules))
+    """)
+    assert printed.strip() == "0.2 True"
 
 
 @pytest.mark.parametrize(
