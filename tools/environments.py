@@ -1,4 +1,4 @@
-"""Environments by name: known tasks, their options, and `make_environment`."""
+"""Environments by name: tasks, their options, and `make_environment`."""
 
 import hashlib
 import inspect
@@ -12,17 +12,16 @@ from threadpoolctl import threadpool_limits
 
 from guiderail.diagrams.envs.options import Options, validate_options
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_task_folder
+from guiderail.diagrams.tasks.registry import (
+    TASKS,
+    check_task_name,
+    environment_id,
+    is_task_folder,
+    register_task_folder,
+)
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import parse_yaml
-from guiderail.tools.imports import IMPORT_HINT
-
-
-def known_tasks() -> list[str]:
-    """Return the names of all registered tasks and of all environments in the namespace "guiderail"."""
-    registered = (spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
-    return sorted({*TASKS.names(), *registered})
 
 
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
@@ -78,8 +77,7 @@ def task_options(task: str) -> dict[str, Any]:
     """
     if task in TASKS.names():
         return check_environment(task, {})
-    if task not in known_tasks():
-        raise InputError(f"there is no task {brief(task)}: {did_you_mean(task, known_tasks(), IMPORT_HINT)}")
+    check_task_name(task)
     entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
     taken = inspect.signature(creator).parameters.items()

@@ -18,8 +18,6 @@ from typing import Any
 from guiderail.diagrams.tasks.registry import is_task_folder, register_task_folder
 from guiderail.models.common.errors import InputError, brief
 
-IMPORT_HINT = ", or --import the file that registers it"
-
 _IMPORTED_FILES: dict[Path, bytes] = {}  # content of each file when it was imported
 _TRUSTED = ContextVar("trusted", default=False)  # whether imports that a file names may be executed
 

@@ -14,13 +14,14 @@ import gymnasium
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.registry import Registry, did_you_mean
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task
 
     TaskClass = TypeVar("TaskClass", bound=type[Task])
 
+IMPORT_HINT = ", or --import the file that registers it"
 TASKS: Registry[type[Task]] = Registry(
     "task", package="guiderail.diagrams.tasks", decorator="register_task", entry_points="guiderail.tasks"
 )
@@ -45,6 +46,22 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
         return task
 
     return add
+
+
+def known_tasks() -> list[str]:
+    """Return the names of all registered tasks and of all environments in the namespace "guiderail"."""
+    registered = (spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
+    return sorted({*TASKS.names(), *registered})
+
+
+def check_task_name(name: object) -> None:
+    """Refuse a name without a task, without importing any task.
+
+    Raises:
+        InputError: If there is no such task.
+    """
+    if name not in known_tasks():
+        raise InputError(f"there is no task {brief(name)}: {did_you_mean(name, known_tasks(), IMPORT_HINT)}")
 
 
 def _check(name: str, task: type[Task]) -> None:

@@ -38,7 +38,7 @@ def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
 
 
 LISTED: dict[str, Callable[[], list[str]]] = {
-    "tasks": _names("tools.environments", "known_tasks"),
+    "tasks": _names("diagrams.tasks.registry", "known_tasks"),
     "guidance": _names("diagrams.guidance.registry", "GUIDANCE"),
     "stations": _names("diagrams.stations.registry", "STATIONS"),
     "robots": _names("models.robots.robot", "robot_names"),

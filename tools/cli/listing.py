@@ -22,7 +22,8 @@ def list_(
     With a task it lists the options of its environment and of a reset; with metrics, the definition of every number in
     a table. `guiderail list --json` prints everything: each entry with its ports, options and ranges.
     """
-    from guiderail.tools.imports import IMPORT_HINT, import_modules
+    from guiderail.diagrams.tasks.registry import IMPORT_HINT
+    from guiderail.tools.imports import import_modules
 
     import_modules(imports or ())
     name = None if what is None else cli.find_task(what)[0]

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
+from guiderail.diagrams.tasks.registry import check_task_name
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option
@@ -72,6 +73,8 @@ def train(
     """
     task, folders = (None, ()) if task is None else cli.find_task(task)
     modules = (*folders, *(imports or ()))
+    if task is not None and not modules and not resume:
+        check_task_name(task)  # before anything slow is imported
     if imports:
         from guiderail.tools.imports import import_modules
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from guiderail.diagrams.tasks.registry import known_tasks
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import beyond_defaults, known_tasks
+from guiderail.tools.environments import beyond_defaults
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.cache import BASELINES_FOLDER, POLICY, POLICY_FOLDER, policy_digest, stored_episodes
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, evaluate_once
