@@ -278,7 +278,9 @@ class _Assets:
         self._writer.close()
 
     async def read(self, name: str) -> bytes:
-        """Return a file of Meshcat's server; empty if there is none."""
+        """Return a file of Meshcat's server; empty if there is none, or the connection was lost."""
+        if self._reader.at_eof() or self._writer.is_closing():
+            return b""
         with suppress(OSError, asyncio.IncompleteReadError, ValueError):
             async with self._lock:
                 self._writer.write(f"GET /{name} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())

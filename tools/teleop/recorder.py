@@ -38,6 +38,7 @@ PATH = "/guiderail/force"
 SIDE_OFFSET, DOWN_OFFSET, LENGTH, THICKNESS = 0.3, 0.05, 0.3, 0.012
 WARNING_SHARE = 0.7  # share of the limit above which the gauge is red
 BLUE, RED, GRAY = (0.1, 0.5, 0.9, 1.0), (0.9, 0.15, 0.1, 1.0), (0.35, 0.35, 0.35, 0.25)
+MIN_FORCE = 1e-6  # below it a force has no direction [N]
 MIN_LENGTH = 1e-3  # share of the full length, because an arrow without length has no direction
 
 
@@ -73,7 +74,7 @@ class ForceGauge:
         """Show a force (3,) in the world [N]; above the limit, arrow and bar have full length."""
         size = float(np.linalg.norm(force))
         share = float(np.clip(size / self._limit, MIN_LENGTH, 1.0))
-        R = RotationMatrix.MakeFromOneVector(force if size > 0.0 else [0.0, 0.0, 1.0], 2).matrix()
+        R = RotationMatrix.MakeFromOneVector(force if size > MIN_FORCE else [0.0, 0.0, 1.0], 2).matrix()
         arrow = R[:, 2] * share * self._length
         self._meshcat.SetTransform(f"{PATH}/shaft", _scaled_pose(R, self._tail + 0.5 * arrow, share * self._length))
         # The cone's tip is its origin, and it opens along z: it is turned over and moved forward by its height.

@@ -309,3 +309,8 @@ def test_recorder_raises_when_arguments_are_invalid(tmp_path):
 def test_recorder_refuses_a_hardware_station(tmp_path):
     with pytest.raises(InputError, match="recorded in simulation: leave station=hardware out"):
         DemonstrationRecorder("BncConnector", {"station": "hardware"}, tmp_path / "recorded.npz")
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e-12, 1e-3])
+def test_gauge_shows_a_force_of_almost_zero(session, size):
+    session._gauge.show(np.array([size, 0.0, 0.0]))
