@@ -12,10 +12,11 @@ from guiderail.models.common.units import MM
 from guiderail.models.parts.assembly_check import MAX_RESTING_OVERLAP, make_solids, measure_overlap
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import to_arrays, to_manifold
-from guiderail.models.parts.surface_distance import SurfaceLocator
+from guiderail.models.parts.surface_distance import SurfaceLocator, sample_surface
 
 MAX_SHRINK = 0.5 * MM  # largest distance that is offered; parts that overlap more are not drawn assembled [m]
 _SPARE = 0.01 * MM  # clearance left by the offered distance [m]
+_SAMPLES = 1000  # points on the surface of a common volume
 _REGULARIZATION = 1e-3  # relative weight of a vertex that does not move along a face
 
 
@@ -65,7 +66,8 @@ def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
         for other in second:
             common = one ^ other
             if not common.is_empty():
-                points = to_arrays(common)[0]
+                # Corners of the common volume lie on both surfaces: the deepest points are between them.
+                points, _ = sample_surface(*to_arrays(common), _SAMPLES)
                 deepest = max(deepest, float(SurfaceLocator(*to_arrays(other)).find_nearest(points)[1].max()))
     return deepest
 

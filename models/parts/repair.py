@@ -16,7 +16,7 @@ from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
 MAX_MOVED = 1e-4  # largest distance by which a repair may move a surface, beyond which it closes a real hole [m]
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
-_CPU_SECONDS = 30
+_CPU_SECONDS = 60
 _NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
 
 
@@ -124,7 +124,9 @@ def _wrap(name: str, vertices: np.ndarray, triangles: np.ndarray, open_edges: in
             "CAD model, and export it again, or pip install 'guiderail[repair]', which closes small gaps"
         )
     try:
-        points, tetrahedra = run_isolated(tetrahedralize, vertices, triangles, _ENVELOPE, cpu_seconds=_CPU_SECONDS)
+        points, tetrahedra = run_isolated(
+            tetrahedralize, vertices, triangles, _ENVELOPE, 0.15, False, cpu_seconds=_CPU_SECONDS
+        )
         solid = to_manifold(*boundary_of(points, tetrahedra))
     except (IsolatedError, ValueError) as error:
         raise InputError(

@@ -14,7 +14,7 @@ _FLAT = 1e-21  # six times the volume below which a tetrahedron is degenerate [m
 
 
 def tetrahedralize(
-    vertices: np.ndarray, triangles: np.ndarray, tolerance: float, edge: float = 0.15
+    vertices: np.ndarray, triangles: np.ndarray, tolerance: float, edge: float = 0.15, optimize: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points (P, 3) [m] and tetrahedra (N, 4) of the volume of any triangles, crossing or open ones included.
 
@@ -23,6 +23,7 @@ def tetrahedralize(
         triangles: Triangles (T, 3).
         tolerance: Largest deviation of the boundary [m].
         edge: Desired length of an edge, as a fraction of the diagonal of the bounding box.
+        optimize: Whether the shape of the tetrahedra is improved, which takes most of the time.
     """
     scale = 1e3  # tolerances of fTetWild are meant for numbers around one
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
@@ -33,6 +34,7 @@ def tetrahedralize(
             np.ascontiguousarray(triangles, dtype=np.int32),
             edge_length_abs=scale * edge * diagonal,
             epsilon=tolerance / diagonal,
+            optimize=optimize,
             stop_energy=100.0,
             num_opt_iter=5,
             num_threads=1,

@@ -30,7 +30,6 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--pairs", help="names of pairs, separated by commas (default: all)")
     parser.add_argument("--every", type=int, default=1, help="only every so many pairs of those prepared are learned")
     parser.add_argument("--learn", help=f"difficulties that are learned, of {', '.join(DIFFICULTIES)}; with commas")
-    parser.add_argument("--calibrate", action="store_true", help="measure difficulty=hard for each part")
     parser.add_argument("--episodes", type=int, default=150, help="training episodes (default: 150)")
     parser.add_argument("--held-out", type=int, default=100, help="evaluated episodes (default: 100)")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of the training (default: 1)")
@@ -53,7 +52,6 @@ def main(arguments: list[str]) -> None:
     out = given.out.resolve()
     for folder in ("tasks", "runs", "logs", "steps"):
         (out / folder).mkdir(parents=True, exist_ok=True)
-    options = ("--calibrate",) if given.calibrate else ()
     rows: dict[str, dict[str, Any]] = {}
 
     def prepare_pair(pair: Pair) -> None:
@@ -76,7 +74,6 @@ def main(arguments: list[str]) -> None:
                         given.held_out,
                         given.timeout,
                         shrink,
-                        options,
                     ),
                 )
                 rows[pair.name] = {**rows[pair.name], f"{difficulty}-{seed}": found}

@@ -16,7 +16,7 @@ import yaml
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.overlap import OverlapError
+from guiderail.models.parts.overlap import MAX_SHRINK, OverlapError
 from guiderail.tools.parts.create_task import create_task
 from research.parts.pairs import Pair
 
@@ -104,9 +104,9 @@ def _prepare(pair: Pair, folder: Path, log: Path) -> dict[str, Any]:
                 )
             except OverlapError as error:
                 write(str(error))
-                if error.shrink is None or shrink:
+                if error.shrink is None or shrink + error.shrink > MAX_SHRINK:
                     raise StepError(str(error)) from error
-                shrink = error.shrink
+                shrink += error.shrink  # by a little more where that is not enough
             except InputError as error:
                 write(str(error))
                 raise StepError(str(error)) from error
@@ -114,11 +114,11 @@ def _prepare(pair: Pair, folder: Path, log: Path) -> dict[str, Any]:
                 return {**measured, "shrink_mm": 1e3 * shrink}
 
 
-def write_task(pair: Pair, out: Path, timeout: float, shrink: float, options: tuple[str, ...]) -> Path:
+def write_task(pair: Pair, out: Path, timeout: float, shrink: float) -> Path:
     """Create the task folder of a prepared pair and return it."""
     folder, log = out / "tasks" / pair.name, out / "logs" / f"{pair.name}.txt"
     if not (folder / "task.yaml").exists():
-        words = (pair.plug, pair.socket, "--unit", pair.unit, "--shrink", shrink, *options)
+        words = (pair.plug, pair.socket, "--unit", pair.unit, "--shrink", shrink)
         run_guiderail(log, timeout, "create-task", *words, "--out", folder)
     return folder
 
@@ -132,7 +132,6 @@ def learn(
     held_out: int,
     timeout: float,
     shrink: float,
-    options: tuple[str, ...],
 ) -> dict[str, Any]:
     """Create the task, train and evaluate a policy with the task's own defaults, and evaluate baselines.
 
@@ -145,9 +144,8 @@ def learn(
         held_out: Number of evaluated episodes.
         timeout: Wall time of each command [s].
         shrink: Distance by which the plug is smaller [mm].
-        options: Further options of `create-task`.
     """
-    folder = write_task(pair, out, timeout, shrink, options)
+    folder = write_task(pair, out, timeout, shrink)
     run = out / "runs" / f"{pair.name}-{difficulty}-{seed}"
     log = out / "logs" / f"{pair.name}-{difficulty}.txt"
     if not (run / "policy.safetensors").exists():

@@ -13,8 +13,14 @@ _SIZES = (4, 8, 12, 16)
 _FACTORY_PAIRS = {
     "round_8mm_loose": ("factory_round_peg_8mm_loose.obj", "factory_round_hole_8mm_subdiv_3x.obj"),
     "round_8mm_tight": ("factory_round_peg_8mm_tight.obj", "factory_round_hole_8mm_subdiv_3x.obj"),
-    "rectangular_8mm_loose": ("factory_rectangular_peg_8mm_loose.obj", "factory_rectangular_hole_8mm_subdiv_3x.obj"),
-    "rectangular_8mm_tight": ("factory_rectangular_peg_8mm_tight.obj", "factory_rectangular_hole_8mm_subdiv_3x.obj"),
+    "rectangular_8mm_loose": (
+        "factory_rectangular_peg_8mm_loose_subdiv_3x.obj",
+        "factory_rectangular_hole_8mm_subdiv_3x.obj",
+    ),
+    "rectangular_8mm_tight": (
+        "factory_rectangular_peg_8mm_tight_subdiv_3x.obj",
+        "factory_rectangular_hole_8mm_subdiv_3x.obj",
+    ),
     "gear_medium": ("factory_gear_medium_space_5e-4.obj", "factory_gear_base_loose_space_5e-4_subdiv_4x.obj"),
     "nut_m16": ("factory_nut_m16_loose_subdiv_3x.obj", "factory_bolt_m16_loose.obj"),
 }

@@ -32,7 +32,7 @@ from guiderail.tools.files import atomic_folder
 from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact
 
 if TYPE_CHECKING:
-    from guiderail.diagrams.tasks.part.file import PartTaskFile
+    from guiderail.diagrams.tasks.part.file import PartTaskFile, SearchNumbers
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 DENSITY = 2700.0  # density of a part, that of aluminum [kg/m³]; a gantry is weightless
@@ -181,9 +181,10 @@ def create_task(
             return _task_file(parts, surfaces, contact, push, values, [file.name for file in scenario])
 
         choice = choose_contact(folder, surfaces, make_file, tolerance, clearance, say)
-        measured = _measure(folder, make_file(choice.contact, choice.push), choice, prepared, clock, say)
+        task = make_file(choice.contact, choice.push)
+        measured, search = _measure(folder, task, choice, prepared, clock, say)
         if not only_insert:
-            _write_task(folder, make_file(choice.contact, choice.push), choice, measured, clock, say)
+            _write_task(folder, task.model_copy(update={"search": search}), choice, measured, clock, say)
     if only_insert:
         shutil.rmtree(out)
         return measured
@@ -276,9 +277,10 @@ def _measure(
     prepared: dict[str, Any],
     clock: Stopwatch,
     say: Callable[[str], None],
-) -> dict[str, Any]:
-    """Return the measurements of the chosen contact."""
-    from guiderail.tools.parts.trial import insert
+) -> tuple[dict[str, Any], SearchNumbers]:
+    """Return the measurements of the chosen contact, and those that the scripted search uses."""
+    from guiderail.diagrams.tasks.part.file import SearchNumbers
+    from guiderail.tools.parts.trial import insert, measure_lever_sign
 
     inserted_s, contact, aligned = clock.read(), choice.contact, choice.aligned
     misaligned = choice.misaligned or tuple(
@@ -290,7 +292,7 @@ def _measure(
     penetration, clearance = 1e3 * max(trial.penetration for trial in trials), prepared["clearance_mm"]
     if clearance is not None and penetration > 0.5 * clearance:
         say(f"penetration of {penetration:.3f} mm is more than half the clearance ({0.5 * clearance:.3f} mm)")
-    return {
+    measured = {
         **prepared,
         "preparation_s": round(prepared["preparation_s"] + choice.seconds, 2),
         "compliant": contact.compliant,
@@ -306,6 +308,8 @@ def _measure(
         "real_time_factor": round(min(trial.real_time_factor for trial in trials), 2),
         "inserted_s": inserted_s,
     }
+    sign = measure_lever_sign([(xy, trial.recording) for xy, trial in zip(MISALIGNMENTS, misaligned, strict=True)])
+    return measured, SearchNumbers.model_validate({"lever_sign": sign})
 
 
 def _write_task(

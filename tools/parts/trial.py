@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ from guiderail.diagrams.tasks.part.file import PartTaskFile
 from guiderail.diagrams.tasks.part.task import PartInsertion, write_workcell
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
+from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
 from guiderail.models.parts.demonstrator import (
     NUM_DEMONSTRATIONS,
     demonstrator_motions,
@@ -216,6 +219,19 @@ def triangles_of(path: Path) -> np.ndarray:
         elif kind == "f":
             corners.append([int(one.split("/")[0]) - 1 for one in rest])
     return np.array(vertices)[np.array(corners)]
+
+
+def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:
+    """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, and -1 if away from it.
+
+    Args:
+        pushed: Offset (x, y) of the socket [m] and the recording of each trial.
+    """
+    towards = 0.0
+    for offset, recording in pushed:
+        levers = [center_of_pressure(wrench, MIN_CONTACT_FORCE) for wrench in recording["wrench"]]
+        towards += float(np.sum(np.asarray(levers) @ np.asarray(offset)))
+    return 1 if towards > 0.0 else -1
 
 
 def _locator(path: Path) -> SurfaceLocator:

@@ -36,7 +36,7 @@ HARD: dict[str, Any] = {
     "observation": "center_of_pressure",
     "action_repeat": 5,
 }
-"""Options of difficulty="hard" that `create-task --calibrate` replaces by measured ones."""
+"""Options of difficulty="hard": the socket is farther off than a chamfer catches, in every episode elsewhere."""
 
 AUTOMATE: dict[str, Any] = {
     "fixture_offset": "per_episode",
@@ -202,12 +202,15 @@ class Recommended(Options):
 
 
 class SearchNumbers(Options):
-    """Response of a plug on the rim, measured by create-task, which the scripted search uses."""
+    """Response of a plug on the rim, which the scripted search uses."""
 
     lever_sign: int = Field(
-        -1, ge=-1, le=1, description="1 if the center of pressure lies towards the socket's axis, -1 if away from it"
+        -1,
+        ge=-1,
+        le=1,
+        description="1 if the center of pressure lies towards the socket's axis, -1 if away from it, as measured",
     )
-    reach: Number = Field(2.0 * MM, gt=0, le=20 * MM, description="displacement of the command at an action of 1 [m]")
+    reach: Number = Field(3.1 * MM, gt=0, le=20 * MM, description="displacement of the command at an action of 1 [m]")
 
 
 class PartTaskFile(Options):

@@ -132,6 +132,52 @@ def test_created_task_trains_with_its_own_learner(folder):
             validate_options(PartTaskFile, changed | wrong, "task.yaml")
 
 
+def test_difficulties_of_a_created_task_bound_the_offset_and_the_command(folder):
+    from guiderail.diagrams.envs.config import EnvConfig
+
+    for difficulty, is_inside in (
+        ("hard", lambda x, y, *turn: 2.6e-3 <= np.hypot(x, y) <= 3e-3 and not turn),
+        ("automate", lambda x, y, turn: max(abs(x), abs(y)) <= 2e-3 and abs(turn) <= np.deg2rad(5.0)),
+    ):
+        task = EnvConfig.resolve(str(folder), {"difficulty": difficulty}).make_task()
+        options = SimpleNamespace(held_out=False, new_run=False, offset=None)
+        rng = np.random.default_rng(0)
+        offsets = np.array([task.offsets.draw(rng, options)[0] for _ in range(200)])
+        assert all(is_inside(*offset) for offset in offsets)
+        assert (np.ptp(offsets[:, :2], axis=0) > 3.5e-3).all()
+        np.testing.assert_allclose(task.constraints().nearest(np.full(6, 9e-3))[:3], [3.5e-3, 3.5e-3, 9e-3])
+    corners = [offset for offset in offsets if np.hypot(*offset[:2]) > 2e-3]
+    assert corners, "a square, not a disc"
+
+
+def test_bound_is_refused_when_the_bounds_of_the_file_change(folder):
+    from guiderail.diagrams.envs.config import EnvConfig
+    from guiderail.diagrams.tasks.part.file import Bounds
+
+    task = EnvConfig.resolve(str(folder), {"bound": 3e-3}).make_task()
+    row = (-1e-3, -1e-3, *[None] * 4), (1e-3, 1e-3, *[None] * 4)
+    phases = Bounds.model_validate({"lower": (row[0],) * 2, "upper": (row[1],) * 2, "phases": (0.0, 0.5)})
+    task.file = task.file.model_copy(update={"bounds": phases})
+    with pytest.raises(InputError, match="bound replaces constant bounds"):
+        task.constraints()
+
+
+def test_scripted_search_follows_the_measured_side_of_the_contact(folder):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.diagrams.tasks.part.task import CENTER_OF_PRESSURE, Z, scripted_search
+
+    file = read_task_file(folder)
+    assert file.search.lever_sign == -1  # a peg stands on its outer side
+    observation = np.zeros(17)
+    observation[CENTER_OF_PRESSURE] = 1.0, 0.0
+    on_rim, inserted = file.motion.rim, 0.5 * file.motion.rim
+    for height, direction in ((on_rim, -1.0), (inserted, 0.0)):
+        observation[Z] = height / (0.5 * file.motion.travel) - 1.0
+        np.testing.assert_array_equal(np.sign(scripted_search(file, observation)), [direction, 0.0])
+    with pytest.raises(InputError, match="needs the center of pressure"):
+        scripted_search(file, observation[:13])
+
+
 def test_options_of_a_created_task_are_listed(folder, capsys):
     call("list", folder)
     assert "offset_range" in capsys.readouterr().out

@@ -1,0 +1,51 @@
+"""The benchmark finds pairs by their names, stores each step and gives the reason of a failure."""
+
+import json
+
+import pytest
+
+pytest.importorskip("trimesh")
+pytest.importorskip("manifold3d")
+pytest.importorskip("igl")
+
+from guiderail.models.common.errors import InputError
+from research.parts.campaign import StepError, finish
+from research.parts.pairs import find_pairs
+from research.parts.table import summarize, write_tables
+
+
+def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_path):
+    names = (
+        "a/asset_plug.obj", "a/asset_socket.obj", "b/plug.stl", "b/socket.stl", "c/plug.stl",
+        "d/industreal_gear_small.obj", "d/industreal_gear_base.obj",
+    )  # fmt: skip
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert [pair.name for pair in find_pairs(tmp_path)] == ["a", "b", "industreal_gear_small"]
+    with pytest.raises(InputError, match="has no pairs"):
+        find_pairs(tmp_path / "c")
+
+
+def test_finished_steps_are_not_repeated(tmp_path):
+    def fail():
+        raise StepError("too intricate")
+
+    assert finish(tmp_path / "a.json", lambda: {"inserted": True}) == {"inserted": True}
+    assert finish(tmp_path / "a.json", fail) == {"inserted": True}
+    assert finish(tmp_path / "b.json", fail) == {"error": "too intricate"}
+    assert json.loads((tmp_path / "b.json").read_text()) == {"error": "too intricate"}
+
+
+def test_tables_hold_measurements_and_reasons(tmp_path):
+    good = {"inserted": True, "clearance_mm": 0.1, "penetration_pushed_on_the_rim_mm": 0.06, "real_time_factor": 9.0}
+    good |= {"preparation_s": 1.0, "inserted_s": 2.0, "hard-0": {"success_rate": 0.98}}
+    rows = {"a": good, "b": {"error": "the parts overlap | here"}}
+    write_tables(tmp_path, rows)
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    assert len({line.count(" | ") for line in lines}) == 1
+    assert "0.98" in lines[2]
+    summary = summarize(rows)
+    assert (summary["pairs"], summary["prepared"], summary["inserted"]) == (2, 1, 1)
+    assert summary["deeper than half the clearance"] == 1
+    assert summary["reasons"] == {"b": "the parts overlap | here"}
