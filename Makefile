@@ -7,7 +7,7 @@ OUTSIDE := .venv-outside
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results kills fuzz mutants forces injections scaling fci outside newest clean
+.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling fci outside newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -45,6 +45,9 @@ gallery: $(VENV)/.ready  ## render the animations of docs/gallery.md, minutes
 
 results: $(VENV)/.ready  ## write the pages of results and the table of the README
 	$(BIN)/python -m research.results
+
+pretrained: $(VENV)/.ready  ## train and evaluate the policies that come with the package, an hour or two
+	$(BIN)/python -m research.pretrained
 
 kills: $(VENV)/.ready  ## kill training runs at random instants, minutes
 	$(BIN)/python tests/harness/kills/kill.py --kills 40

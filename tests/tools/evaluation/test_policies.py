@@ -24,6 +24,7 @@ from guiderail.tools.evaluation.policies import (
 )
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.pretrained import find_run
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
 OBSERVATION = np.array([0.1, -0.2, 0.3], np.float32)
 
@@ -206,6 +207,19 @@ def test_environment_of_another_origin_is_evaluated():
 def test_pretrained_name_that_does_not_exist_is_refused():
     with pytest.raises(InputError, match="there is no pretrained policy 'toaster'"):
         find_run("pretrained:toaster")
+
+
+def test_pretrained_policy_is_evaluated_without_writing_into_the_package(bead_run, tmp_path, monkeypatch):
+    folder = tmp_path / "package" / "bead"
+    folder.mkdir(parents=True)
+    for name in ("config.yaml", "policy.json", "policy.safetensors"):
+        (folder / name).write_bytes((bead_run / name).read_bytes())
+    monkeypatch.setattr("guiderail.tools.pretrained.PRETRAINED_FOLDER", folder.parent)
+    result = evaluate("pretrained:bead", episodes=2, baselines=["constant"])
+    assert result["mean_return"] == evaluate(bead_run, episodes=2, baselines=())["mean_return"]
+    assert result["trained_episodes"] is None
+    assert EpisodeSpec.of_policy("pretrained:bead").run is None
+    assert len(list(folder.iterdir())) == 3
 
 
 def test_policy_folder_is_loaded_without_code(tmp_path):
