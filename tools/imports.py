@@ -58,7 +58,8 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
             names.append(_import_or_refuse(module, partial(import_module, module)).__name__)
         else:
             kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
-            raise InputError(f"there is no {kind} {module} to import: restore it, or give another --import")
+            shown = module if module.isprintable() else brief(module)
+            raise InputError(f"there is no {kind} {shown} to import: restore it, or give another --import")
     return tuple(names)
 
 
