@@ -12,6 +12,8 @@ from .energy_tank import EnergyTank as EnergyTank
 from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
 from .episode_monitor import TerminationTerm as TerminationTerm
+from .external_torque_sensor import ExternalTorqueSensor as ExternalTorqueSensor
+from .external_torque_sensor import JointTorqueErrors as JointTorqueErrors
 from .function_guidance_system import FunctionGuidanceSystem as FunctionGuidanceSystem
 from .gripper_command import GripperCommand as GripperCommand
 from .heartbeat_monitor import HeartbeatMonitor as HeartbeatMonitor
@@ -49,3 +51,4 @@ from .torque_safety_limiter import ArmState as ArmState
 from .torque_safety_limiter import SafetyLimits as SafetyLimits
 from .torque_safety_limiter import TorqueSafetyLimiter as TorqueSafetyLimiter
 from .wrench_sensor import WrenchSensor as WrenchSensor
+from .wrench_tare import WrenchTare as WrenchTare

@@ -1,4 +1,4 @@
-"""Sensor with scale error, bias, noise and delay."""
+"""Sensor with scale error, bias, drift, noise, delay and resolution."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
@@ -6,62 +6,95 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
+DRIFT_TIME = 10.0
+"""Time after which a drift has the given standard deviation [s]."""
+
 
 class SensorDisturbance(LeafSystem):
-    """Add scale error, bias, white noise and delay to a measurement.
+    """Add scale error, bias, drift, white noise, delay and rounding to a measurement.
 
-        y = s ∘ u(t − k h) + b + σ ∘ n,  n ~ N(0, 1), sampled once per period h
+        y = s ∘ u(t − k h) + b + C (x − x₀) + d + σ ∘ n,  n ~ N(0, 1), sampled once per period h
 
-    s, b and the seed of the noise are parameters, which a reset samples and restores. An initialization restarts the
-    noise and fills the delay line with zeros.
+    and then rounded to whole multiples of the resolution. s, b, C, k and the seed of noise and drift are parameters,
+    which a reset samples and restores. d is a random walk, and x₀ the configuration x at the initialization. An
+    initialization restarts the noise and fills the delay line with zeros.
 
     .. pydrake_system::
 
         name: SensorDisturbance
         input_ports:
         - measurement
+        - configuration (if its size is not 0)
         output_ports:
         - disturbed_measurement
 
-    Both are (n,), in the units of the sensor.
+    ``measurement`` and ``disturbed_measurement`` are (n,), in the units of the sensor. ``configuration`` is (m,).
 
     Args:
-        period: Period h of noise and delay [s], positive.
+        period: Period h of noise, drift and delay [s], positive.
         noise: Standard deviations σ, (n,), not negative.
-        delay: k periods, at least 0.
+        delay: Largest delay in periods, at least 0; k is 1 or more and by default this.
+        drift: Standard deviations of d after `DRIFT_TIME`, (n,), not negative; none by default.
+        resolution: Steps of the output, (n,), not negative; 0 for no rounding, the default.
+        configuration_size: m.
 
     Raises:
         InputError: If an argument is out of range.
     """
 
-    def __init__(self, period: float, noise: np.ndarray, delay: int = 0):
+    def __init__(
+        self,
+        period: float,
+        noise: np.ndarray,
+        delay: int = 0,
+        *,
+        drift: np.ndarray | None = None,
+        resolution: np.ndarray | None = None,
+        configuration_size: int = 0,
+    ):
         super().__init__()
         check_period(period)
         self._noise = np.array(noise, dtype=float)
-        if self._noise.ndim != 1 or not (np.isfinite(self._noise) & (self._noise >= 0.0)).all():
+        if self._noise.ndim != 1 or not _are_magnitudes(self._noise, self._noise.shape):
             raise InputError(f"a sensor's noise is a standard deviation for each of its numbers, not {noise}")
         if delay < 0:
             raise InputError(f"a sensor's delay is a number of periods from 0, not {delay}")
         size, self._delay = len(self._noise), delay
+        self._drift = np.zeros(size) if drift is None else np.array(drift, dtype=float)
+        self._resolution = np.zeros(size) if resolution is None else np.array(resolution, dtype=float)
+        for name, values in (("drift", self._drift), ("resolution", self._resolution)):
+            if not _are_magnitudes(values, (size,)):
+                raise InputError(f"a sensor's {name} is a number from 0 for each of its numbers, not {values}")
+        self._step = np.sqrt(period / DRIFT_TIME)
         self._scale = self.DeclareNumericParameter(BasicVector(np.ones(size)))
         self._bias = self.DeclareNumericParameter(BasicVector(np.zeros(size)))
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
+        self._used_delay = self.DeclareNumericParameter(BasicVector(np.full(1, float(delay))))
+        self._gradient = self.DeclareNumericParameter(BasicVector(np.zeros(max(size * configuration_size, 1))))
         self._count = self.DeclareDiscreteState(1)
         self._noise_sample = self.DeclareDiscreteState(size)  # n
+        self._walk = self.DeclareDiscreteState(size)  # d
+        self._first_configuration = self.DeclareDiscreteState(configuration_size) if configuration_size else None
         self._delay_line = self.DeclareDiscreteState(delay * size) if delay else None  # oldest measurement first
         self._measurement_port = self.DeclareVectorInputPort("measurement", size)
-        source = (
+        self._configuration_port = (
+            self.DeclareVectorInputPort("configuration", configuration_size) if configuration_size else None
+        )
+        sources = {
             self._measurement_port.ticket()
             if self._delay_line is None
             else self.discrete_state_ticket(self._delay_line)
-        )
+        }
+        if self._configuration_port is not None:
+            sources |= {self._configuration_port.ticket(), self.discrete_state_ticket(self._first_configuration)}
         self._disturbed_measurement_port = self.DeclareVectorOutputPort(
             "disturbed_measurement",
             size,
             self._calc_disturbed_measurement,
-            prerequisites_of_calc={
-                source,
+            prerequisites_of_calc=sources
+            | {
                 self.discrete_state_ticket(self._noise_sample),
+                self.discrete_state_ticket(self._walk),
                 self.all_parameters_ticket(),
             },
         )
@@ -69,27 +102,49 @@ class SensorDisturbance(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     get_measurement_input_port = input_getter("measurement", "undisturbed measurement, (n,)")
+    get_configuration_input_port = input_getter("configuration", "configuration, (m,), if its size is not 0")
     get_disturbed_measurement_output_port = output_getter("disturbed_measurement", "disturbed measurement, (n,)")
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
-        """Set s and b, (n,) each, and the seed of the noise; `context` is this system's."""
+        """Set s and b, (n,) each, and the seed of noise and drift; `context` is this system's."""
         for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
+
+    def set_delay(self, context: Context, delay: int) -> None:
+        """Set k; `context` is this system's.
+
+        Raises:
+            InputError: If it is not from 1 to the largest delay.
+        """
+        if not 1 <= delay <= self._delay:
+            raise InputError(f"the delay of this sensor is from 1 to {self._delay} periods, not {delay}")
+        context.get_mutable_numeric_parameter(self._used_delay).SetAtIndex(0, float(delay))
+
+    def set_gradient(self, context: Context, gradient: np.ndarray) -> None:
+        """Set C, (n, m), of a sensor with a configuration; `context` is this system's."""
+        context.get_mutable_numeric_parameter(self._gradient).SetFromVector(np.ravel(gradient))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         size = len(self._noise)
         discrete_state.set_value(self._count, np.zeros(1))
         discrete_state.set_value(self._noise_sample, np.zeros(size))
+        discrete_state.set_value(self._walk, np.zeros(size))
+        if self._configuration_port is not None:
+            discrete_state.set_value(self._first_configuration, self._configuration_port.Eval(context))
         if self._delay_line is not None:
             discrete_state.set_value(self._delay_line, np.zeros(self._delay * size))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value() + 1.0
         discrete_state.set_value(self._count, count)
-        if self._noise.any():
+        if self._noise.any() or self._drift.any():
             seed = context.get_numeric_parameter(self._seed).value()[0]
-            sample = np.random.default_rng([int(seed), int(count[0])]).standard_normal(len(self._noise))
-            discrete_state.set_value(self._noise_sample, sample)
+            rng = np.random.default_rng([int(seed), int(count[0])])
+            discrete_state.set_value(self._noise_sample, rng.standard_normal(len(self._noise)))
+            if self._drift.any():
+                walk = context.get_discrete_state(self._walk).value()
+                step = self._step * self._drift * rng.standard_normal(len(self._drift))
+                discrete_state.set_value(self._walk, walk + step)
         if self._delay_line is not None:
             line = context.get_discrete_state(self._delay_line).value()
             newest = self._measurement_port.Eval(context)
@@ -99,7 +154,24 @@ class SensorDisturbance(LeafSystem):
         if self._delay_line is None:
             measured = self._measurement_port.Eval(context)
         else:
-            measured = context.get_discrete_state(self._delay_line).value()[: len(self._noise)]
+            skipped = self._delay - int(context.get_numeric_parameter(self._used_delay).value()[0])
+            size = len(self._noise)
+            measured = context.get_discrete_state(self._delay_line).value()[skipped * size :][:size]
         scale, bias = (context.get_numeric_parameter(index).value() for index in (self._scale, self._bias))
         noise = self._noise * context.get_discrete_state(self._noise_sample).value()
-        output.SetFromVector(scale * measured + bias + noise)
+        disturbed = scale * measured + bias + noise
+        if self._drift.any():
+            disturbed = disturbed + context.get_discrete_state(self._walk).value()
+        if self._configuration_port is not None:
+            moved = self._configuration_port.Eval(context)
+            moved = moved - context.get_discrete_state(self._first_configuration).value()
+            gradient = context.get_numeric_parameter(self._gradient).value().reshape(len(noise), -1)
+            disturbed = disturbed + gradient @ moved
+        if self._resolution.any():
+            step = np.where(self._resolution > 0.0, self._resolution, 1.0)
+            disturbed = np.where(self._resolution > 0.0, np.round(disturbed / step) * step, disturbed)
+        output.SetFromVector(disturbed)
+
+
+def _are_magnitudes(values: np.ndarray, shape: tuple[int, ...]) -> bool:
+    return values.shape == shape and bool((np.isfinite(values) & (values >= 0.0)).all())

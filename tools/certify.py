@@ -17,6 +17,7 @@ import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.diagrams.stations.disturbances import Disturbances
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import QUANTITIES, Adversary, AttackResult
@@ -286,12 +287,17 @@ def _find_corrected_steps(loop: CertifiedLoop, certified: CertifiedBounds) -> np
 
 def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndarray:
     """Return the largest start offset (O,) of the environment's history: that of a reset plus a pose's error."""
-    declared = EnvConfig.resolve(task, options).make_task().start_within()
+    config = EnvConfig.resolve(task, options)
+    declared = config.make_task().start_within()
     try:
         within = np.array(np.broadcast_to(declared, size), dtype=float)
     except (TypeError, ValueError):
         raise InputError(f"start_within of {task} is a number, or {size} of them, not {brief(declared)}") from None
-    within[:3] += float(options.get("pose_bias", 0.0))
+    disturbances = config.parts["disturbances"]
+    if isinstance(disturbances, Disturbances):
+        errors = disturbances.errors
+        within[:3] += disturbances.pose_bias
+        within += np.repeat(errors.calibration_error, 3) + 0.5 * np.repeat(errors.pose_resolution, 3)
     return within
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +15,7 @@ from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.stations.impedance_control import add_impedance_control
 from guiderail.diagrams.stations.registry import register_station
+from guiderail.diagrams.stations.sensing import JointTorqueAccuracy
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
@@ -34,10 +37,13 @@ from guiderail.models.robots.robot import (
     find_end_effector,
     find_robot,
 )
+from guiderail.systems.external_torque_sensor import ExternalTorqueSensor, JointTorqueErrors
 from guiderail.systems.gripper_command import GripperCommand
+from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.wrench_sensor import WrenchSensor
 
+WRENCH_ESTIMATE_TIME_CONSTANT = 0.02  # of the filter of a wrench that is estimated from joint torques [s]
 # Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.
 MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
@@ -184,6 +190,12 @@ class ArmStation(Station):
     ==================  =========  ====================================================================================
 
     A gripper's force is limited by its actuators. For controller and wrench sensor it is a rigid, open tool.
+
+    With `joint_torque`, `wrench` is estimated from joint torques that have errors, as by a `HardwareStation`, and the
+    wrist's exact wrench is the port `exact_wrench`.
+
+    Attributes:
+        estimates_wrench: True if the wrench is estimated from joint torques.
     """
 
     wraps_angles = True
@@ -197,6 +209,7 @@ class ArmStation(Station):
         *,
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+        joint_torque: JointTorqueAccuracy | None = None,
     ):
         """Construct the station.
 
@@ -208,8 +221,11 @@ class ArmStation(Station):
             wrench_time_constant: Time constant of the wrench sensor's low-pass filter [s].
             robot: The arm, or its name: see `robot_names()`.
             end_effector: The tool, or its name: see `end_effector_names()`.
+            joint_torque: Errors of the joint torques from which the wrench is estimated; None for a sensor at the
+                wrist.
         """
         super().__init__()
+        self.estimates_wrench, self._joint_torque = joint_torque is not None, joint_torque
         builder = DiagramBuilder()
         end_effector = find_end_effector(end_effector)
         if time_step is None:
@@ -224,13 +240,17 @@ class ArmStation(Station):
         )
         builder.AddNamedSystem("wrench_sensor", sensor)
         sensor.connect(builder, plant)
+        wrench = sensor.get_wrench_output_port()
+        if joint_torque is not None:
+            builder.ExportOutput(wrench, "exact_wrench")
+            wrench = self._add_wrench_estimate(builder, joint_torque)
         torque = add_impedance_control(
             builder,
             self._controller_plant,
             impedance,
             CONTROL_PERIOD,
             state=plant.get_state_output_port(arm.model),
-            wrench=sensor.get_wrench_output_port(),
+            wrench=wrench,
         )
         builder.Connect(torque, plant.get_actuation_input_port(arm.model))
         if arm.gripper:
@@ -251,7 +271,74 @@ class ArmStation(Station):
         """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
+    def _add_wrench_estimate(self, builder: DiagramBuilder, accuracy: JointTorqueAccuracy) -> OutputPort:
+        """Add joint torque sensors and the estimate of the wrench; return its port."""
+        model, plant, arm = self._controller_plant, self.plant, self.arm
+        largest, n = model.plant.GetEffortUpperLimits(), model.plant.num_positions()
+        self._torque_sensor = builder.AddNamedSystem(
+            "torque_sensor",
+            ExternalTorqueSensor(
+                model.plant,
+                model.arm.tool[0],
+                accuracy.noise * largest,
+                accuracy.drift * largest,
+                period=plant.time_step(),
+            ),
+        )
+        estimate = builder.AddNamedSystem(
+            "wrench_estimate",
+            JointTorqueWrench(
+                model.plant,
+                model.target,
+                model.tool_center,
+                period=plant.time_step(),
+                time_constant=WRENCH_ESTIMATE_TIME_CONSTANT,
+            ),
+        )
+        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
+        state, contact = (
+            plant.get_state_output_port(arm.model),
+            plant.get_generalized_contact_forces_output_port(arm.model),
+        )
+        builder.Connect(state, self._torque_sensor.get_state_input_port())
+        builder.Connect(contact, self._torque_sensor.get_contact_torque_input_port())
+        builder.Connect(state, positions.get_input_port())
+        builder.Connect(positions.get_output_port(), estimate.get_positions_input_port())
+        builder.Connect(
+            self._torque_sensor.get_external_torque_output_port(), estimate.get_external_torque_input_port()
+        )
+        return estimate.get_wrench_output_port()
+
+    def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
+        """Sample the errors of joint torques, if the wrench is estimated from them."""
+        if self._joint_torque is None:
+            return {}
+        a, sensor, plant = self._joint_torque, self._torque_sensor, self._controller_plant.plant
+        largest, bodies = plant.GetEffortUpperLimits(), len(sensor.bodies)
+        tool = {int(body.index()) for body in self._controller_plant.arm.tool}
+        masses = np.array([body.default_mass() for body in sensor.bodies])
+        is_tool = np.array([int(body.index()) in tool for body in sensor.bodies])
+        errors = JointTorqueErrors(
+            gain=a.gain * rng.uniform(-1.0, 1.0, len(largest)),
+            offset=a.offset * largest * rng.uniform(-1.0, 1.0, len(largest)),
+            friction=a.friction * largest * rng.uniform(0.0, 1.0, len(largest)),
+            mass=np.where(is_tool, 0.0, a.mass * masses) * rng.uniform(-1.0, 1.0, bodies),
+            center=a.center * rng.uniform(-1.0, 1.0, (bodies, 3)),
+        )
+        payload = a.payload * rng.uniform(-1.0, 1.0)
+        own = sensor.GetMyMutableContextFromRoot(context)
+        sensor.set_errors(own, errors, int(rng.integers(2**31)))
+        sensor.add_payload(own, payload)
+        return {
+            "torque_offset": errors.offset,
+            "torque_gain": errors.gain,
+            "torque_friction": errors.friction,
+            "payload_error": payload,
+        }
+
     def set_payload(self, context: Context, mass: float) -> None:
         """Add a mass [kg] to the tool that controller and sensor do not model; `context` is the root context."""
         own, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
         tool.SetMass(own, tool.default_mass() + mass)
+        if self._joint_torque is not None:
+            self._torque_sensor.add_payload(self._torque_sensor.GetMyMutableContextFromRoot(context), mass)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from pydantic import Field, field_validator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Adder, ConstantVectorSource
 
 from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
+from guiderail.diagrams.stations.sensing import SENSING, TARE_AVERAGED, TARE_SKIPPED, Sensing, SensorErrors
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     OUTPUTS,
@@ -21,12 +23,14 @@ from guiderail.diagrams.stations.station import (
     export_station_ports,
 )
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
 from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance
+from guiderail.systems.wrench_tare import WrenchTare
 
 MAX_FACTOR = 100.0
 """Largest factor of a disturbance; its inverse is the smallest."""
+MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; more was probably meant in millimetres or degrees
 
 
 def _factors(quantity: str) -> Any:
@@ -34,23 +38,46 @@ def _factors(quantity: str) -> Any:
 
 
 def _magnitudes(description: str) -> Any:
-    return Field((0.0, 0.0), min_length=2, max_length=2, description=description)
+    return Field(None, min_length=2, max_length=2, description=f"{description}; default: that of sensing")
 
 
 class Disturbances(Options):
     """Options of environments with a workcell: constant disturbances, and ranges that every episode samples from.
 
-    A policy can be trained with one range and evaluated with another.
+    A policy can be trained with one range and evaluated with another. `sensing` sets all errors of the sensors by one
+    name; an error that is given as well replaces that of the name.
     """
 
+    sensing: Sensing = Field(
+        "exact",
+        description="errors of the sensors: exact has none, wrist is a force-torque sensor at the wrist, robot "
+        "estimates the wrench from joint torques; both are tared",
+    )
     friction_factor: Numbers = _factors("all friction, sampled every episode")
     modulus_factor: Numbers = _factors("the contact's stiffness, sampled every episode")
-    wrench_scale: Numbers = _factors("the measured wrench, sampled every episode")
-    wrench_bias: Numbers = _magnitudes(
+    wrench_scale: Numbers | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description="smallest and largest factor of the measured wrench, sampled every episode; default: that of "
+        "sensing",
+    )
+    wrench_bias: Numbers | None = _magnitudes(
         "largest offset of the measured wrench, sampled every episode: force [N], torque [Nm]"
     )
-    wrench_noise: Numbers = _magnitudes("standard deviation of the measured wrench: force [N], torque [Nm]")
-    wrench_delay: Integer = Field(0, ge=0, le=50, description="delay of the measured wrench in control steps")
+    wrench_drift: Numbers | None = _magnitudes(
+        "standard deviation after 10 s of a random walk of the measured wrench: force [N], torque [Nm]"
+    )
+    wrench_noise: Numbers | None = _magnitudes("standard deviation of the measured wrench: force [N], torque [Nm]")
+    wrench_delay: Integer | None = Field(
+        None, ge=0, le=50, description="delay of the measured wrench in control steps; default: that of sensing"
+    )
+    calibration_error: Numbers | None = _magnitudes(
+        "largest error of the robot's kinematics, sampled every episode: position [m], orientation [rad]"
+    )
+    tare: bool | None = Field(
+        None, description="subtract the wrench measured at the start, in free motion; default: that of sensing"
+    )
     pose_bias: Number = Field(
         0.0, ge=0, le=0.01, description="largest offset of measured x, y, z, sampled every episode [m]"
     )
@@ -66,31 +93,70 @@ class Disturbances(Options):
 
     @field_validator("friction_factor", "modulus_factor", "wrench_scale")
     @classmethod
-    def _check_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if not 1.0 / MAX_FACTOR <= value[0] <= value[1] <= MAX_FACTOR:
+    def _check_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and not 1.0 / MAX_FACTOR <= value[0] <= value[1] <= MAX_FACTOR:
             raise ValueError(f"give two factors from {1.0 / MAX_FACTOR} to {MAX_FACTOR}, the smaller one first")
         return value
 
-    @field_validator("wrench_bias", "wrench_noise")
+    @field_validator("wrench_bias", "wrench_drift", "wrench_noise", "calibration_error")
     @classmethod
-    def _check_magnitudes(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if min(value) < 0.0:
-            raise ValueError("give a force and a torque, none negative")
+    def _check_magnitudes(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and min(value) < 0.0:
+            raise ValueError("give two numbers, none negative")
         return value
+
+    @field_validator("calibration_error")
+    @classmethod
+    def _check_calibration(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and max(value) > MAX_CALIBRATION_ERROR:
+            raise ValueError(f"give a position in metres and an angle in radians, at most {MAX_CALIBRATION_ERROR}")
+        return value
+
+    @property
+    def errors(self) -> SensorErrors:
+        """Errors of the sensors: those of `sensing`, with the given ones in their place.
+
+        Joint torques have their own errors: a given scale replaces their gain, a bias their offset and the errors of
+        the arm's model, a drift and a noise their own.
+        """
+        errors = SENSING[self.sensing]
+        given: dict[str, Any] = {
+            field.name: getattr(self, field.name)
+            for field in fields(SensorErrors)
+            if getattr(self, field.name, None) is not None
+        }
+        joint_torque = errors.joint_torque
+        if joint_torque is not None:
+            none = {
+                "wrench_scale": {"gain": 0.0},
+                "wrench_bias": {"offset": 0.0, "mass": 0.0, "center": 0.0, "payload": 0.0},
+                "wrench_drift": {"drift": 0.0, "friction": 0.0},
+                "wrench_noise": {"noise": 0.0},
+            }
+            for name, replaced in none.items():
+                joint_torque = replace(joint_torque, **(replaced if name in given else {}))
+        if "wrench_delay" in given:
+            given["wrench_delay"] = (given["wrench_delay"],) * 2
+        return replace(errors, **given, joint_torque=joint_torque)
 
     @property
     def any(self) -> bool:
         """True if any disturbance is on."""
-        return self != type(self).model_validate({})
+        undisturbed = type(self).model_validate({})
+        given = {field.name: None for field in fields(SensorErrors) if field.name in type(self).model_fields}
+        return self.errors != undisturbed.errors or self.model_copy(update=given) != undisturbed
 
 
 SIMULATION_PORTS = ("query", "body_poses")
+EXACT_WRENCH = "exact_wrench"
+"""Port of the wrench without errors of sensors, (6,)."""
 
 
 class DisturbedStation(Station):
     """A station with disturbances between its ports and those of the inner station.
 
     Measured pose and wrench are disturbed; success and the contact force, by which collisions are detected, are not.
+    A further output, `exact_wrench`, is the wrench without errors.
     """
 
     def __init__(self, station: Station, disturbances: Disturbances):
@@ -111,19 +177,22 @@ class DisturbedStation(Station):
         self._commands = commands = builder.AddNamedSystem(
             "commands", CommandDisturbance(POSE_SIZE, period, d.lost_commands, d.late_commands)
         )
-        self._wrench = wrench = builder.AddNamedSystem(
-            "wrench", SensorDisturbance(period, np.repeat(d.wrench_noise, 3), d.wrench_delay)
+        e = self._errors = _without_replaced_errors(d, station)
+        self._calibration: list[ConstantVectorSource] = []
+        self._pose = pose = builder.AddNamedSystem(
+            "pose", SensorDisturbance(period, np.zeros(POSE_SIZE), resolution=np.repeat(e.pose_resolution, 3))
         )
-        self._pose = pose = builder.AddNamedSystem("pose", SensorDisturbance(period, np.zeros(POSE_SIZE)))
-        builder.Connect(commands.get_delivered_command_output_port(), station.get_desired_pose_input_port())
-        builder.Connect(station.get_pose_output_port(), commands.get_pose_input_port())
-        builder.Connect(station.get_wrench_output_port(), wrench.get_measurement_input_port())
-        builder.Connect(station.get_pose_output_port(), pose.get_measurement_input_port())
+        delivered, measured = commands.get_delivered_command_output_port(), station.get_pose_output_port()
+        if any(e.calibration_error):
+            delivered = self._add_constant(builder, "calibration_of_commands", delivered)
+            measured = self._add_constant(builder, "calibration_of_poses", measured)
+        builder.Connect(delivered, station.get_desired_pose_input_port())
+        builder.Connect(measured, pose.get_measurement_input_port())
+        builder.Connect(pose.get_disturbed_measurement_output_port(), commands.get_pose_input_port())
+        wrench = self._add_wrench(builder, station.get_wrench_output_port(), measured)
+        exact = station.GetOutputPort(EXACT_WRENCH if station.HasOutputPort(EXACT_WRENCH) else "wrench")
         outputs = {name: station.GetOutputPort(name) for name in OUTPUTS}
-        outputs |= {
-            "pose": pose.get_disturbed_measurement_output_port(),
-            "wrench": wrench.get_disturbed_measurement_output_port(),
-        }
+        outputs |= {"pose": pose.get_disturbed_measurement_output_port(), "wrench": wrench}
         export_station_ports(
             builder,
             commands.get_command_input_port(),
@@ -133,7 +202,51 @@ class DisturbedStation(Station):
         )
         for name in SIMULATION_PORTS:
             builder.ExportOutput(station.GetOutputPort(name), name)
+        builder.ExportOutput(exact, EXACT_WRENCH)
         builder.BuildInto(self)
+
+    def _add_constant(self, builder: DiagramBuilder, name: str, port: OutputPort) -> OutputPort:
+        """Add a pose to `port` that a reset sets; return the port of the sum."""
+        source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(POSE_SIZE)))
+        total = builder.AddNamedSystem(f"{name}_added", Adder(2, POSE_SIZE))
+        builder.Connect(port, total.get_input_port(0))
+        builder.Connect(source.get_output_port(), total.get_input_port(1))
+        self._calibration.append(source)
+        return total.get_output_port()
+
+    def _add_wrench(self, builder: DiagramBuilder, wrench: OutputPort, pose: OutputPort) -> OutputPort:
+        """Add errors, tare and delay of the wrench; return the port of what is measured.
+
+        A robot tares its own sensor; the delay is that of the way to the policy.
+        """
+        e, period = self._errors, self.control_period
+        delay, has_gradient = e.wrench_delay[1], any(e.wrench_gradient)
+        self._wrench = builder.AddNamedSystem(
+            "wrench",
+            SensorDisturbance(
+                period,
+                np.repeat(e.wrench_noise, 3),
+                0 if e.tare else delay,
+                drift=np.repeat(e.wrench_drift, 3),
+                configuration_size=POSE_SIZE if has_gradient else 0,
+            ),
+        )
+        builder.Connect(wrench, self._wrench.get_measurement_input_port())
+        if has_gradient:
+            builder.Connect(pose, self._wrench.get_configuration_input_port())
+        self._delay = self._wrench if delay and not e.tare else None
+        measured: OutputPort = self._wrench.get_disturbed_measurement_output_port()
+        if e.tare:
+            tare = builder.AddNamedSystem("tare", WrenchTare(period, TARE_SKIPPED, TARE_AVERAGED))
+            builder.Connect(measured, tare.get_measured_wrench_input_port())
+            measured = tare.get_tared_wrench_output_port()
+            if delay:
+                self._delay = builder.AddNamedSystem(
+                    "wrench_delay", SensorDisturbance(period, np.zeros(WRENCH_SIZE), delay)
+                )
+                builder.Connect(measured, self._delay.get_measurement_input_port())
+                measured = self._delay.get_disturbed_measurement_output_port()
+        return measured
 
     @property
     def nominal_period(self) -> float:
@@ -146,15 +259,13 @@ class DisturbedStation(Station):
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the disturbances of an episode, and return them by name."""
-        d = self._disturbances
+        d, e = self._disturbances, self._errors
         friction, modulus = (_sample_factor(rng, factors) for factors in (d.friction_factor, d.modulus_factor))
-        scale, seed = _sample_factor(rng, d.wrench_scale), int(rng.integers(2**31))
-        bias = rng.uniform(-1.0, 1.0, 6) * np.repeat(d.wrench_bias, 3)
+        scale, seed = _sample_factor(rng, e.wrench_scale), int(rng.integers(2**31))
+        bias = rng.uniform(-1.0, 1.0, 6) * np.repeat(e.wrench_bias, 3)
         pose_offset = np.append(rng.uniform(-1.0, 1.0, 3) * d.pose_bias, np.zeros(3))
         if (friction, modulus) != (1.0, 1.0):
             self._inner.set_contact(context, friction, modulus)
-        if d.payload:
-            self._inner.set_payload(context, d.payload)
         wrench, pose, commands = (
             system.GetMyMutableContextFromRoot(context) for system in (self._wrench, self._pose, self._commands)
         )
@@ -162,7 +273,50 @@ class DisturbedStation(Station):
         self._pose.set_error(pose, np.ones(POSE_SIZE), pose_offset, 0)
         # A seed of its own: with the same seed both systems would use the same random numbers.
         self._commands.set_seed(commands, int(np.random.SeedSequence(seed).generate_state(1)[0]))
-        return {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
+        drawn = {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
+        if self._has_further_errors:
+            drawn |= self._disturb_further(context, np.random.default_rng([int(rng.integers(2**31)), seed]))
+        if d.payload:  # after the inner station has sampled its own errors of the tool
+            self._inner.set_payload(context, d.payload)
+        return drawn
+
+    @property
+    def _has_further_errors(self) -> bool:
+        e = self._errors
+        further = (*e.calibration_error, *e.wrench_gradient, e.wrench_delay[1] - e.wrench_delay[0])
+        return any(further) or e.joint_torque is not None
+
+    def _disturb_further(self, context: Context, rng: np.random.Generator) -> dict[str, Any]:
+        """Sample the errors that only a named setting has, and return them by name."""
+        e = self._errors
+        delay = int(rng.integers(e.wrench_delay[0], e.wrench_delay[1], endpoint=True))
+        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))  # nothing changes with the position within a few centimetres
+        gradient[:, 3:] = rng.uniform(-1.0, 1.0, (WRENCH_SIZE, 3)) * np.repeat(e.wrench_gradient, 3)[:, None]
+        calibration = rng.uniform(-1.0, 1.0, POSE_SIZE) * np.repeat(e.calibration_error, 3)
+        if self._delay is not None:
+            own = self._delay.GetMyMutableContextFromRoot(context)
+            self._delay.set_delay(own, delay)
+        if any(e.wrench_gradient):
+            self._wrench.set_gradient(self._wrench.GetMyMutableContextFromRoot(context), gradient)
+        for source, sign in zip(self._calibration, (-1.0, 1.0), strict=False):
+            own = source.GetMyMutableContextFromRoot(context)
+            source.get_mutable_source_value(own).SetFromVector(sign * calibration)
+        drawn = {"wrench_delay": delay, "wrench_gradient": gradient, "calibration_error": calibration}
+        return drawn | dict(self._inner.disturb(context, rng))
+
+
+def _without_replaced_errors(disturbances: Disturbances, station: Station) -> SensorErrors:
+    """Return the errors that are added to a station's ports: not those that its joint torques have already."""
+    errors = disturbances.errors
+    if errors.joint_torque is None:
+        return errors
+    if not getattr(station, "estimates_wrench", False):
+        return replace(errors, joint_torque=None)
+    given = disturbances.model_dump(exclude_none=True)
+    exact = SENSING["exact"]
+    replaced = ("wrench_scale", "wrench_bias", "wrench_drift", "wrench_noise")
+    mine = {name: getattr(exact, name) for name in replaced if name not in given}
+    return replace(errors, **mine, wrench_gradient=exact.wrench_gradient)
 
 
 def disturbed(
@@ -201,6 +355,9 @@ def disturbed(
         nominal = impedance or Impedance()
         stiffness = tuple(disturbances.stiffness_factor * value for value in nominal.stiffness)
         arguments["impedance"] = replace(nominal, stiffness=stiffness)
+    errors = disturbances.errors
+    if errors.joint_torque is not None and "joint_torque" in inspect.signature(build).parameters:
+        arguments["joint_torque"] = errors.joint_torque
     return DisturbedStation(build(**arguments), disturbances)
 
 

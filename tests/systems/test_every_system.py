@@ -83,6 +83,7 @@ def built():
         systems.EnergyTank(np.ones(6), np.ones(6), WrenchBound(np.ones(6), 1.0, 1.0), capacity=1.0, period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
+        systems.ExternalTorqueSensor(plant, body, np.ones(7), np.ones(7), period=PERIOD),
         systems.FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
@@ -103,11 +104,12 @@ def built():
         systems.SafetyFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0), PERIOD),
         systems.SctInputMapping(template, frames, PERIOD),
         systems.SctStateMachine(template, frames, PERIOD),
-        systems.SensorDisturbance(PERIOD, np.ones(2), delay=1),
+        systems.SensorDisturbance(PERIOD, np.ones(2), delay=1, configuration_size=2),
         systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
         systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD),
         systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_center, RotationMatrix(), PERIOD, 0.0),
+        systems.WrenchTare(PERIOD, 3, 5),
     ]
     return {type(instance).__name__: instance for instance in instances}
 

@@ -73,3 +73,53 @@ def test_initialization_restarts_noise_and_delay():
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         SensorDisturbance(PERIOD, **wrong)
+
+
+def test_delay_of_an_episode_is_at_most_the_largest():
+    sensor = SensorDisturbance(PERIOD, np.zeros(1), delay=3)
+    simulator = Simulator(sensor)
+    context = simulator.get_mutable_context()
+    measured = sensor.get_measurement_input_port().FixValue(context, np.zeros(1))
+    for delay in (1, 2, 3):
+        context.SetTime(0.0)
+        simulator.Initialize()
+        sensor.set_delay(context, delay)
+        for step in range(6):
+            measured.GetMutableData().set_value([float(step)])
+            simulator.AdvanceTo((step + 0.5) * PERIOD)
+        # The measurement of the last sample, step 5, is one period old when the delay is 1.
+        assert sensor.get_disturbed_measurement_output_port().Eval(context)[0] == 6 - delay
+    for wrong in (0, 4):
+        with pytest.raises(InputError, match="from 1 to 3"):
+            sensor.set_delay(context, wrong)
+
+
+def test_drift_is_a_random_walk_with_its_deviation():
+    drifts = np.array([readings(seed=seed, drift=np.array([1.0])) - TIMES for seed in range(60)])
+    assert drifts[:, -1].std() == pytest.approx(np.sqrt(0.1), rel=0.3)  # one second of ten
+    assert np.abs(np.diff(drifts)).mean() < 0.5 * np.abs(drifts[:, -1]).mean()
+
+
+def test_bias_depends_on_the_configuration():
+    sensor = SensorDisturbance(PERIOD, np.zeros(2), configuration_size=3)
+    context = sensor.CreateDefaultContext()
+    sensor.get_measurement_input_port().FixValue(context, np.ones(2))
+    configuration = sensor.get_configuration_input_port().FixValue(context, np.array([1.0, 2.0, 3.0]))
+    gradient = np.arange(6.0).reshape(2, 3)
+    sensor.set_gradient(context, gradient)
+    simulator = Simulator(sensor, context)
+    simulator.Initialize()
+    np.testing.assert_allclose(sensor.get_disturbed_measurement_output_port().Eval(context), 1.0)
+    configuration.GetMutableData().set_value([1.5, 2.0, 4.0])
+    expected = 1.0 + gradient @ [0.5, 0.0, 1.0]
+    np.testing.assert_allclose(sensor.get_disturbed_measurement_output_port().Eval(context), expected)
+
+
+def test_measurement_is_rounded_to_the_resolution():
+    np.testing.assert_allclose(readings(resolution=np.array([0.3]), bias=0.01), np.round((TIMES + 0.01) / 0.3) * 0.3)
+
+
+@pytest.mark.parametrize("wrong", [{"drift": np.array([-1.0])}, {"resolution": np.array([np.nan])}])
+def test_constructor_refuses_negative_magnitudes(wrong):
+    with pytest.raises(InputError):
+        SensorDisturbance(PERIOD, np.zeros(1), **wrong)

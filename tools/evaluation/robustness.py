@@ -175,6 +175,8 @@ def _is_default(axis: Axis, resolved: Environment) -> bool:
         neutral = axis.change(resolved, axis.default)
     except InputError:
         return True
+    if resolved.get("sensing", "exact") != "exact" and any(resolved.get(option, 0) is None for option in neutral):
+        return False  # the error is that of the setting
     known = {option: resolved[option] for option in neutral if resolved.get(option) is not None}
     return all(np.allclose(value, neutral[option]) for option, value in known.items())
 

@@ -1,0 +1,113 @@
+"""Named settings of a station's sensors: exact, a wrist force-torque sensor, or an arm's joint torque sensors.
+
+Data sheets and papers that the numbers come from; the bibliography lists them:
+
+- Franka Emika Panda: force and torque at the tool from joint torque sensors with a noise of 0.035 N and 0.005 Nm, a
+  repeatability of 0.15 N and 0.05 Nm, and an accuracy of 0.8 N and 0.15 Nm.
+- KUKA LBR iiwa 14 R820: pose repeatability 0.15 mm, joint torques accurate to 2 % of the largest ones.
+- Universal Robots UR5e: sensor at the flange with a precision of 3.5 N and 0.2 Nm, and an accuracy of 4 N and 0.3 Nm.
+- ATI Gamma SI-65-5: resolution 0.0125 N and 0.00075 Nm, uncertainty about 1 % of the range.
+- Gaz et al. (2019): identified dynamic model and friction of the Panda.
+
+Noise of 0.01 % of a joint's largest torque gives a Panda's tool the noise of its data sheet; friction and drift of
+0.02 % stay within its repeatability. Offsets and errors of the arm's model are much larger before the tare: several
+newtons at the tool of an iiwa. docs/robot.md has the errors that result for each arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from guiderail.models.common.units import MM
+
+Sensing = Literal["exact", "wrist", "robot"]
+
+TARE_SKIPPED, TARE_AVERAGED = 3, 5
+"""Control steps before and during the tare. Every shipped task begins in free motion that lasts longer."""
+
+
+@dataclass(frozen=True)
+class JointTorqueAccuracy:
+    """Errors of an arm's external joint torques; uniformly sampled every episode up to these values.
+
+    Attributes:
+        gain: Relative error of a torque.
+        offset: Offset of a sensor, as a fraction of the joint's largest torque.
+        friction: Friction that a sensor measures, as such a fraction.
+        drift: Standard deviation of a sensor's drift after `DRIFT_TIME`, as such a fraction.
+        noise: Standard deviation of a sensor's noise, as such a fraction.
+        mass: Relative error of the mass of each link.
+        center: Error of the center of mass of each body in each direction [m].
+        payload: Error of the mass of tool and workpiece [kg].
+    """
+
+    gain: float = 0.01
+    offset: float = 0.005
+    friction: float = 2e-4
+    drift: float = 2e-4
+    noise: float = 1e-4
+    mass: float = 0.02
+    center: float = 2.0 * MM
+    payload: float = 0.05
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """Errors of the measured wrench and pose, in pairs of force [N] and torque [Nm], or length [m] and angle [rad].
+
+    Attributes:
+        wrench_scale: Smallest and largest factor of the measured wrench, sampled every episode.
+        wrench_bias: Largest offset of each component, sampled every episode.
+        wrench_drift: Standard deviation of a random walk after `DRIFT_TIME`.
+        wrench_gradient: Largest change of the bias per radian that the tool turns about each axis.
+        wrench_noise: Standard deviation of white noise.
+        wrench_delay: Smallest and largest delay in control steps, sampled every episode.
+        calibration_error: Largest constant error of the arm's kinematics, sampled every episode. Commands and
+            measurements have it, so that the tool is elsewhere than the arm measures.
+        pose_resolution: Resolution of a measured pose, from that of the encoders.
+        tare: Subtract the wrench of the episode's first control steps, which are free motion.
+        joint_torque: On an arm, errors of joint torques, in place of scale, bias, drift, gradient and noise; None for a
+            wrench sensor at the wrist.
+    """
+
+    wrench_scale: tuple[float, float] = (1.0, 1.0)
+    wrench_bias: tuple[float, float] = (0.0, 0.0)
+    wrench_drift: tuple[float, float] = (0.0, 0.0)
+    wrench_gradient: tuple[float, float] = (0.0, 0.0)
+    wrench_noise: tuple[float, float] = (0.0, 0.0)
+    wrench_delay: tuple[int, int] = (0, 0)
+    calibration_error: tuple[float, float] = (0.0, 0.0)
+    pose_resolution: tuple[float, float] = (0.0, 0.0)
+    tare: bool = False
+    joint_torque: JointTorqueAccuracy | None = None
+
+
+# An absolute encoder of 19 bits has steps of 12 µrad, which are 10 µm at a reach of 0.8 m.
+_KINEMATICS = {"calibration_error": (0.15 * MM, 5e-4), "pose_resolution": (1e-5, 1.2e-5)}
+
+SENSING: dict[Sensing, SensorErrors] = {
+    "exact": SensorErrors(),
+    "wrist": SensorErrors(
+        wrench_scale=(0.99, 1.01),
+        wrench_bias=(2.0, 0.1),
+        wrench_drift=(0.05, 0.001),
+        wrench_gradient=(0.05, 0.01),
+        wrench_noise=(0.0125, 0.00075),
+        wrench_delay=(1, 2),
+        tare=True,
+        **_KINEMATICS,
+    ),
+    "robot": SensorErrors(
+        wrench_scale=(0.99, 1.01),
+        wrench_bias=(3.0, 0.3),
+        wrench_drift=(0.1, 0.01),
+        wrench_gradient=(0.3, 0.03),
+        wrench_noise=(0.05, 0.005),
+        wrench_delay=(1, 5),
+        tare=True,
+        joint_torque=JointTorqueAccuracy(),
+        **_KINEMATICS,
+    ),
+}
+"""Errors of each setting. Without an arm, "robot" has the errors that joint torques cause at an iiwa's tool."""

@@ -1,0 +1,185 @@
+"""External joint torques as an arm with joint torque sensors measures them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems.sensor_disturbance import DRIFT_TIME
+from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
+
+FRICTION_SPEED = 0.01  # joint speed at which friction has 76 % of its magnitude [rad/s]
+
+
+@dataclass(frozen=True)
+class JointTorqueErrors:
+    """Errors of joint torque sensors and of the arm's model, constant during an episode.
+
+    Attributes:
+        gain: Relative error of each sensor, (n,).
+        offset: Offset of each sensor, (n,) [Nm].
+        friction: Friction torque that each sensor measures, (n,) [Nm].
+        mass: Actual minus modelled mass of each body but the world, (B,) [kg].
+        center: Actual minus modelled center of mass of each body but the world, (B, 3) [m].
+    """
+
+    gain: np.ndarray
+    offset: np.ndarray
+    friction: np.ndarray
+    mass: np.ndarray
+    center: np.ndarray
+
+
+class ExternalTorqueSensor(LeafSystem):
+    """Measure external joint torques with errors of sensors, friction and model.
+
+        τ = τ_c + ε ∘ (τ_c + g(q)) + g'(q) − g(q) − c ∘ tanh(v / v₀) + b + d + σ ∘ n,  n ~ N(0, 1) once per period
+
+    An arm computes its external torques as measured torques minus those of its model. τ_c are the torques of contact
+    forces, g(q) the gravity of the model and g'(q) that of the actual bodies, c friction, b offsets, and d a random
+    walk. Torques of inertia are compensated exactly. The errors are parameters, which a reset samples and restores.
+
+    .. pydrake_system::
+
+        name: ExternalTorqueSensor
+        input_ports:
+        - state
+        - contact_torque
+        output_ports:
+        - external_torque
+
+    ``state`` is (2n,), positions and velocities of the joints. ``contact_torque`` and ``external_torque`` are (n,), in
+    Nm.
+
+    Args:
+        plant: Model of the arm alone, finalized.
+        payload_body: Body that a payload is rigidly attached to, at its center of mass.
+        noise: Standard deviations σ, (n,) [Nm].
+        drift: Standard deviations of d after `DRIFT_TIME`, (n,) [Nm].
+        period: Period of noise and drift [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(
+        self, plant: MultibodyPlant, payload_body: RigidBody, noise: np.ndarray, drift: np.ndarray, *, period: float
+    ):
+        super().__init__()
+        check_period(period)
+        n = plant.num_positions()
+        self._noise, self._drift = np.array(noise, dtype=float), np.array(drift, dtype=float)
+        for values in (self._noise, self._drift):
+            if values.shape != (n,) or not (np.isfinite(values) & (values >= 0.0)).all():
+                raise InputError(f"noise and drift of torque sensors are {n} standard deviations, not {values}")
+        self._plant, self._step = plant, np.sqrt(period / DRIFT_TIME)
+        self._bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+        self._nominal = [body.default_mass() for body in self._bodies]
+        own = plant.CreateDefaultContext()
+        self._centers = [body.CalcCenterOfMassInBodyFrame(own) for body in self._bodies]
+        self._payload_index = [int(body.index()) for body in self._bodies].index(int(payload_body.index()))
+        bodies = len(self._bodies)
+        self._gain, self._offset, self._friction, self._mass, self._center, self._seed = (
+            self.DeclareNumericParameter(BasicVector(np.zeros(size))) for size in (n, n, n, bodies, 3 * bodies, 1)
+        )
+        self._count = self.DeclareDiscreteState(1)
+        self._noise_sample, self._walk = self.DeclareDiscreteState(n), self.DeclareDiscreteState(n)
+        self._state_port = self.DeclareVectorInputPort("state", 2 * n)
+        self._contact_torque_port = self.DeclareVectorInputPort("contact_torque", n)
+        state, parameters = self._state_port.ticket(), self.all_parameters_ticket()
+        self._model = declare_plant_context(self, plant, self._set_positions, prerequisites_of_calc={state})
+        self._actual = declare_plant_context(
+            self, plant, self._set_actual_bodies, prerequisites_of_calc={state, parameters}
+        )
+        self._external_torque_port = self.DeclareVectorOutputPort(
+            "external_torque",
+            n,
+            self._calc_external_torque,
+            prerequisites_of_calc={
+                self._contact_torque_port.ticket(),
+                self._model.ticket(),
+                self._actual.ticket(),
+                self.discrete_state_ticket(self._noise_sample),
+                self.discrete_state_ticket(self._walk),
+            },
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_state_input_port = input_getter("state", "positions and velocities of the joints, (2n,)")
+    get_contact_torque_input_port = input_getter("contact_torque", "joint torques of contact forces, (n,) [Nm]")
+    get_external_torque_output_port = output_getter("external_torque", "measured external torques, (n,) [Nm]")
+
+    @property
+    def bodies(self) -> tuple[RigidBody, ...]:
+        """The B bodies of `JointTorqueErrors`."""
+        return tuple(self._bodies)
+
+    def set_errors(self, context: Context, errors: JointTorqueErrors, seed: int) -> None:
+        """Set the errors of an episode and the seed of noise and drift; `context` is this system's."""
+        for index, values in (
+            (self._gain, errors.gain),
+            (self._offset, errors.offset),
+            (self._friction, errors.friction),
+            (self._mass, errors.mass),
+            (self._center, errors.center.ravel()),
+            (self._seed, [float(seed)]),
+        ):
+            context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
+
+    def add_payload(self, context: Context, mass: float) -> None:
+        """Add a mass [kg] that the arm's model does not have; `context` is this system's."""
+        masses = context.get_mutable_numeric_parameter(self._mass)
+        masses.SetAtIndex(self._payload_index, masses.GetAtIndex(self._payload_index) + mass)
+
+    def _set_positions(self, context: Context, plant_context: Context) -> None:
+        n = self._plant.num_positions()
+        self._plant.SetPositions(plant_context, self._state_port.Eval(context)[:n])
+
+    def _set_actual_bodies(self, context: Context, plant_context: Context) -> None:
+        self._set_positions(context, plant_context)
+        masses = context.get_numeric_parameter(self._mass).value()
+        centers = context.get_numeric_parameter(self._center).value().reshape(-1, 3)
+        for body, nominal, own, mass, center in zip(
+            self._bodies, self._nominal, self._centers, masses, centers, strict=True
+        ):
+            body.SetMass(plant_context, max(nominal + mass, 0.0))
+            body.SetCenterOfMassInBodyFrame(plant_context, own + center)
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        n = len(self._noise)
+        discrete_state.set_value(self._count, np.zeros(1))
+        discrete_state.set_value(self._noise_sample, np.zeros(n))
+        discrete_state.set_value(self._walk, np.zeros(n))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        count = context.get_discrete_state(self._count).value()[0] + 1.0
+        seed = context.get_numeric_parameter(self._seed).value()[0]
+        noise, step = np.random.default_rng([int(seed), int(count)]).standard_normal((2, len(self._noise)))
+        walk = context.get_discrete_state(self._walk).value()
+        discrete_state.set_value(self._count, [count])
+        discrete_state.set_value(self._noise_sample, self._noise * noise)
+        discrete_state.set_value(self._walk, walk + self._step * self._drift * step)
+
+    def _calc_external_torque(self, context: Context, output: BasicVector) -> None:
+        n = len(self._noise)
+        contact, velocities = self._contact_torque_port.Eval(context), self._state_port.Eval(context)[n:]
+        gravity, actual = (
+            self._plant.CalcGravityGeneralizedForces(entry.Eval(context)) for entry in (self._model, self._actual)
+        )
+        gain, offset, friction = (
+            context.get_numeric_parameter(index).value() for index in (self._gain, self._offset, self._friction)
+        )
+        noise, walk = (context.get_discrete_state(index).value() for index in (self._noise_sample, self._walk))
+        output.SetFromVector(
+            contact
+            + gain * (contact + gravity)
+            + (actual - gravity)
+            - friction * np.tanh(velocities / FRICTION_SPEED)
+            + offset
+            + walk
+            + noise
+        )

@@ -1,0 +1,86 @@
+"""Tare of a wrench measurement: subtraction of its mean in free motion."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import WRENCH_SIZE
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+
+
+class WrenchTare(LeafSystem):
+    """Subtract the mean of the first measurements, which are taken in free motion, from all later ones.
+
+        y_k = 0 for k < s + n,  y_k = u_k − (1/n) Σ u_j over j = s … s + n − 1 afterwards
+
+    k counts samples since the initialization, s are samples that are skipped until filters have settled, and n samples
+    are averaged. Whatever the robot touches during these samples is subtracted too.
+
+    .. pydrake_system::
+
+        name: WrenchTare
+        input_ports:
+        - measured_wrench
+        output_ports:
+        - tared_wrench
+
+    Both are (6,), force first [N, Nm].
+
+    Args:
+        period: Sampling period [s], positive.
+        skipped: s, at least 0.
+        averaged: n, at least 1.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, period: float, skipped: int, averaged: int):
+        super().__init__()
+        check_period(period)
+        if skipped < 0 or averaged < 1:
+            raise InputError(f"a tare skips samples from 0 and averages at least one, not {skipped} and {averaged}")
+        self._skipped, self._averaged = skipped, averaged
+        self._count = self.DeclareDiscreteState(1)  # k
+        self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # the mean of the samples so far
+        self._measured_wrench_port = self.DeclareVectorInputPort("measured_wrench", WRENCH_SIZE)
+        self._tared_wrench_port = self.DeclareVectorOutputPort(
+            "tared_wrench",
+            WRENCH_SIZE,
+            self._calc_tared_wrench,
+            prerequisites_of_calc={
+                self._measured_wrench_port.ticket(),
+                self.discrete_state_ticket(self._count),
+                self.discrete_state_ticket(self._offset),
+            },
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_measured_wrench_input_port = input_getter("measured_wrench", "wrench with a bias, (6,)")
+    get_tared_wrench_output_port = output_getter("tared_wrench", "wrench without it, (6,)")
+
+    def is_tared(self, context: Context) -> bool:
+        """Return True if all samples of the mean have been taken; `context` is this system's."""
+        return context.get_discrete_state(self._count).value()[0] >= self._skipped + self._averaged
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(self._count, np.zeros(1))
+        discrete_state.set_value(self._offset, np.zeros(WRENCH_SIZE))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self.is_tared(context):
+            return
+        count = context.get_discrete_state(self._count).value()[0]
+        if count >= self._skipped:
+            offset = context.get_discrete_state(self._offset).value()
+            sample = self._measured_wrench_port.Eval(context)
+            discrete_state.set_value(self._offset, offset + (sample - offset) / (count - self._skipped + 1.0))
+        discrete_state.set_value(self._count, [count + 1.0])
+
+    def _calc_tared_wrench(self, context: Context, output: BasicVector) -> None:
+        if self.is_tared(context):
+            offset = context.get_discrete_state(self._offset).value()
+            output.SetFromVector(self._measured_wrench_port.Eval(context) - offset)
+        else:
+            output.SetZero()

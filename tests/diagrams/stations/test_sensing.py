@@ -1,0 +1,140 @@
+"""Named settings of the sensors: what they add, what replaces them, and that the tare happens in free motion."""
+
+import numpy as np
+import pytest
+
+from guiderail import InputError, make_env
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
+from guiderail.diagrams.stations.sensing import SENSING, TARE_AVERAGED, TARE_SKIPPED
+from guiderail.models.common.units import MM
+
+HARD = {"difficulty": "hard", "guidance": "kgrl", "action_repeat": 1}
+TARE_STEPS = TARE_SKIPPED + TARE_AVERAGED
+
+
+def free_motion(env, steps=45, seed=3):
+    """Return measured and exact wrenches (steps, 6) of a motion without contact, and the reset's info."""
+    _, info = env.reset(seed=seed)
+    station = env.task.diagram.GetSubsystemByName("station")
+    exact = []
+    for _ in range(steps):
+        env.step(np.zeros(env.action_space.shape))
+        exact.append(
+            station.GetOutputPort("exact_wrench").Eval(station.GetMyContextFromRoot(env.simulator.get_context()))
+        )
+    return env.trace.signals["wrench"].copy(), np.array(exact), info
+
+
+@pytest.mark.parametrize("sensing", ["robot", "wrist"])
+@pytest.mark.parametrize("station", ["gantry", "arm", "mujoco"])
+def test_setting_is_tared_and_seeded_on_every_station(station, sensing):
+    env = make_env("BncConnector", station=station, sensing=sensing, **HARD)
+    measured, exact, info = free_motion(env)
+    again, _, drawn = free_motion(env)
+    np.testing.assert_array_equal(again, measured)
+    other, _, changed = free_motion(env, seed=4)
+    assert not np.array_equal(other, measured)
+    delay = info["wrench_delay"]
+    assert SENSING[sensing].wrench_delay[0] <= delay <= SENSING[sensing].wrench_delay[1]
+    assert np.array_equal(drawn["calibration_error"], info["calibration_error"])
+    assert not np.array_equal(changed["calibration_error"], info["calibration_error"])
+    assert np.abs(info["calibration_error"][:3]).max() <= 0.15 * MM
+    np.testing.assert_array_equal(measured[: TARE_STEPS + delay - 1], 0.0)
+    # Newtons of bias before the tare, and tenths of a newton after it.
+    errors = (measured - exact)[TARE_STEPS + delay :]
+    assert 1e-4 < np.abs(errors[:, :3]).max() < 0.6
+    assert 1e-5 < np.abs(errors[:, 3:]).max() < 0.15
+
+
+def test_arm_estimates_the_wrench_from_joint_torques():
+    env = make_env("BncConnector", station="arm", sensing="robot", tare=False, wrench_delay=0, **HARD)
+    measured, exact, info = free_motion(env)
+    assert info["torque_offset"].shape == (7,)
+    bias = np.abs((measured - exact)[10:].mean(axis=0))
+    assert 0.3 < bias[:3].max() < 10.0  # as a lab measures without a tare
+    wrist = make_env("BncConnector", station="arm", sensing="wrist", **HARD)
+    assert "torque_offset" not in free_motion(wrist, steps=2)[2]
+
+
+def test_payload_is_measured_and_tared():
+    """Half a kilogram that the model does not have: five newtons before the tare, none after it."""
+    options = {**HARD, "station": "arm", "sensing": "robot", "wrench_bias": (0.0, 0.0)}
+    untared, _, _ = free_motion(make_env("BncConnector", payload=0.5, tare=False, **options))
+    assert untared[20:, 2].mean() == pytest.approx(-0.5 * 9.81, abs=0.5)
+    tared, _, _ = free_motion(make_env("BncConnector", payload=0.5, **options))
+    assert abs(tared[20:, 2].mean()) < 0.3
+
+
+def test_calibration_error_displaces_tool_and_measurement():
+    env = make_env("BncConnector", sensing="exact", calibration_error=(1.0 * MM, 0.0), **HARD)
+    _, info = env.reset(seed=1)
+    for _ in range(30):
+        env.step(np.zeros(2))
+    station = env.task.diagram.GetSubsystemByName("station")
+    inner = station.GetSubsystemByName("station")
+    true = inner.get_pose_output_port().Eval(inner.GetMyContextFromRoot(env.simulator.get_context()))
+    np.testing.assert_allclose(env.trace.measured[-1] - true, info["calibration_error"], atol=1e-9)
+    # The robot tracks what it measures, so that the tool itself is off.
+    assert np.abs(env.trace.measured[-1] - env.trace.commanded[-1])[:2].max() < 0.1 * MM
+    assert np.abs(info["calibration_error"][:2]).max() > 0.15 * MM
+
+
+def test_pose_has_the_resolution_of_encoders():
+    env = make_env("BncConnector", sensing="robot", **HARD)
+    free_motion(env, steps=5)
+    steps = env.trace.measured / np.repeat(SENSING["robot"].pose_resolution, 3)
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
+@pytest.mark.parametrize("difficulty", ["standard", "hard"])
+def test_tare_ends_before_the_first_contact(task, difficulty):
+    """Whatever action is taken: the tare would subtract a contact."""
+    env = make_env(task, difficulty=difficulty, action_repeat=1)
+    for seed, action in enumerate((-1.0, 0.0, 1.0)):
+        env.reset(seed=seed)
+        for _ in range(TARE_STEPS + 1):
+            env.step(np.full(env.action_space.shape, action))
+        assert np.abs(env.trace.signals["wrench"]).max() < 1e-6
+
+
+def test_given_value_replaces_that_of_the_setting():
+    def errors(**options):
+        return Disturbances(**options).errors
+
+    assert errors(sensing="robot").wrench_delay == (1, 5)
+    assert errors(sensing="robot", wrench_delay=2).wrench_delay == (2, 2)
+    assert not errors(sensing="robot", tare=False).tare
+    assert errors(sensing="robot", wrench_bias=(3.0, 0.1)).wrench_bias == (3.0, 0.1)
+    joint_torque = errors(sensing="robot", wrench_bias=(0.0, 0.0), wrench_noise=(0.0, 0.0)).joint_torque
+    assert (joint_torque.offset, joint_torque.mass, joint_torque.noise) == (0.0, 0.0, 0.0)
+    assert joint_torque.friction > 0.0
+    assert errors(wrench_scale=(0.5, 2.0)).wrench_scale == (0.5, 2.0)
+
+
+def test_setting_can_be_changed_in_a_stored_configuration():
+    """A run's folder stores all options; another setting must not inherit the errors of the stored one."""
+    stored = EnvConfig.resolve("BncConnector", {"sensing": "robot"}).options
+    changed = EnvConfig.resolve("BncConnector", {**stored, "sensing": "exact"})
+    assert not changed.parts["disturbances"].any
+    assert EnvConfig.resolve("BncConnector", stored).options == stored
+
+
+def test_exact_setting_adds_nothing():
+    env = make_env("BncConnector", sensing="exact", **HARD)
+    assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensing": "perfect"}, "there is no sensing 'perfect'"),
+        ({"calibration_error": (0.5, 0.0)}, "metres"),
+        ({"wrench_drift": (-1.0, 0.0)}, "none negative"),
+        ({"sensing": "robot", "wrench_bias": (1.0,)}, "wrench_bias"),
+    ],
+)
+def test_environment_raises_when_a_setting_is_invalid(options, message):
+    with pytest.raises(InputError, match=message):
+        make_env("BncConnector", **options)

@@ -1,0 +1,101 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.robots.iiwa import IIWA14
+from guiderail.systems import ExternalTorqueSensor, JointTorqueErrors
+
+HOME = np.array(IIWA14.home)
+CONTACT = np.linspace(-2.0, 3.0, 7)
+PERIOD = 0.01
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return controller_model(BncWorkcell())
+
+
+def none(sensor):
+    bodies = len(sensor.bodies)
+    return JointTorqueErrors(np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(bodies), np.zeros((bodies, 3)))
+
+
+def measured(arm, *, noise=0.0, drift=0.0, seconds=0.005, velocity=0.0, payload=0.0, seed=1, **errors):
+    """Return the measured torques at home, (7,), with errors by name, and the sensor."""
+    plant, model = arm
+    sensor = ExternalTorqueSensor(plant, model.tool[0], np.full(7, noise), np.full(7, drift), period=PERIOD)
+    simulator = Simulator(sensor)
+    context = simulator.get_mutable_context()
+    sensor.get_state_input_port().FixValue(context, np.concatenate([HOME, np.full(7, velocity)]))
+    sensor.get_contact_torque_input_port().FixValue(context, CONTACT)
+    sensor.set_errors(context, replace(none(sensor), **errors), seed)
+    sensor.add_payload(context, payload)
+    simulator.AdvanceTo(seconds)
+    return sensor.get_external_torque_output_port().Eval(context).copy(), sensor
+
+
+def gravity(arm, payload=0.0):
+    plant, model = arm
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, HOME)
+    model.tool[0].SetMass(context, model.tool[0].default_mass() + payload)
+    return plant.CalcGravityGeneralizedForces(context)
+
+
+def test_contact_torques_are_measured_without_errors(arm):
+    np.testing.assert_allclose(measured(arm)[0], CONTACT, atol=1e-12)
+
+
+def test_gain_acts_on_gravity_too(arm):
+    """A sensor measures the whole torque of its joint, also that of the arm's own weight."""
+    gain = 0.01 * np.arange(7)
+    np.testing.assert_allclose(measured(arm, gain=gain)[0], CONTACT + gain * (CONTACT + gravity(arm)), atol=1e-9)
+
+
+def test_payload_is_measured_as_its_weight(arm):
+    expected = CONTACT + gravity(arm, 0.5) - gravity(arm)
+    np.testing.assert_allclose(measured(arm, payload=0.5)[0], expected, atol=1e-9)
+    assert np.abs(expected - CONTACT).max() > 1.0
+
+
+def test_errors_of_the_model_depend_on_the_configuration(arm):
+    sensor = measured(arm)[1]
+    mass = np.array([0.02 * body.default_mass() for body in sensor.bodies])
+    np.testing.assert_allclose(measured(arm, mass=mass)[0], CONTACT + 0.02 * gravity(arm), atol=1e-9)
+    center = np.full((len(sensor.bodies), 3), 0.002)
+    assert np.abs(measured(arm, center=center)[0] - CONTACT).max() > 0.05
+
+
+def test_friction_opposes_the_motion(arm):
+    friction = np.full(7, 0.1)
+    np.testing.assert_allclose(measured(arm, friction=friction, velocity=0.0)[0], CONTACT)
+    np.testing.assert_allclose(measured(arm, friction=friction, velocity=0.5)[0], CONTACT - 0.1)
+    np.testing.assert_allclose(measured(arm, friction=friction, velocity=-0.5)[0], CONTACT + 0.1)
+
+
+def test_noise_and_drift_repeat_with_their_seed(arm):
+    first = measured(arm, noise=0.1, drift=0.1, seconds=0.5, seed=3)[0]
+    np.testing.assert_array_equal(measured(arm, noise=0.1, drift=0.1, seconds=0.5, seed=3)[0], first)
+    assert not np.allclose(measured(arm, noise=0.1, drift=0.1, seconds=0.5, seed=4)[0], first)
+
+
+def test_drift_is_a_random_walk_with_its_deviation(arm):
+    ends = np.array([measured(arm, drift=1.0, seconds=0.995, seed=seed)[0] - CONTACT for seed in range(20)])
+    assert ends.std() == pytest.approx(np.sqrt(0.1), rel=0.25)  # a tenth of the time
+
+
+@pytest.mark.parametrize(
+    ("noise", "drift", "period"), [(-1.0, 0.0, PERIOD), (0.0, np.nan, PERIOD), (0.0, 0.0, 0.0), (np.zeros(3), 0.0, 1)]
+)
+def test_constructor_refuses_arguments_out_of_range(arm, noise, drift, period):
+    plant, model = arm
+    with pytest.raises(InputError):
+        ExternalTorqueSensor(
+            plant, model.tool[0], np.resize(noise, np.size(noise) if np.size(noise) > 1 else 7), np.full(7, drift),
+            period=period,
+        )  # fmt: skip
