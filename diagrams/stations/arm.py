@@ -43,7 +43,7 @@ from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.wrench_sensor import WrenchSensor
 
-WRENCH_ESTIMATE_TIME_CONSTANT = 0.02  # of the filter of a wrench that is estimated from joint torques [s]
+WRENCH_ESTIMATE_TIME_CONSTANT = 0.05  # of the filter of a wrench that is estimated from joint torques [s]
 # Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.
 MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 

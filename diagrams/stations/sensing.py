@@ -1,17 +1,17 @@
 """Named settings of a station's sensors: exact, a wrist force-torque sensor, or an arm's joint torque sensors.
 
-Data sheets and papers that the numbers come from; the bibliography lists them:
+Data sheets and papers that the numbers come from, by their number in docs/bibliography.md:
 
-- Franka Emika Panda: force and torque at the tool from joint torque sensors with a noise of 0.035 N and 0.005 Nm, a
-  repeatability of 0.15 N and 0.05 Nm, and an accuracy of 0.8 N and 0.15 Nm.
-- KUKA LBR iiwa 14 R820: pose repeatability 0.15 mm, joint torques accurate to 2 % of the largest ones.
-- Universal Robots UR5e: sensor at the flange with a precision of 3.5 N and 0.2 Nm, and an accuracy of 4 N and 0.3 Nm.
-- ATI Gamma SI-65-5: resolution 0.0125 N and 0.00075 Nm, uncertainty about 1 % of the range.
-- Gaz et al. (2019): identified dynamic model and friction of the Panda.
+- An arm with joint torque sensors [23]: at the tool a noise of 0.035 N and 0.005 Nm, a repeatability of 0.15 N and
+  0.05 Nm, and an accuracy of 0.8 N and 0.15 Nm.
+- Another one [24]: pose repeatability of 0.15 mm, joint torques accurate to 2 % of the largest ones.
+- An arm with a sensor at its flange [25]: precision of 3.5 N and 0.2 Nm, accuracy of 4 N and 0.3 Nm.
+- A wrist sensor [26]: resolution of 0.0125 N and 0.00075 Nm, uncertainty of about 1 % of the range.
+- An identified dynamic model of the first arm, with friction [27].
 
-Noise of 0.01 % of a joint's largest torque gives a Panda's tool the noise of its data sheet; friction and drift of
-0.02 % stay within its repeatability. Offsets and errors of the arm's model are much larger before the tare: several
-newtons at the tool of an iiwa. docs/robot.md has the errors that result for each arm.
+Noise of 0.01 % of a joint's largest torque gives the first arm's tool the noise of its data sheet; friction of 0.02 %
+stays within its repeatability. Offsets and errors of the model are much larger before the tare: newtons at the tool.
+Strain gauges drift with their temperature, hardly within one episode. docs/robot.md has what results for each arm.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class JointTorqueAccuracy:
     gain: float = 0.01
     offset: float = 0.005
     friction: float = 2e-4
-    drift: float = 2e-4
+    drift: float = 5e-5
     noise: float = 1e-4
     mass: float = 0.02
     center: float = 2.0 * MM

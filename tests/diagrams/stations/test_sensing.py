@@ -59,7 +59,7 @@ def test_arm_estimates_the_wrench_from_joint_torques():
 
 def test_payload_is_measured_and_tared():
     """Half a kilogram that the model does not have: five newtons before the tare, none after it."""
-    options = {**HARD, "station": "arm", "sensing": "robot", "wrench_bias": (0.0, 0.0)}
+    options = {**HARD, "station": "arm", "sensing": "robot", "wrench_bias": (0.0, 0.0), "wrench_scale": (1.0, 1.0)}
     untared, _, _ = free_motion(make_env("BncConnector", payload=0.5, tare=False, **options))
     assert untared[20:, 2].mean() == pytest.approx(-0.5 * 9.81, abs=0.5)
     tared, _, _ = free_motion(make_env("BncConnector", payload=0.5, **options))
