@@ -29,6 +29,7 @@ class JointTorqueWrench(LeafSystem):
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool center P in the axes of
     T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, without direct feedthrough.
+    The first sample initializes the filter: a filter that rises from zero would hide a part of the bias from a tare.
     Samples that are not finite are skipped.
 
     Args:
@@ -63,6 +64,7 @@ class JointTorqueWrench(LeafSystem):
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
         self._external_torque_port = self.DeclareVectorInputPort("external_torque", num_joints)
         self._state = self.DeclareDiscreteState(6)
+        self._has_sample = self.DeclareDiscreteState(1)
         self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
         self._plant_context = declare_plant_context(
             self, plant, self._set_plant_state, prerequisites_of_calc={self._positions_port.ticket()}
@@ -92,6 +94,9 @@ class JointTorqueWrench(LeafSystem):
         # [torque, force], as the Jacobian's rows are [rotational, translational]
         F = np.linalg.solve(J @ J.T + self._damping * np.eye(6), J @ external_torque)
         newest = np.concatenate([F[3:], F[:3]])
-        last = context.get_discrete_state(self._state).value()
-        discrete_state.set_value(newest + self._decay * (last - newest))
+        if context.get_discrete_state(self._has_sample).value()[0]:
+            last = context.get_discrete_state(self._state).value()
+            newest = newest + self._decay * (last - newest)
+        discrete_state.set_value(self._state, newest)
+        discrete_state.set_value(self._has_sample, np.ones(1))
         return EventStatus.Succeeded()

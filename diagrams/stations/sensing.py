@@ -110,4 +110,4 @@ SENSING: dict[Sensing, SensorErrors] = {
         **_KINEMATICS,
     ),
 }
-"""Errors of each setting. Without an arm, "robot" has the errors that joint torques cause at an iiwa's tool."""
+"""Errors of each setting. Without an arm, "robot" has the errors at the tool that joint torques cause on one."""

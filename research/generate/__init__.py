@@ -17,15 +17,19 @@ def _passage(*folder: Path) -> None:
     passage.generate().save(folder[0] / passage.PATH.name if folder else passage.PATH)
 
 
-def _search(*folder: Path) -> None:
-    recording = import_module("research.generate.bnc_connector")
-    recording.main(*(folder or (None,)), recording.SEARCH_SESSION)
+def _session(name: str) -> Callable[..., None]:
+    def record(*folder: Path) -> None:
+        recording = import_module("research.generate.bnc_connector")
+        recording.main(*(folder or (None,)), getattr(recording, name))
+
+    return record
 
 
 # Each takes a folder, or nothing for the folder of the package.
 GENERATORS: dict[str, Callable[..., None]] = {
     "connector-demonstrations": _main("research.generate.bnc_connector"),
-    "connector-search-demonstrations": _search,
+    "connector-search-demonstrations": _session("SEARCH_SESSION"),
+    "connector-firm-search-demonstrations": _session("FIRM_SEARCH_SESSION"),
     "passage-demonstrations": _passage,
     "connector-objects": _main("guiderail.models.objects.bnc_connector.sdf"),
     "clamp-objects": _main("guiderail.models.objects.grid_clamp.sdf"),

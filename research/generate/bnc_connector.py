@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.envs.recording import drive_along
+from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance, Station
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
@@ -30,26 +31,36 @@ class Session:
     Attributes:
         motions: Returns the motions, (M, N, 6), of a seed and times, (N,).
         path: File of the shipped recording.
+        station: Builds the station that is driven.
+        source: Description of the recording.
     """
 
     motions: Callable[[int, np.ndarray], np.ndarray]
     path: Path
+    station: Callable[..., Station] = GantryStation
+    source: str = "scripted motion on the gantry station, through its impedance; outputs are commands"
 
 
 INSERT_SESSION = Session(bnc_connector.demonstrator_motions, bnc_connector.PATH)
 SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
+FIRM_SEARCH_SESSION = Session(
+    bnc_search.firm_motions,
+    bnc_search.FIRM_PATH,
+    ArmStation,
+    "scripted motion on the arm station, through its impedance; outputs are commands",
+)
 
 
-def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
-    """Drive a motion, (N, 6), through the gantry's impedance; return the recording and whether the plug is locked."""
+def record_one(motion: np.ndarray, station: Callable[..., Station] = GantryStation) -> tuple[Recording, bool]:
+    """Drive a motion, (N, 6), through a station's impedance; return the recording and whether the plug is locked."""
     workcell = BncWorkcell()
-    driven, recording = drive_along(GantryStation(workcell, time_step=TIME_STEP), TIMES, motion)
+    driven, recording = drive_along(station(workcell, time_step=TIME_STEP), TIMES, motion)
     return recording, workcell.is_locked(workcell.workpiece_in_target(driven.station.plant, driven.plant_context))
 
 
 def record_session(session: Session, seed: int) -> list[Recording] | None:
     """Record all demonstrations of a session; return None if one of them does not end locked."""
-    recorded = [record_one(motion) for motion in session.motions(seed, TIMES)]
+    recorded = [record_one(motion, session.station) for motion in session.motions(seed, TIMES)]
     return [recording for recording, _ in recorded] if all(is_locked for _, is_locked in recorded) else None
 
 
@@ -75,7 +86,7 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
         "seed": np.array(seed),
         "stiffness": np.array(Impedance().stiffness),
         "frame": np.array("T: the locked plug on the nominal jack; [x y z Rz Ry Rx], R = Rz Ry Rx"),
-        "source": np.array("scripted motion on the gantry station, through its impedance; outputs are commands"),
+        "source": np.array(session.source),
     }
 
 

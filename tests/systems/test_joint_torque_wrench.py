@@ -43,10 +43,20 @@ def test_wrench_is_recovered_from_its_joint_torques(arm):
     np.testing.assert_allclose(estimate(arm, wrench), wrench, rtol=0.05, atol=0.05)
 
 
-def test_filter_is_a_first_order_low_pass(arm):
-    wrench = np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
-    filtered = estimate(arm, wrench, seconds=0.045, time_constant=0.1, damping=0.0)  # events at 0, 10, 20, 30, 40 ms
-    np.testing.assert_allclose(filtered, wrench * (1.0 - np.exp(-0.5)), atol=1e-9)
+def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
+    plant, model = arm
+    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.1, damping=0.0)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_positions_input_port().FixValue(context, READY_POSTURE)
+    torque = system.get_external_torque_input_port().FixValue(context, np.linspace(-1.0, 1.0, 7))
+    output = system.get_wrench_output_port()
+    simulator.AdvanceTo(0.005)
+    first = output.Eval(context).copy()
+    assert np.linalg.norm(first) > 0.1
+    torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
+    simulator.AdvanceTo(0.055)  # events at 10, 20, 30, 40 and 50 ms
+    np.testing.assert_allclose(output.Eval(context), first * (2.0 - np.exp(-0.5)), atol=1e-9)
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}])

@@ -86,7 +86,7 @@ class BncUncertainty(HiddenOffsets):
 
 ALIGNMENT = 2.0 * MM  # largest |x| and |y| of every command: equation 4.26
 NOMINAL = BncDimensions()
-SHIPPED = ("insert", "search")  # demonstrations
+SHIPPED = ("insert", "search", "firm_search")  # demonstrations
 
 
 class BncOptions(FixtureOffsetOptions, ForceOptions):
@@ -122,7 +122,9 @@ class BncOptions(FixtureOffsetOptions, ForceOptions):
     equal_area: bool = Field(
         False, description="give the polygons of barrel and bore in Drake the areas of their circles"
     )
-    demonstrations: str = Field("insert", description="demonstrations: insert, search, or the path of a file")
+    demonstrations: str = Field(
+        "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
+    )
 
     @field_validator("demonstrations")
     @classmethod
@@ -131,7 +133,7 @@ class BncOptions(FixtureOffsetOptions, ForceOptions):
             return value
         path = Path(value)
         if not path.is_file():
-            raise ValueError(f"it is {' or '.join(SHIPPED)}, or the path of an existing file, .npz or .csv")
+            raise ValueError(f"it is {', '.join(SHIPPED)}, or the path of an existing file, .npz or .csv")
         return str(path.resolve())  # so that a run can be resumed from another folder
 
     def workcell(self) -> BncWorkcell:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 COMPONENTS = 16
 FLOOR = np.array(REPEATABILITY_STD)
-DEMONSTRATIONS = {"insert": inserting, "search": searching}
+DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # consecutive control steps that count as locked
 
@@ -58,7 +58,7 @@ def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
     """Return the Gaussian mixture regression of shipped demonstrations or of a file's, fitted once a process."""
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
-    loaded = DEMONSTRATIONS[demonstrations].load()
+    loaded = DEMONSTRATIONS[demonstrations]()
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
 
 
@@ -198,7 +198,7 @@ class BncConnector(DemonstratedInsertion):
         to_world = in_frame(self._workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
         bound, name = self.options.bound, self.options.demonstrations
-        demonstrations = DEMONSTRATIONS[name].load() if name in DEMONSTRATIONS else Demonstrations.load(Path(name))
+        demonstrations = DEMONSTRATIONS[name]() if name in DEMONSTRATIONS else Demonstrations.load(Path(name))
         return Scene(
             to_world=to_world,
             demonstrations=tuple(demonstrations.outputs),

@@ -5,7 +5,12 @@ turn further, and then inserts the plug. At every time of the search the five li
 center, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
 the same effect in every direction of the whole search.
 
-`python -m research.generate connector-search-demonstrations` records them again.
+There are two sets. The push of "search" is light. That of "firm_search", recorded on an arm, is four times as large:
+the torque of the rim, by which a policy feels on which side of it the plug stands, is then as large as the errors of an
+arm's joint torques, and not a quarter of them.
+
+`python -m research.generate connector-search-demonstrations` and `connector-firm-search-demonstrations` record them
+again.
 """
 
 from pathlib import Path
@@ -25,11 +30,13 @@ from guiderail.models.objects.bnc_connector.demonstrations import (
 from guiderail.models.primitives import Demonstrations
 
 PATH = Path(__file__).with_name("bnc_search.npz")
+FIRM_PATH = Path(__file__).with_name("bnc_firm_search.npz")
 
 
 RADIUS = 2.5 * MM  # radius of the circle
 TURN = 0.3  # period of the circle [s], much shorter than the search
 SEARCH_PUSH = 1.5 * MM  # distance of the command below the rim, about two newtons
+FIRM_PUSH = 6.0 * MM  # about nine newtons
 SEARCH = (1.2, 3.0)  # begin and end of the search [s]
 HOLD_UNTIL, IN_BY = 3.6, 4.1  # times when the circle begins to shrink and when it has vanished [s]
 
@@ -61,10 +68,15 @@ _DEVIATIONS = {
 _CORRELATION = 0.3  # correlation time [s]
 
 
-def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
-    """Return the desired poses (M, N, 6) of M demonstrations at `times` (N,) [s], in the locked frame."""
+def demonstrator_motions(seed: int, times: np.ndarray, push: float = SEARCH_PUSH) -> np.ndarray:
+    """Return the desired poses (M, N, 6) of M demonstrations at `times` (N,) [s], in the locked frame.
+
+    `push` is the distance of the command below the rim at the beginning of the search [m].
+    """
     rng = np.random.default_rng(seed)
     script_times, z, yaw = WAYPOINTS.T
+    searches = (script_times >= SEARCH[0]) & (script_times <= SEARCH[1])
+    z = np.where(searches, z + SEARCH_PUSH - push, z)
     remaining = np.clip((IN_BY - times) / (IN_BY - HOLD_UNTIL), 0.0, 1.0)
     radius = RADIUS * remaining**2 * (3.0 - 2.0 * remaining)
     scale = np.stack([np.interp(times, _TIMES, deviation) for deviation in _DEVIATIONS.values()], axis=1)
@@ -79,6 +91,16 @@ def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
     return motions
 
 
+def firm_motions(seed: int, times: np.ndarray) -> np.ndarray:
+    """Return `demonstrator_motions` with the firm push."""
+    return demonstrator_motions(seed, times, FIRM_PUSH)
+
+
 def load() -> Demonstrations:
     """Load the commanded poses: five demonstrations of 400 poses in the locked frame."""
     return Demonstrations.load(PATH)
+
+
+def load_firm() -> Demonstrations:
+    """Load the commanded poses with the firm push, of the same shape."""
+    return Demonstrations.load(FIRM_PATH)

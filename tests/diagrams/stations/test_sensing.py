@@ -61,9 +61,9 @@ def test_payload_is_measured_and_tared():
     """Half a kilogram that the model does not have: five newtons before the tare, none after it."""
     options = {**HARD, "station": "arm", "sensing": "robot", "wrench_bias": (0.0, 0.0), "wrench_scale": (1.0, 1.0)}
     untared, _, _ = free_motion(make_env("BncConnector", payload=0.5, tare=False, **options))
-    assert untared[20:, 2].mean() == pytest.approx(-0.5 * 9.81, abs=0.5)
+    assert untared[12:28, 2].mean() == pytest.approx(-0.5 * 9.81, abs=0.5)
     tared, _, _ = free_motion(make_env("BncConnector", payload=0.5, **options))
-    assert abs(tared[20:, 2].mean()) < 0.3
+    assert abs(tared[12:28, 2].mean()) < 0.3
 
 
 def test_calibration_error_displaces_tool_and_measurement():
