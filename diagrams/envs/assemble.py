@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
-from guiderail.diagrams.envs.observation import Observation, affine
+from guiderail.diagrams.envs.observation import Observation, ObservationTerm, affine
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
@@ -157,6 +157,8 @@ class Loop:
         builder.Connect(guidance.GetOutputPort("desired_pose"), station.get_desired_pose_input_port())
         self.signals = Signals(builder, station.control_period, _vector_ports(station) | _vector_ports(guidance))
         self.signals.add({"action": guidance.GetOutputPort("held_action")})
+        if not station.HasOutputPort("exact_wrench"):
+            self.signals.add({"exact_wrench": station.get_wrench_output_port()})
         self.signals.add(task.signals(builder, station))
         self.space, self.observation = self._add_observation(task)
 
@@ -167,15 +169,21 @@ class Loop:
             image = add_camera(self.builder, station.scene_graph, query, "observation_camera", observed)
             width, height = observed.size
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
-        user = f"the observation of {task.name}"
-        names = [one.signal for one in observed if one.signal not in ("time", "phase")]
-        ports = {name: self.signals.get(name, user) for name in names}
-        duration = task.num_steps * station.control_period
-        sizes = {name: port.size() for name, port in ports.items()}
-        seen = Observation(observed, sizes, duration, task.clip, task.name)
-        diagram = self.builder.AddNamedSystem("observation", seen)
-        for name, port in ports.items():
-            self.builder.Connect(port, diagram.GetInputPort(name))
+        return self.add_terms(task, observed, "observation")
+
+    def add_terms(
+        self, task: Task, terms: Sequence[ObservationTerm], name: str
+    ) -> tuple[gymnasium.spaces.Box, OutputPort]:
+        """Add the diagram `name` of observation terms; return the space and the port of its output."""
+        user = f"the {name} of {task.name}"
+        names = [one.signal for one in terms if one.signal not in ("time", "phase")]
+        ports = {signal: self.signals.get(signal, user) for signal in names}
+        duration = task.num_steps * self.station.control_period
+        sizes = {signal: port.size() for signal, port in ports.items()}
+        seen = Observation(terms, sizes, duration, task.clip, task.name)
+        diagram = self.builder.AddNamedSystem(name, seen)
+        for signal, port in ports.items():
+            self.builder.Connect(port, diagram.GetInputPort(signal))
         return diagram.space, diagram.get_observation_output_port()
 
 
@@ -236,6 +244,8 @@ def build_task_diagram(
                 f"no reward term of {task.name} can be called {name!r}, which is reserved: give it another name"
             )
         exported[name] = reward.get_term_output_port(name)
+    if task.privileged_terms() and station.HasOutputPort("body_poses"):
+        exported["privileged"] = loop.add_terms(task, task.privileged_terms(), "privileged")[1]
     # Outputs that only this guidance has, such as the state of a template.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():

@@ -83,6 +83,9 @@ class DiagramEnv(DrakeGymEnv):
         action_repeat: Control steps per action.
         trace: `EpisodeTrace` of the current episode.
         drawn: Values that the task sampled for it.
+        observes_privileged: True if `privileged` is to be read; False by default.
+        privileged: Privileged observation (m,) that belongs to the last observation, or None.
+        privileged_space: Its space; None if the task has no privileged terms.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
@@ -151,6 +154,14 @@ class DiagramEnv(DrakeGymEnv):
         sizes = {name: port.size() for name, port in self._recorded}
         self.trace = EpisodeTrace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
         self.drawn: dict[str, Any] = {}
+        self._privileged_port = diagram.GetOutputPort("privileged") if diagram.HasOutputPort("privileged") else None
+        self.privileged_space = (
+            None
+            if self._privileged_port is None
+            else gymnasium.spaces.Box(-np.inf, np.inf, (self._privileged_port.size(),), np.float32)
+        )
+        self.observes_privileged = False
+        self.privileged: np.ndarray | None = None
         self._control_steps = 0
         self._running = False
         self._observation: np.ndarray | None = None  # the last valid one
@@ -341,6 +352,8 @@ class DiagramEnv(DrakeGymEnv):
         return np.clip(action, -1.0, 1.0)
 
     def _observe(self, context: Context) -> np.ndarray:
+        if self.observes_privileged and self._privileged_port is not None:
+            self.privileged = self._privileged_port.Eval(context).astype(np.float32)
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
         observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)

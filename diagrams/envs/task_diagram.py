@@ -61,15 +61,18 @@ class Symmetry:
     Attributes:
         observations: Signed permutation of the observation for each of K symmetries, (K, n, n).
         actions: Signed permutation of the action, (K, A, A).
+        privileged: Signed permutation of the privileged observation, (K, m, m); None if it is not declared.
     """
 
     observations: np.ndarray
     actions: np.ndarray
+    privileged: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        if len(self.observations) != len(self.actions):
+        privileged = () if self.privileged is None else self.privileged
+        if len(self.observations) != len(self.actions) or len(privileged) not in (0, len(self.actions)):
             raise ValueError("a symmetry has as many matrices of the action as of the observation")
-        for matrix in (*self.observations, *self.actions):
+        for matrix in (*self.observations, *self.actions, *privileged):
             magnitudes = np.abs(matrix)
             if not (
                 np.isin(matrix, (-1, 0, 1)).all() and (magnitudes.sum(0) == 1).all() and (magnitudes.sum(1) == 1).all()
@@ -83,12 +86,13 @@ class Symmetry:
         size = self.observations.shape[1]
         observations = np.tile(np.eye(size + count), (len(self.observations), 1, 1))
         observations[:, :size, :size] = self.observations
-        return Symmetry(observations, self.actions)
+        return Symmetry(observations, self.actions, self.privileged)
 
     @classmethod
-    def of_signs(cls, observation: ArrayLike, action: ArrayLike) -> Symmetry:
-        """Return the symmetry that multiplies each observed number (n,) and each action (A,) by 1 or −1."""
-        return cls(np.diag(np.asarray(observation, float))[None], np.diag(np.asarray(action, float))[None])
+    def of_signs(cls, observation: ArrayLike, action: ArrayLike, privileged: ArrayLike | None = None) -> Symmetry:
+        """Return the symmetry that multiplies each observed number (n,), action (A,) and privileged number by ±1."""
+        signs = (observation, action) if privileged is None else (observation, action, privileged)
+        return cls(*(np.diag(np.asarray(each, float))[None] for each in signs))
 
 
 @dataclass(frozen=True)
@@ -108,9 +112,10 @@ class TaskDiagram:
     ``desired_pose``        (O,) commanded pose
     ``pose``                (O,) measured pose
     ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
-    ``wrench``              of the surroundings on the tool; this port and the next three are optional
+    ``wrench``              of the surroundings on the tool; this port and the next four are optional
     ``saturation``          (A,) demand on each actuator beyond its limit
     ``collision``           (1,) positive during a collision
+    ``privileged``          (m,) observation of a privileged critic, which the policy does not have
     ``command_timed_out``   (1,) 1 while the last safe pose is held because commands stopped or are not finite
     ``rgb_image``           an abstract `ImageRgba8U`; only if the diagram was built with a camera
     ======================= ================================================================================

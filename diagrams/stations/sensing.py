@@ -17,7 +17,7 @@ Strain gauges drift with their temperature, hardly within one episode. docs/robo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from guiderail.models.common.units import MM
 
@@ -84,7 +84,7 @@ class SensorErrors:
 
 
 # An absolute encoder of 19 bits has steps of 12 µrad, which are 10 µm at a reach of 0.8 m.
-_KINEMATICS = {"calibration_error": (0.15 * MM, 5e-4), "pose_resolution": (1e-5, 1.2e-5)}
+_KINEMATICS: dict[str, Any] = {"calibration_error": (0.15 * MM, 5e-4), "pose_resolution": (1e-5, 1.2e-5)}
 
 SENSING: dict[Sensing, SensorErrors] = {
     "exact": SensorErrors(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task
 from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.units import MM
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE
 from guiderail.models.objects.insertion import COLLISION_FORCE, MIN_CONTACT_FORCE
@@ -74,6 +75,11 @@ def max_wrench(force_limit: float) -> np.ndarray:
     bound = Impedance().with_max_force(force_limit).bound
     assert bound is not None
     return bound.numbers
+
+
+HIDDEN_OFFSET_SCALE = (2.0 * MM, 2.0 * MM, 0.1)
+EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
+"""Scales of a privileged critic's observation: x, y and turn of the fixture, force and torque."""
 
 
 class InsertionReset(ResetOptions):
@@ -150,11 +156,15 @@ class InsertionTask(Task):
             estimate = builder.AddNamedSystem(f"{self.workpiece}_estimate", affine(*observable))
             builder.Connect(station.get_pose_output_port(), estimate.get_input_port())
             return {self.workpiece: estimate.get_output_port()}
+        self.episode_constants["hidden_offset"] = EpisodeConstant(builder, "hidden_offset", 3)
         plant = station.plant
         relative = RelativePoses(plant, [plant.GetBodyByName(self.workpiece)], plant.GetBodyByName(self.fixture))
         builder.AddNamedSystem(f"{self.workpiece}_in_{self.fixture}", relative)
         builder.Connect(station.GetOutputPort("body_poses"), relative.get_body_poses_input_port())
-        return {self.workpiece: relative.get_relative_poses_output_port()}
+        return {
+            self.workpiece: relative.get_relative_poses_output_port(),
+            "hidden_offset": self.episode_constants["hidden_offset"].port,
+        }
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return D (6, 6) and y0 (6,) of the estimate D X_TP + y0 of the workpiece's pose from the robot's pose X_TP.
@@ -168,6 +178,13 @@ class InsertionTask(Task):
         if not getattr(self.options, "bounded_force", True):
             return None
         return Impedance().with_max_force(self.collision.above)
+
+    def privileged_terms(self) -> Sequence[ObservationTerm]:
+        """Return the fixture's actual offset and the exact wrench."""
+        return (
+            ObservationTerm("hidden_offset", 0.0, HIDDEN_OFFSET_SCALE),
+            ObservationTerm("exact_wrench", 0.0, EXACT_WRENCH_SCALE),
+        )
 
     def force_limit(self) -> TerminationTerm:
         """Return the term that ends an episode as a collision above `collision.above` [N], or above a sampled limit."""
@@ -187,6 +204,8 @@ class InsertionTask(Task):
         fixture, workpiece = self.offsets.draw(rng, options)
         self.set_part_offsets(station, context, fixture, workpiece)
         station.set_pose(context, self.start_pose(rng))
+        if "hidden_offset" in self.episode_constants:
+            self.episode_constants["hidden_offset"].set(context, np.resize([*fixture, 0.0], 3))
         sampled: dict[str, Any] = {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
         if self._force_limit_range is not None:
             lowest, highest = self._force_limit_range

@@ -177,6 +177,14 @@ class Task(ABC):
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """Return the terms of the observation `config.observation`, or the camera of an image."""
 
+    def privileged_terms(self) -> Sequence[ObservationTerm]:
+        """Return the terms that only a privileged critic observes, such as what is hidden; none by default.
+
+        Training uses them in simulation. The policy never does. Besides the signals of other terms there is
+        `exact_wrench`, the wrench without errors of sensors.
+        """
+        return ()
+
     @abstractmethod
     def reward_terms(self, num_actions: int) -> Sequence[RewardTerm]:
         """Return the terms of a control step's reward `config.reward`."""

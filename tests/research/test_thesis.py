@@ -68,6 +68,8 @@ OTHER_VALUES = {
     "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
     "time_step": 0.005, "control_period": 0.004, "robot": "other.urdf", "end_effector": "other", "robot_url": "udpm://",
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
+    "wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.1), "wrench_drift": (1.0, 0.1), "wrench_noise": (1.0, 0.1),
+    "wrench_delay": 3, "calibration_error": (0.001, 0.01), "tare": True,
 }  # fmt: skip
 TOGETHER = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}
 """Further options that an option needs to take a value that the thesis does not have."""
@@ -82,7 +84,7 @@ def _another(task, name, field, default):
     words = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
     words["history_source"], words["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
     words["fixture_offset"], words["solver"] = ("per_run", "per_episode", "none"), ("daqp", "osqp")
-    words["kernel"] = ("squared_exponential", "matern52")
+    words["kernel"], words["sensing"] = ("squared_exponential", "matern52"), ("exact", "robot")
     if isinstance(default, bool):
         values = (True, False)
     elif name in words:
@@ -136,7 +138,7 @@ def test_every_non_default_option_is_described_unless_neutral():
     [
         ("BncConnector", {"bound": 0.006}, "bound 0.006 (thesis: 0.002)"),
         ("BncConnector", {"offset_range": (0.0, 0.0)}, "offset range 0, 0 (default: unset)"),
-        ("BncConnector", {"wrench_noise": (5.0, 0.5)}, "wrench noise 5, 0.5 (default: 0, 0)"),
+        ("BncConnector", {"wrench_noise": (5.0, 0.5)}, "wrench noise 5, 0.5 (default: unset)"),
         ("BncConnector", {"difficulty": "hard", "force_limit": 35.0}, "force limit 35 (default: 20)"),
         ("Pouring", {"active_constraints": False}, "active constraints no (thesis: yes)"),
         ("Pouring", {"guidance": "none", "active_constraints": True}, "active constraints yes (default: unset)"),

@@ -79,6 +79,7 @@ def test_sample_is_skipped_when_it_is_not_finite(arm, port):
     simulator.AdvanceTo(0.035)
     np.testing.assert_array_equal(system.get_wrench_output_port().Eval(context), before)
     values[port].GetMutableData().set_value(sound[port])
+    values["external_torque"].GetMutableData().set_value(2.0 * sound["external_torque"])
     simulator.AdvanceTo(1.0)
     assert np.isfinite(system.get_wrench_output_port().Eval(context)).all()
     assert np.linalg.norm(system.get_wrench_output_port().Eval(context) - before) > 0.1

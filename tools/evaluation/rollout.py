@@ -27,6 +27,8 @@ class Transition:
         terminated: True if the task ended the episode.
         truncated: True if the episode ended for another reason.
         info: `info` of the environment's step.
+        privileged: Privileged observation before the action, (m,), if the environment observes it.
+        next_privileged: Privileged observation after the action, (m,).
     """
 
     observation: np.ndarray
@@ -36,6 +38,8 @@ class Transition:
     terminated: bool
     truncated: bool
     info: Mapping[str, Any]
+    privileged: np.ndarray | None = None
+    next_privileged: np.ndarray | None = None
 
     @property
     def is_last(self) -> bool:
@@ -121,9 +125,12 @@ def rollout(
     infos: list[Mapping[str, Any]] = []  # of an environment of another origin
     is_over = False
     while not is_over:
-        action = act(observation)
+        action, privileged = act(observation), getattr(base, "privileged", None)
         following, reward, terminated, truncated, info = env.step(action)
-        transition = Transition(observation, action, float(reward), following, terminated, truncated, info)
+        transition = Transition(
+            observation, action, float(reward), following, terminated, truncated, info,
+            privileged, getattr(base, "privileged", None),
+        )  # fmt: skip
         total += transition.reward
         terms = {name: value + float(info[name]) for name, value in terms.items()}
         if not is_own:

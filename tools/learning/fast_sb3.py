@@ -70,8 +70,10 @@ class FastTrainingStep(_Algorithm):
         for network in (actor, critic):
             if any(True for _ in network.features_extractor.parameters()):
                 raise TypeError("gradients are written out for feature extractors without parameters")
-        self._features, self._actions = actor.features_dim, self.action_space.shape[0]
-        trunk, head = [self._features, *actor.net_arch], [actor.net_arch[-1], self._actions]
+        # A privileged critic has further features, after those of the actor.
+        self._features, self._actions = critic.features_extractor.features_dim, self.action_space.shape[0]
+        self._actor_features = actor.features_dim
+        trunk, head = [self._actor_features, *actor.net_arch], [actor.net_arch[-1], self._actions]
         shared = sum(_num_parameters(*pair) for pair in pairwise(trunk))
         values, gradient = actor.optimizer.values, actor.optimizer.gradient
         # The mean and the logarithm of the standard deviation are two networks on one trunk.
@@ -101,9 +103,9 @@ class FastTrainingStep(_Algorithm):
 
     def _train_batches(self, data: ReplayBufferSamples, steps: int, batch_size: int) -> None:
         """Take `steps` gradient steps on consecutive batches of `data`."""
-        actor, features = self.policy.actor, self._features
-        now = actor.extract_features(data.observations, actor.features_extractor)
-        following = actor.extract_features(data.next_observations, actor.features_extractor)
+        critic, features = self.policy.critic, self._features
+        now = critic.extract_features(data.observations, critic.features_extractor)
+        following = critic.extract_features(data.next_observations, critic.features_extractor)
         taken = torch.cat([now, data.actions], dim=1).view(steps, batch_size, -1)
         states = torch.empty(steps, 2 * batch_size, taken.shape[-1])
         states[:, :batch_size, :features] = now.view(steps, batch_size, -1)
@@ -136,7 +138,7 @@ class FastTrainingStep(_Algorithm):
             log_density: (2B, 1), logarithm of the density of the noise.
         """
         batch = len(taken)
-        (mean, log_std), actor_cache = self._actor.forward(states[None, :, : self._features])
+        (mean, log_std), actor_cache = self._actor.forward(states[None, :, : self._actor_features])
         clamped = log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
         deviation = clamped.exp().mul_(noise)
         actions = torch.tanh(mean + deviation)

@@ -30,6 +30,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.asymmetric import observe_privileged, with_privileged
 from guiderail.tools.learning.checkpoint import CheckpointSelection
 from guiderail.tools.learning.config import OffPolicyConfig, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
@@ -201,7 +202,11 @@ class OffPolicyLearner(Learner):
         is_fast = config.training_step == "fast" and self.fast_algorithm is not None and not config.dropout
         algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
         accepted = inspect.signature(algorithm).parameters  # not every algorithm has an entropy coefficient
-        self.model = algorithm("MlpPolicy", env, **{k: v for k, v in arguments.items() if k in accepted})
+        policy: Any = "MlpPolicy"
+        self._num_privileged = 0  # entries of an observation in the replay buffer after those of the policy
+        if config.privileged_critic:
+            env, policy, self._num_privileged = observe_privileged(env, algorithm, self.symmetry)
+        self.model = algorithm(policy, env, **{k: v for k, v in arguments.items() if k in accepted})
         buffer = DemonstrationReplayBuffer if config.demonstration_fraction else NStepReplayBuffer
         self.model.replay_buffer = buffer(
             self._copies * self.model.buffer_size,
@@ -286,6 +291,8 @@ class OffPolicyLearner(Learner):
             return self._constant_action
         if not self.is_learning():
             return self._uniform()
+        if self._num_privileged:  # the actor ignores these entries
+            observation = np.concatenate([observation, np.zeros(self._num_privileged, observation.dtype)])
         if not self._is_greedy:
             extended = self._temporally_extended()
             return self.explore(observation) if extended is None else extended
@@ -333,6 +340,9 @@ class OffPolicyLearner(Learner):
             observations.extend(self.symmetry.observations @ observation)
             actions.extend(self.symmetry.actions @ action)
             next_observations.extend(self.symmetry.observations @ following)
+        if self._num_privileged:
+            observations = with_privileged(observations, transition.privileged, self.symmetry)
+            next_observations = with_privileged(next_observations, transition.next_privileged, self.symmetry)
         self.model.replay_buffer.add(
             np.array(observations),
             np.array(next_observations),

@@ -180,7 +180,11 @@ class PipelinedLearner(Learner):
         learned_arrays, learned_values = self._receive()
         arrays, values = self._acting.state()
         pending = self._pending or []
-        stored = {f"pending/{name}": np.array([getattr(one, name) for one in pending]) for name in _STORED if pending}
+        stored = {
+            f"pending/{name}": np.array([getattr(one, name) for one in pending])
+            for name in _STORED
+            if pending and getattr(pending[0], name) is not None
+        }
         both = {f"acting/{k}": v for k, v in arrays.items()} | {f"learning/{k}": v for k, v in learned_arrays.items()}
         return both | stored, {"acting": values, "learning": learned_values}
 
@@ -195,8 +199,9 @@ class PipelinedLearner(Learner):
         if (message := self._receive()) is not None:
             raise ValueError(message)
         if parts["pending"]:
-            columns = zip(*(parts["pending"][name] for name in _STORED), strict=True)
-            self._pending = [Transition(**dict(zip(_STORED, one, strict=True)), info={}) for one in columns]
+            names = [name for name in _STORED if name in parts["pending"]]
+            columns = zip(*(parts["pending"][name] for name in names), strict=True)
+            self._pending = [Transition(**dict(zip(names, one, strict=True)), info={}) for one in columns]
         self.submit_episode()
 
     def _send(self, message: tuple[Any, ...]) -> None:
@@ -222,7 +227,9 @@ class PipelinedLearner(Learner):
 
 
 # Fields of a transition that a learner uses.
-_STORED = ("observation", "action", "reward", "next_observation", "terminated", "truncated")
+_STORED = (
+    "observation", "action", "reward", "next_observation", "terminated", "truncated", "privileged", "next_privileged",
+)  # fmt: skip
 
 
 class SpacesOnlyEnv(gymnasium.Env):
@@ -231,6 +238,7 @@ class SpacesOnlyEnv(gymnasium.Env):
     def __init__(self, env: gymnasium.Env):
         """Copy the spaces of `env`."""
         self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.privileged_space = getattr(env.unwrapped, "privileged_space", None)
 
 
 def _process_ended_error() -> InputError:

@@ -53,18 +53,19 @@ def half_turn(observation: str) -> tuple[float, ...]:
     return (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
 
 
-def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray] | None:
+def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
 
     Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components about the axis
     stay.
 
     Returns:
-        Matrices of observations (7, n, n) and of actions (7, A, A); None if actions move x and not y, or one tilt.
+        Matrices of observations (7, n, n), of actions (7, A, A) and of what a privileged critic observes, (7, 9, 9);
+        None if actions move x and not y, or one tilt.
     """
     quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
-    observations, actions, outputs = [], [], list(action_dims)
+    observations, actions, privileged, outputs = [], [], [], list(action_dims)
     for across in [*turns[1:], *(turn @ mirror for turn in turns)]:
         axial = np.linalg.det(across).round() * across
         # In a pose, Ry comes before Rx.
@@ -73,9 +74,10 @@ def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.n
         further = () if observation == "state" else (across, across)
         observations.append(block_diag(np.eye(1), pose, wrench, *further))
         actions.append(pose[np.ix_(outputs, outputs)])
+        privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
     if any((np.abs(action).sum(0) != 1).any() for action in actions):
         return None
-    return np.array(observations), np.array(actions)
+    return np.array(observations), np.array(actions), np.array(privileged)
 
 
 # The thesis gives no unit of f; here it is 10 N and 0.5 Nm.

@@ -26,7 +26,7 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import (
     reward_terms,
     sides_of_the_rim,
 )
-from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, HALF_TURN_OF_WRENCH, BncWorkcell
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion
 from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
@@ -174,7 +174,8 @@ class BncConnector(DemonstratedInsertion):
 
     def symmetry(self) -> Symmetry:
         """Return half a turn about the jack's axis."""
-        signs = Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()])
+        privileged = (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH)
+        signs = Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()], privileged)
         return signs.padded(len(self.force_limit_terms()))
 
     def near_symmetry(self) -> Symmetry:

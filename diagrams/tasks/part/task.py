@@ -198,7 +198,7 @@ class PartInsertion(DemonstratedInsertion):
         chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
         if every is None or not chosen:
             return None
-        return Symmetry(every[0][chosen], every[1][chosen]).padded(len(self.force_limit_terms()))
+        return Symmetry(*(matrices[chosen] for matrices in every)).padded(len(self.force_limit_terms()))
 
     @classmethod
     def is_seated(cls, plug: np.ndarray) -> bool:
