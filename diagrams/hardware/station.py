@@ -18,7 +18,14 @@ from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_ra
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.impedance_control import add_controller, add_energy_tank
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import Impedance, Station, export_station_ports, to_wrench_order
+from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
+from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
+    Impedance,
+    Station,
+    export_station_ports,
+    to_wrench_order,
+)
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, StatusLimits
@@ -30,6 +37,7 @@ from guiderail.systems.status_watchdog import StatusWatchdog
 from guiderail.systems.support.declarations import output_getter
 from guiderail.systems.torque_publisher import TorquePublisher
 from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
+from guiderail.systems.wrench_tare import WrenchTare
 
 
 class HardwareOptions(Options):
@@ -93,6 +101,7 @@ class HardwareStation(Station):
         robot_url: str = "",
         limits: SafetyLimits | None = None,
         status_limits: StatusLimits | None = None,
+        tare: bool = False,
     ):
         """Construct the station.
 
@@ -110,6 +119,8 @@ class HardwareStation(Station):
             limits: Limits of measurements and torques; `safety_limits` by default.
             status_limits: Limits of a status; by default they follow from the joints' velocities, the period and the
                 driver's hold-off.
+            tare: Subtract the wrench that is measured after the start, when the tool must be free, from the output
+                `wrench`. The limits of safety use the wrench without it.
 
         Raises:
             InputError: If the robot has no driver, the address is unusable, or the settling time is shorter than the
@@ -133,7 +144,7 @@ class HardwareStation(Station):
                 f"long, not {self.status_limits.settling_time:g} s"
             )
         self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
-        self._robot_timeout, self._wrench_time_constant = robot_timeout, wrench_time_constant
+        self._robot_timeout, self._wrench_time_constant, self._tare = robot_timeout, wrench_time_constant, tare
         self._build()
 
     def _build(self) -> None:
@@ -203,12 +214,18 @@ class HardwareStation(Station):
             publisher = builder.AddNamedSystem("publisher", TorquePublisher(self.driver.write, n, period=period))
             builder.Connect(limiter.get_safe_torque_output_port(), publisher.get_torque_input_port())
             builder.Connect(limiter.get_is_sending_output_port(), publisher.get_is_sending_input_port())
+        measured_wrench = wrench.get_wrench_output_port()
+        if self._tare:
+            skipped, averaged = (max(round(n * CONTROL_PERIOD / period), 1) for n in (TARE_SKIPPED, TARE_AVERAGED))
+            tare = builder.AddNamedSystem("tare", WrenchTare(period, skipped, averaged))
+            builder.Connect(measured_wrench, tare.get_measured_wrench_input_port())
+            measured_wrench = tare.get_tared_wrench_output_port()
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
             watchdog.get_command_time_input_port(),
             pose=pose,
-            wrench=wrench.get_wrench_output_port(),
+            wrench=measured_wrench,
             contact_force=impedance_monitor.get_contact_force_output_port(),
             saturation=controller.get_saturation_output_port(),
             command_timed_out=limiter.get_not_following_output_port(),
@@ -309,6 +326,7 @@ class HardwareStation(Station):
             robot=self._robot,
             limits=self.limits,
             status_limits=self.status_limits,
+            tare=self._tare,
         )
 
     def estimate_force(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:

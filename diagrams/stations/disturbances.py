@@ -140,6 +140,11 @@ class Disturbances(Options):
         return replace(errors, **given, joint_torque=joint_torque)
 
     @property
+    def is_named_only(self) -> bool:
+        """True if nothing but `sensing` and `tare` is given."""
+        return self == type(self).model_validate({"sensing": self.sensing, "tare": self.tare})
+
+    @property
     def any(self) -> bool:
         """True if any disturbance is on."""
         undisturbed = type(self).model_validate({})
@@ -347,6 +352,10 @@ def disturbed(
     arguments: dict[str, Any] = {} if impedance is None else {"impedance": impedance}
     if not disturbances.any:
         return build(**arguments)
+    if not is_simulated and disturbances.is_named_only:
+        # A robot has its own errors; what the setting adds to it is the tare.
+        can_tare = "tare" in inspect.signature(build).parameters
+        return build(**arguments, **({"tare": True} if can_tare and disturbances.errors.tare else {}))
     if not is_simulated:
         raise InputError(f"station={name!r} is a real robot, which has disturbances of its own: leave them out")
     if disturbances.stiffness_factor != 1.0:

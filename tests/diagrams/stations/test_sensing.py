@@ -5,6 +5,7 @@ import pytest
 
 from guiderail import InputError, make_env
 from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
 from guiderail.diagrams.stations.sensing import SENSING, TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.units import MM
@@ -119,6 +120,18 @@ def test_setting_can_be_changed_in_a_stored_configuration():
     changed = EnvConfig.resolve("BncConnector", {**stored, "sensing": "exact"})
     assert not changed.parts["disturbances"].any
     assert EnvConfig.resolve("BncConnector", stored).options == stored
+
+
+@pytest.mark.parametrize(("sensing", "tares"), [("robot", True), ("exact", False)])
+def test_robot_itself_adds_its_errors_and_is_tared(sensing, tares):
+    options = {"station": "hardware", "robot_url": "memq://", "sensing": sensing}
+    task = EnvConfig.resolve("BncConnector", options).make_task()
+    station = make_station(task)
+    for one in (station, station.clone(task.workcell())):
+        assert any(system.get_name() == "tare" for system in one.GetSystems()) == tares
+    noisy = EnvConfig.resolve("BncConnector", {**options, "wrench_noise": (0.1, 0.01)}).make_task()
+    with pytest.raises(InputError, match="disturbances of its own"):
+        make_station(noisy)
 
 
 def test_exact_setting_adds_nothing():
