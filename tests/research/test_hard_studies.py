@@ -15,6 +15,7 @@ HARD = (
     "pouring_balls_baselines",
     "narrow_passage_hard",
     "narrow_passage_hard_baselines",
+    "connector_robot_sensing",
 )
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
 # Study whose policies a sweep evaluates.

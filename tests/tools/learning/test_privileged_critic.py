@@ -189,9 +189,9 @@ def test_pipelined_run_resumes_to_the_same_policy(tmp_path):
         "fixture_offset": "none", "action_repeat": 50, "sensing": "robot",
         "settings": {**SETTINGS, "pipelined": True, "train_freq": 4, "gradient_steps": 2}, "preset": "tqc_contact",
     }  # fmt: skip
-    whole = train("GridClamp", out=tmp_path / "whole", episodes=3, seed=1, **options)
-    train("GridClamp", out=tmp_path / "resumed", episodes=2, seed=1, **options)
-    resumed = train("GridClamp", out=tmp_path / "resumed", episodes=3, resume=True)
+    whole = train("GridClamp", out=tmp_path / "whole", episodes=2, seed=1, **options)
+    train("GridClamp", out=tmp_path / "resumed", episodes=1, seed=1, **options)
+    resumed = train("GridClamp", out=tmp_path / "resumed", episodes=2, resume=True)
     seen = np.zeros(whole.policy.description["observation_shape"], np.float32)
     np.testing.assert_array_equal(whole.policy(seen), resumed.policy(seen))
     assert (tmp_path / "whole/policy.safetensors").read_bytes() == (
