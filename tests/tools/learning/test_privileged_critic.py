@@ -16,8 +16,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition, rollout
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
-from guiderail.tools.learning.pipelined import SpacesOnlyEnv
-from guiderail.tools.learning.train import train
+from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 
 OBSERVED, HIDDEN = 5, 3
 SETTINGS = {"net_arch": "16", "batch_size": 8, "learning_starts": 4, "symmetry": False, "privileged_critic": True}
@@ -184,16 +183,36 @@ def test_rollout_passes_what_is_hidden_to_callbacks_only():
     assert not np.array_equal(transitions[0].privileged, transitions[-1].next_privileged)
 
 
-def test_pipelined_run_resumes_to_the_same_policy(tmp_path):
-    options = {
-        "fixture_offset": "none", "action_repeat": 50, "sensing": "robot",
-        "settings": {**SETTINGS, "pipelined": True, "train_freq": 4, "gradient_steps": 2}, "preset": "tqc_contact",
-    }  # fmt: skip
-    whole = train("GridClamp", out=tmp_path / "whole", episodes=2, seed=1, **options)
-    train("GridClamp", out=tmp_path / "resumed", episodes=1, seed=1, **options)
-    resumed = train("GridClamp", out=tmp_path / "resumed", episodes=2, resume=True)
-    seen = np.zeros(whole.policy.description["observation_shape"], np.float32)
-    np.testing.assert_array_equal(whole.policy(seen), resumed.policy(seen))
-    assert (tmp_path / "whole/policy.safetensors").read_bytes() == (
-        tmp_path / "resumed/policy.safetensors"
-    ).read_bytes()
+def test_pipelined_learner_restores_a_pending_episode(forkserver):
+    """The pending episode of a checkpoint holds what is hidden, too."""
+
+    def pipelined():
+        config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"train_freq": 1, "gradient_steps": 1})
+        named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
+        env = SpacesOnlyEnv(Vector())
+        return PipelinedLearner(TqcLearner(config, env, **named), ((config, env), named), waits=True)
+
+    def episode(learner, seed):
+        random = np.random.default_rng(seed)
+        learner.on_episode_start()
+        for _ in range(8):
+            seen, hidden = random.uniform(-1, 1, OBSERVED), random.uniform(-1, 1, HIDDEN)
+            seen, hidden = seen.astype(np.float32), hidden.astype(np.float32)
+            action = learner.act(seen)
+            learner.on_step(Transition(seen, action, 1.0, seen, False, False, {}, hidden, hidden))
+        learner.on_episode_end({"termination": "success", "success": True})
+
+    whole, resumed = pipelined(), pipelined()
+    episode(whole, 0)
+    arrays, values = whole.state()
+    assert arrays["pending/privileged"].shape == (8, HIDDEN)
+    random_state = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    whole.submit_episode()
+    whole.finish()
+    torch.set_rng_state(random_state[0])
+    np.random.set_state(random_state[1])  # noqa: NPY002
+    resumed.restore(arrays, values)
+    resumed.finish()
+    seen = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
+    policies = [learner.policy({"observation_shape": [OBSERVED]}) for learner in (whole, resumed)]
+    np.testing.assert_array_equal(policies[0](seen), policies[1](seen))
