@@ -183,7 +183,7 @@ def test_rollout_passes_what_is_hidden_to_callbacks_only():
     assert not np.array_equal(transitions[0].privileged, transitions[-1].next_privileged)
 
 
-def test_pipelined_learner_restores_a_pending_episode(forkserver):
+def test_pipelined_learner_restores_a_pending_episode():
     """The pending episode of a checkpoint holds what is hidden, too."""
 
     def pipelined():
