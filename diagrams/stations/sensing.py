@@ -2,12 +2,12 @@
 
 Data sheets and papers that the numbers come from, by their number in docs/bibliography.md:
 
-- An arm with joint torque sensors [23]: at the tool a noise of 0.035 N and 0.005 Nm, a repeatability of 0.15 N and
+- An arm with joint torque sensors [25]: at the tool a noise of 0.035 N and 0.005 Nm, a repeatability of 0.15 N and
   0.05 Nm, and an accuracy of 0.8 N and 0.15 Nm.
-- Another one [24]: pose repeatability of 0.15 mm, joint torques accurate to 2 % of the largest ones.
-- An arm with a sensor at its flange [25]: precision of 3.5 N and 0.2 Nm, accuracy of 4 N and 0.3 Nm.
-- A wrist sensor [26]: resolution of 0.0125 N and 0.00075 Nm, uncertainty of about 1 % of the range.
-- An identified dynamic model of the first arm, with friction [27].
+- Another one [26]: pose repeatability of 0.15 mm, joint torques accurate to 2 % of the largest ones.
+- An arm with a sensor at its flange [27]: precision of 3.5 N and 0.2 Nm, accuracy of 4 N and 0.3 Nm.
+- A wrist sensor [28]: resolution of 0.0125 N and 0.00075 Nm, uncertainty of about 1 % of the range.
+- An identified dynamic model of the first arm, with friction [29].
 
 Noise of 0.01 % of a joint's largest torque gives the first arm's tool the noise of its data sheet; friction of 0.02 %
 stays within its repeatability. Offsets and errors of the model are much larger before the tare: newtons at the tool.
