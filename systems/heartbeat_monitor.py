@@ -1,30 +1,34 @@
-"""Monitor of the heartbeat of a robot-side safety monitor."""
+"""Monitor of the heartbeats of robot-side safety monitors."""
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault, Heartbeat
+from guiderail.models.control.joint_status import MAX_SENDERS, Fault, Heartbeat
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+
+FORGET_TIME = 1.0  # time for which a silent monitor is missed while another one is alive [s]
 
 
 class HeartbeatMonitor(LeafSystem):
-    """Raise a fault when the robot-side safety monitor reports a stop or its heartbeat times out.
+    """Raise a fault when a robot-side safety monitor reports a stop or its heartbeat times out.
 
-    No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
+    Each sender has a timeout of its own, so that one monitor cannot hide that another one has exited. A monitor that
+    was replaced is missed for `FORGET_TIME`, and for good if no other one is alive. No fault is raised before the first
+    heartbeat, so that a robot without a safety monitor can be used.
 
     .. pydrake_system::
 
         name: HeartbeatMonitor
         input_ports:
-        - heartbeat
+        - heartbeats
         - status_fault
         output_ports:
         - fault
 
-    ``heartbeat`` is abstract: the newest `Heartbeat`, or None. ``status_fault`` and ``fault`` are (1,), codes of
-    `Fault`; a status fault takes precedence.
+    ``heartbeats`` is abstract: a tuple with the newest `Heartbeat` of each sender. ``status_fault`` and ``fault`` are
+    (1,), codes of `Fault`; a status fault takes precedence.
 
     Args:
         period: Sampling period [s], positive.
@@ -40,16 +44,17 @@ class HeartbeatMonitor(LeafSystem):
         if not 0.0 < timeout < np.inf:
             raise InputError(f"the heartbeat timeout must be positive, not {timeout} s")
         self._period, self._timeout = period, timeout
-        self._heartbeat_port = self.DeclareAbstractInputPort("heartbeat", Value[object]())
+        self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
-        # [sequence number of the newest heartbeat, NaN before the first; time since that heartbeat in s]
-        self._state = self.DeclareDiscreteState([np.nan, 0.0])
+        # For each sender [sender, NaN if none; its last sequence number; time since that heartbeat in s].
+        self._initial = np.tile([np.nan, 0.0, 0.0], MAX_SENDERS)
+        self._state = self.DeclareDiscreteState(self._initial)
         self._fault_port = self.DeclareVectorOutputPort(
             "fault",
             1,
             self._calc_fault,
             prerequisites_of_calc={
-                self._heartbeat_port.ticket(),
+                self._heartbeats_port.ticket(),
                 self._status_fault_port.ticket(),
                 self.discrete_state_ticket(self._state),
             },
@@ -57,37 +62,49 @@ class HeartbeatMonitor(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    get_heartbeat_input_port = input_getter("heartbeat", "newest `Heartbeat`; any other object counts as none")
+    get_heartbeats_input_port = input_getter("heartbeats", "newest `Heartbeat` of each sender; other objects are none")
     get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
     get_fault_output_port = output_getter("fault", "combined fault, (1,), a code of `Fault`")
 
     def is_alive(self, context: Context) -> bool:
         """Return True if a heartbeat has been received and has not timed out."""
-        return self._heartbeat(context) is not None and not self._has_timed_out(context)
+        return bool((self._senders(context)[:, 2] <= self._timeout).any())
 
-    def _heartbeat(self, context: Context) -> Heartbeat | None:
-        value = self._heartbeat_port.Eval(context)
-        return value if isinstance(value, Heartbeat) else None
+    def _heartbeats(self, context: Context) -> tuple[Heartbeat, ...]:
+        value = self._heartbeats_port.Eval(context)
+        return value if isinstance(value, tuple) else ()
 
-    def _has_timed_out(self, context: Context) -> bool:
-        heartbeat = self._heartbeat(context)
-        last_sequence, age = context.get_discrete_state(self._state).value()
-        return heartbeat is not None and heartbeat.sequence == last_sequence and age > self._timeout
+    def _senders(self, context: Context) -> np.ndarray:
+        """Return sender, sequence and age of each known monitor, (m, 3), with the newest heartbeats."""
+        senders = context.get_discrete_state(self._state).value().reshape(-1, 3)
+        known = {sender: (sequence, age) for sender, sequence, age in senders.tolist() if np.isfinite(sender)}
+        for heartbeat in self._heartbeats(context):
+            sequence, _ = known.get(heartbeat.sender, (-np.inf, 0.0))
+            if heartbeat.sequence > sequence:
+                known[heartbeat.sender] = (heartbeat.sequence, 0.0)
+        rows = sorted((age, sender, sequence) for sender, (sequence, age) in known.items())[:MAX_SENDERS]
+        return np.array([(sender, sequence, age) for age, sender, sequence in rows]).reshape(-1, 3)
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value([np.nan, 0.0])
+        discrete_state.set_value(self._initial)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        heartbeat = self._heartbeat(context)
-        last_sequence, age = context.get_discrete_state(self._state).value()
-        if heartbeat is not None and heartbeat.sequence != last_sequence:
-            discrete_state.set_value([heartbeat.sequence, 0.0])
-        else:
-            discrete_state.set_value([last_sequence, age + self._period])
+        state, senders = self._initial.copy(), self._senders(context)
+        senders[:, 2] += self._period
+        state[: senders.size] = senders.ravel()
+        discrete_state.set_value(state)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         fault = float(self._status_fault_port.Eval(context)[0])
-        heartbeat = self._heartbeat(context)
-        if fault == Fault.NONE and heartbeat is not None and (heartbeat.is_stopping or self._has_timed_out(context)):
+        if fault == Fault.NONE and self._is_stopping_or_missing(context):
             fault = float(Fault.MONITOR_STOP)
         output.SetAtIndex(0, fault)
+
+    def _is_stopping_or_missing(self, context: Context) -> bool:
+        ages = {sender: age for sender, _, age in self._senders(context).tolist()}
+        is_alive = {sender: age <= self._timeout for sender, age in ages.items()}
+        is_stopping = any(
+            heartbeat.is_stopping and is_alive.get(heartbeat.sender, False) for heartbeat in self._heartbeats(context)
+        )
+        is_missing = any(not alive and ages[sender] <= FORGET_TIME for sender, alive in is_alive.items())
+        return is_stopping or is_missing or (bool(ages) and not any(is_alive.values()))

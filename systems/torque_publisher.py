@@ -12,37 +12,54 @@ from guiderail.systems.support.declarations import check_period, input_getter
 class TorquePublisher(LeafSystem):
     """Publish joint torques once per period while enabled; otherwise no message is sent, not even zeros.
 
+    While the driver is to hold the arm, it is asked to do so once per period instead.
+
     .. pydrake_system::
 
         name: TorquePublisher
         input_ports:
         - torque
         - is_sending
+        - is_holding
 
-    ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0.
+    ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0. ``is_holding``
+    is (1,); `hold` is called while it is 1.
 
     Args:
         write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
         num_joints: n, at least 1.
         period: Publishing period [s], positive.
+        hold: Function that asks the driver to hold the arm, such as `Driver.hold`.
 
     Raises:
         InputError: If an argument is out of range.
     """
 
-    def __init__(self, write: Callable[[np.ndarray, float], None], num_joints: int, *, period: float):
+    def __init__(
+        self,
+        write: Callable[[np.ndarray, float], None],
+        num_joints: int,
+        *,
+        period: float,
+        hold: Callable[[], None],
+    ):
         super().__init__()
         check_period(period)
         if num_joints < 1:
             raise InputError(f"torques are sent to at least one joint, not {num_joints}")
-        self._write = write
+        self._write, self._hold = write, hold
         self._torque_port = self.DeclareVectorInputPort("torque", num_joints)
         self._is_sending_port = self.DeclareVectorInputPort("is_sending", 1)
+        self._is_holding_port = self.DeclareVectorInputPort("is_holding", 1)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
     get_torque_input_port = input_getter("torque", "torques, (n,) [Nm]")
     get_is_sending_input_port = input_getter("is_sending", "enable flag, (1,); no message is sent while it is 0")
 
+    get_is_holding_input_port = input_getter("is_holding", "flag that the driver holds the arm, (1,)")
+
     def _publish(self, context: Context) -> None:
-        if self._is_sending_port.Eval(context)[0] > 0.0:
+        if self._is_holding_port.Eval(context)[0] > 0.0:
+            self._hold()
+        elif self._is_sending_port.Eval(context)[0] > 0.0:
             self._write(self._torque_port.Eval(context), context.get_time())

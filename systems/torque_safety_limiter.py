@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault, damping_torque
+from guiderail.models.control.joint_status import STATUS_FAULTS, Fault, damping_torque
 from guiderail.systems.support.declarations import (
     check_period,
     declare_cache,
@@ -24,7 +24,6 @@ _STATE_TIME = 2  # time since the arm state changed [s]
 _BLEND_FACTOR = 3  # from 0 to 1
 
 ZERO_TORQUE_TIME = 0.05  # zero torque is sent this long to a robot without status before publishing stops [s]
-MAX_VELOCITY_AGE = 0.1  # maximum age of a velocity measurement used for damping [s]
 
 
 class ArmState(IntEnum):
@@ -80,14 +79,14 @@ class TorqueSafetyLimiter(LeafSystem):
 
     The blend factor a increases from 0 to 1 in the ramp time. The freshness f is 1 for a status that is at most one
     period old and 0 for one that is two periods old, because torques computed from an old state would accelerate the
-    arm. τ_damping (`damping_torque`) reduces all joint velocities with the decay time. If no status arrives, the
-    momentum of the last status and the impulses applied since are damped once.
+    arm. τ_damping (`damping_torque`) reduces the velocity with the decay time, at the inertia of the last accepted
+    positions. Its velocity is estimated from several sources and decays by prediction when no status is accepted.
 
     A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
-    the start the limiter waits for a valid status and then takes over by itself. If a robot returns after a timeout
-    with a clock that was set back, its controller has restarted and its velocity is unknown: zero torque is commanded.
-    The output is always finite and within the torque limits. While a robot sends no status nothing is sent to it, nor
-    immediately after its return.
+    the start the limiter waits for a valid status and then takes over by itself. The output is always finite and within
+    the torque limits; zero torque is the robot's own gravity compensation. While a robot sends no status nothing is
+    sent to it, nor immediately after its return. A driver that can hold the arm by itself (brakes, position control)
+    is asked to do so when a status fault stopped the arm.
 
     .. pydrake_system::
 
@@ -101,7 +100,7 @@ class TorqueSafetyLimiter(LeafSystem):
         - desired_pose
         - status_fault
         - status_age
-        - status_is_new
+        - velocity
         - command_timed_out
         output_ports:
         - safe_torque
@@ -109,27 +108,30 @@ class TorqueSafetyLimiter(LeafSystem):
         - arm_state
         - blend_factor
         - is_sending
+        - is_holding
         - not_following
 
     ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,), ``external_torque`` (n,)
     [Nm], ``wrench`` (6,), force first. ``pose`` and ``desired_pose`` are (6,); their positions are checked.
-    ``status_fault``, ``status_age`` and ``status_is_new`` are (1,), outputs of a `StatusWatchdog`.
+    ``status_fault`` and ``status_age``, (1,), and ``velocity``, (n,) [rad/s], are outputs of a `StatusWatchdog`.
     ``command_timed_out`` is (1,), the output of a `CommandWatchdog`.
 
     ``fault`` is (1,), the code of the `Fault` that stopped the arm, or 0. ``arm_state`` is (1,), a value of `ArmState`.
-    ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are sent. ``not_following`` (1,) is 1 while the
-    desired pose is not followed: the arm is stopped or taking over, or no valid command is available.
+    ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are sent. ``is_holding`` (1,) is 1 while the
+    driver holds the arm instead. ``not_following`` (1,) is 1 while the desired pose is not followed: the arm is stopped
+    or taking over, or no valid command is available.
 
     Args:
         plant: Model of the arm and its payload alone, finalized; its inertia is used.
         limits: Limits of measured and sent values.
         period: Period of the torque commands [s], positive.
+        can_hold: True if the driver can hold the arm.
 
     Raises:
         InputError: If an argument is out of range.
     """
 
-    def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float):
+    def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float, can_hold: bool = False):
         super().__init__()
         check_period(period)
         num_joints = plant.num_positions()
@@ -138,7 +140,7 @@ class TorqueSafetyLimiter(LeafSystem):
         if limits.decay_time < 2.0 * period:
             raise InputError(f"an arm can't come to rest within {limits.decay_time} s at a period of {period} s")
         self._plant, self._limits, self._period, self._num_joints = plant, limits, period, num_joints
-        self._torque_limits = np.array(limits.torque)
+        self._torque_limits, self._can_hold = np.array(limits.torque), can_hold
 
         self._torque_port = self.DeclareVectorInputPort("torque", num_joints)
         self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)
@@ -148,10 +150,9 @@ class TorqueSafetyLimiter(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
-        self._status_is_new_port = self.DeclareVectorInputPort("status_is_new", 1)
+        self._velocity_port = self.DeclareVectorInputPort("velocity", num_joints)
         self._command_timed_out_port = self.DeclareVectorInputPort("command_timed_out", 1)
         self._state = self.DeclareDiscreteState(4)
-        self._impulse = self.DeclareDiscreteState(num_joints)  # applied since the last status [Nms]
 
         state, status_fault = {self.discrete_state_ticket(self._state)}, {self._status_fault_port.ticket()}
         measured = {
@@ -183,10 +184,8 @@ class TorqueSafetyLimiter(LeafSystem):
             self._calc_safe_torque,
             prerequisites_of_calc=present_fault
             | state
-            | status_fault
             | {self._torque_port.ticket(), self._estimated_state_port.ticket()}
-            | {self._status_age_port.ticket(), self._status_is_new_port.ticket()}
-            | {self.discrete_state_ticket(self._impulse)},
+            | {self._status_age_port.ticket(), self._velocity_port.ticket()},
         )
         self._fault_port = self.DeclareVectorOutputPort(
             "fault", 1, self._calc_fault, prerequisites_of_calc=present_fault | state
@@ -199,6 +198,9 @@ class TorqueSafetyLimiter(LeafSystem):
         )
         self._is_sending_port = self.DeclareVectorOutputPort(
             "is_sending", 1, self._calc_is_sending, prerequisites_of_calc=state | status_fault
+        )
+        self._is_holding_port = self.DeclareVectorOutputPort(
+            "is_holding", 1, self._calc_is_holding, prerequisites_of_calc=present_fault | state
         )
         self._not_following_port = self.DeclareVectorOutputPort(
             "not_following",
@@ -217,13 +219,14 @@ class TorqueSafetyLimiter(LeafSystem):
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
     get_status_age_input_port = input_getter("status_age", "age of the status, (1,) [s]")
-    get_status_is_new_input_port = input_getter("status_is_new", "flag that a new status has been accepted, (1,)")
+    get_velocity_input_port = input_getter("velocity", "velocity for damping, (n,) [rad/s]")
     get_command_timed_out_input_port = input_getter("command_timed_out", "flag that no command is valid, (1,)")
     get_safe_torque_output_port = output_getter("safe_torque", "limited torques, (n,) [Nm]")
     get_fault_output_port = output_getter("fault", "fault, (1,), a code of `Fault`")
     get_arm_state_output_port = output_getter("arm_state", "arm state, (1,), a value of `ArmState`")
     get_blend_factor_output_port = output_getter("blend_factor", "blend factor, (1,), from 0 to 1")
     get_is_sending_output_port = output_getter("is_sending", "flag that commands are sent, (1,)")
+    get_is_holding_output_port = output_getter("is_holding", "flag that the driver holds the arm, (1,)")
     get_not_following_output_port = output_getter("not_following", "flag that the desired pose is not followed, (1,)")
 
     def stop(self, context: Context) -> None:
@@ -286,18 +289,11 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._state, [ArmState.WAITING, Fault.NONE, 0.0, 0.0])
-        discrete_state.set_value(self._impulse, np.zeros(self._num_joints))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         arm_state, fault, state_time, blend_factor = self._state_of(context)
         state_time += self._period
         present_fault = self._present_fault.Eval(context)
-        impulse = self._impulse_since_status(context)
-        if arm_state in (ArmState.RAMPING, ArmState.RUNNING) and not present_fault:
-            total_torque = self._safe_torque_port.Eval(context)
-            total_torque = total_torque + self._freshness(context) * self._external_torque_port.Eval(context)
-            impulse = impulse + self._period * total_torque
-        discrete_state.set_value(self._impulse, impulse)
         if arm_state == ArmState.WAITING:
             if not present_fault:
                 arm_state, state_time = ArmState.RAMPING, 0.0
@@ -308,61 +304,33 @@ class TorqueSafetyLimiter(LeafSystem):
                 blend_factor = min(blend_factor + self._period / self._limits.ramp_time, 1.0)
                 if arm_state == ArmState.RAMPING and blend_factor == 1.0:
                     arm_state, state_time = ArmState.RUNNING, 0.0
-        elif arm_state == ArmState.DAMPING and (
-            state_time >= self._limits.damping_time or self._has_robot_restarted(context)
-        ):
+        elif arm_state == ArmState.DAMPING and state_time >= self._limits.damping_time:
             arm_state, state_time = ArmState.OFF, 0.0
         discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor])
 
     def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
-        arm_state, _, state_time, blend_factor = self._state_of(context)
+        arm_state, _, _, blend_factor = self._state_of(context)
         is_active = arm_state in (ArmState.RAMPING, ArmState.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._present_fault.Eval(context):
             torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
             if blend_factor < 1.0:
-                torque = torque + (1.0 - blend_factor) * self._damping_torque(context, np.inf)
-        elif is_active:
-            torque = self._damping_torque(context, 0.0)
-        elif arm_state == ArmState.DAMPING and not self._has_robot_restarted(context):
-            torque = self._damping_torque(context, state_time + self._period)
+                torque = torque + (1.0 - blend_factor) * self._damping_torque(context)
+        elif is_active or arm_state == ArmState.DAMPING:
+            torque = self._damping_torque(context)
         torque = np.where(np.isfinite(torque), torque, 0.0)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
-
-    def _has_robot_restarted(self, context: Context) -> bool:
-        """Return True if the arm was stopped by a status timeout and the robot's clock has since been set back.
-
-        A clock that is ahead is no proof: delayed messages look the same when they arrive in time again.
-        """
-        status_fault = self._status_fault_port.Eval(context)[0]
-        return bool(self._state_of(context)[_FAULT] == Fault.STALE and status_fault == Fault.OUT_OF_ORDER)
 
     def _freshness(self, context: Context) -> float:
         return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
 
-    def _impulse_since_status(self, context: Context) -> np.ndarray:
-        """Return the joint impulse applied since the last status, (n,) [Nms]."""
-        is_new = self._status_is_new_port.Eval(context)[0] > 0.0
-        return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._impulse).value().copy()
-
-    def _damping_torque(self, context: Context, elapsed: float) -> np.ndarray:
-        """Return the torque (n,) [Nm] that damps the last measured velocity, `elapsed` [s] after damping began.
-
-        It is zero if that velocity was already old when damping began: after a delay of this program the velocity is
-        unknown, and the safety monitor may have stopped the arm. It is also zero if velocity, age or posture is not
-        finite.
-        """
-        age = float(self._status_age_port.Eval(context)[0])
-        joint_state = self._estimated_state_port.Eval(context)
-        is_stale = np.isfinite(elapsed) and not age - elapsed <= MAX_VELOCITY_AGE
-        if is_stale or not np.isfinite(joint_state).all():
+    def _damping_torque(self, context: Context) -> np.ndarray:
+        """Return the torque (n,) [Nm] that damps the velocity; zero if velocity or posture is not finite."""
+        velocity = self._velocity_port.Eval(context)
+        if not np.isfinite(velocity).all() or not np.isfinite(self._estimated_state_port.Eval(context)).all():
             return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
-        v = joint_state[self._num_joints :]
-        if np.isfinite(elapsed):
-            v = v + np.linalg.solve(M, self._impulse_since_status(context))
-        elapsed = min(age, elapsed)
-        return damping_torque(M, v, self._limits.decay_time, period=self._period, elapsed=elapsed)
+        return damping_torque(M, velocity, self._limits.decay_time, period=self._period)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         arm_state, fault, _, _ = self._state_of(context)
@@ -381,6 +349,12 @@ class TorqueSafetyLimiter(LeafSystem):
         if arm_state == ArmState.OFF:
             is_sending = state_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
         output.SetAtIndex(0, float(is_sending))
+
+    def _calc_is_holding(self, context: Context, output: BasicVector) -> None:
+        arm_state, fault, _, _ = self._state_of(context)
+        if arm_state in (ArmState.RAMPING, ArmState.RUNNING):
+            fault = self._present_fault.Eval(context)
+        output.SetAtIndex(0, float(self._can_hold and arm_state != ArmState.WAITING and fault in STATUS_FAULTS))
 
     def _calc_not_following(self, context: Context, output: BasicVector) -> None:
         has_timed_out = self._command_timed_out_port.Eval(context)[0] > 0.0

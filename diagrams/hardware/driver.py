@@ -15,7 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
-from guiderail.models.control.joint_status import Heartbeat, JointStatus
+from guiderail.models.control.joint_status import Heartbeat, JointStatus, StatusLimits
 from guiderail.models.control.motion_limits import MotionLimits
 from guiderail.models.robots.robot import Robot
 from guiderail.systems.torque_safety_limiter import SafetyLimits
@@ -25,8 +25,8 @@ POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 
 # Shares of the driver's reflex limits that are commanded and tolerated, and of a joint's maximum velocity.
 TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
+TORQUE_TOLERANCE_SHARE = 0.02  # error of a joint's torque by friction, gravity compensation and sensor, of its limit
 
-StatusCallback = Callable[[JointStatus], None]
 CommandCallback = Callable[[np.ndarray], None]
 
 
@@ -35,12 +35,14 @@ class Driver(ABC):
 
     A driver of another robot or transport implements `read` and `write` and is registered with `register_driver`. If
     the robot's program repeats the last torque when commands stop, a `SafetyMonitor` is needed, and the driver
-    implements `add_listener`, `read_heartbeat` and `write_heartbeat` as well.
+    implements `add_listener`, `read_heartbeats` and `write_heartbeat` as well. A driver of a robot that brakes or holds
+    its position by itself sets `can_hold` and implements `hold`.
 
     Attributes:
         name: Prefix of the joint ports of a hardware station, as in Drake's own stations.
         torque_reflex_limits: External torques at which the driver stops by itself under torque control, (n,) [Nm].
         has_command_timeout: True if the driver brings the arm to rest when commands stop.
+        can_hold: True if the driver holds the arm when `hold` is called, without a status or a torque.
         hold_off: Time after its first status for which the driver must not receive commands [s].
         period: Period of statuses and commands [s].
         url: Address that the connection was opened with; empty for the default.
@@ -51,6 +53,7 @@ class Driver(ABC):
     name: ClassVar[str]
     torque_reflex_limits: ClassVar[tuple[float, ...]]
     has_command_timeout: ClassVar[bool]
+    can_hold: ClassVar[bool] = False
     hold_off: ClassVar[float] = 0.25
     period: ClassVar[float] = STATUS_PERIOD
 
@@ -66,6 +69,14 @@ class Driver(ABC):
     @abstractmethod
     def write(self, torque: np.ndarray, time: float) -> None:
         """Send joint torques (n,) [Nm]; `time` is the time of the command [s]."""
+
+    def hold(self) -> None:
+        """Brake the arm or hold its position, until torques are written again.
+
+        Raises:
+            InputError: If the driver cannot; see `can_hold`.
+        """
+        raise InputError(f"the driver {self.name} can't hold the arm by itself")
 
     def receive(self, timeout: float = 0.0) -> None:
         """Receive what has arrived.
@@ -93,17 +104,17 @@ class Driver(ABC):
     def check_usable(self) -> None:  # noqa: B027 (optional hook)
         """Raise `InputError` if the connection cannot receive in this environment."""
 
-    def add_listener(self, on_status: StatusCallback, on_command: CommandCallback) -> None:
-        """Call back for every status, and for the torques of every readable command of another program.
+    def add_listener(self, on_command: CommandCallback) -> None:
+        """Call back for the torques of every readable command of another program.
 
         Raises:
             InputError: If the driver does not show the commands of other programs.
         """
         raise InputError(f"the driver {self.name} cannot be watched by a safety monitor")
 
-    def read_heartbeat(self) -> Heartbeat | None:
-        """Return the newest heartbeat of the safety monitor, or None before the first."""
-        return None
+    def read_heartbeats(self) -> tuple[Heartbeat, ...]:
+        """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`."""
+        return ()
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat of the safety monitor."""
@@ -196,3 +207,14 @@ def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> Safet
         torque=tuple(np.minimum(TORQUE_SHARE * reflex_limits, plant.GetEffortUpperLimits()).tolist()),
         external_torque=tuple((EXTERNAL_TORQUE_SHARE * reflex_limits).tolist()),
     )
+
+
+def status_limits(plant: MultibodyPlant, driver: Driver | type[Driver], period: float | None = None) -> StatusLimits:
+    """Return the limits of a driver's statuses; the period of the checks [s] is the driver's by default."""
+    velocity = plant.GetVelocityUpperLimits().tolist()
+    return StatusLimits.at_rate(velocity, period or driver.period, settling_time=driver.hold_off)
+
+
+def torque_tolerance(limits: SafetyLimits) -> tuple[float, ...]:
+    """Return the largest error of each joint's torque that a status may show, (n,) [Nm]."""
+    return tuple(TORQUE_TOLERANCE_SHARE * torque for torque in limits.torque)

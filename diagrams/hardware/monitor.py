@@ -1,14 +1,19 @@
-"""Safety monitor: damps the arm to rest when torque commands stop arriving."""
+"""Safety monitor: damps the arm to rest when torque commands stop arriving or the robot's status is wrong."""
 
 from __future__ import annotations
 
+import secrets
+import time
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.hardware.driver import Driver
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Heartbeat, JointStatus, damping_torque
+from guiderail.diagrams.hardware.driver import Driver, status_limits, torque_tolerance
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, STATUS_FAULTS, Fault, Heartbeat, damping_torque
+from guiderail.models.control.state_estimator import Estimate, EstimatorState, StateEstimator
+from guiderail.systems.support.joint_dynamics import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
 
 
@@ -22,18 +27,27 @@ class MonitorState(IntEnum):
 
 
 class SafetyMonitor:
-    """Watch the statuses and commands of a robot, and damp the arm to rest when commands stop.
+    """Watch the statuses and commands of a robot, and damp the arm to rest when commands stop or a status is wrong.
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
-    lost. The monitor therefore runs on the driver's machine, in a process of its own. All its times are
-    timestamps of the robot's statuses. It sends a heartbeat with every status, so that a commanding program stops if
-    the monitor stops the arm or has exited.
+    lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
+    `StateEstimator` as the station, by a clock of its own, and sends a heartbeat with every check, so that a commanding
+    program stops if the monitor stops the arm or has exited. During a stop it sends torques even if no status arrives,
+    so that the driver never repeats a torque.
 
     Attributes:
         state: Current state.
+        fault: Fault of the last check.
     """
 
-    def __init__(self, driver: Driver, plant: MultibodyPlant, limits: SafetyLimits, max_silence: float | None = None):
+    def __init__(
+        self,
+        driver: Driver,
+        plant: MultibodyPlant,
+        limits: SafetyLimits,
+        max_silence: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
         """Construct the monitor.
 
         Args:
@@ -41,62 +55,91 @@ class SafetyMonitor:
             plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
             limits: Torque limits, and durations of the phases of a stop.
             max_silence: Largest accepted time between commands [s]; default: `MAX_MISSED_MESSAGES` driver periods.
+            clock: Function that returns the local time [s].
         """
         driver.check_usable()
-        self.state = MonitorState.IDLE
-        self._driver, self._plant, self._limits = driver, plant, limits
+        self.state, self.fault = MonitorState.IDLE, Fault.NO_STATUS
+        self._driver, self._plant, self._limits, self._clock = driver, plant, limits, clock
+        self._dynamics = JointDynamics(plant)
         self._max_silence = MAX_MISSED_MESSAGES * driver.period if max_silence is None else max_silence
         self._context = plant.CreateDefaultContext()
-        # Times by the robot's clock [s]: last status, last command, last change of state.
-        self._now = self._commanded_at = self._entered_at = -np.inf
-        self._has_torque = False  # the last command was not zero
-        self._num_heartbeats = 0
-        driver.add_listener(self._on_status, self._on_command)
+        self._estimator = StateEstimator(status_limits(plant, driver), torque_tolerance(limits), period=driver.period)
+        self._estimated = EstimatorState.initial(plant.num_positions())
+        self._torque_limits = np.array(limits.torque)
+        self._command: np.ndarray | None = None  # torques that the driver repeats
+        # Local times [s]: last command, last change of state, last check.
+        self._commanded_at = self._entered_at = self._checked_at = -np.inf
+        self._sender, self._num_heartbeats = secrets.randbits(48), 0
+        driver.add_listener(self._on_command)
+
+    def receive(self, timeout: float = 0.0) -> None:
+        """Receive what has arrived, wait at most `timeout` [s] if nothing has, and check the newest status."""
+        self._driver.receive(timeout)
+        self.check()
+
+    def check(self) -> None:
+        """Check the newest status and the commands, stop the arm if needed, and send a heartbeat.
+
+        Without a new status nothing is done before a period has passed.
+        """
+        status, now = self._driver.read(), self._clock()
+        is_due = now - self._checked_at >= 0.99 * self._driver.period
+        if not is_due and (status is None or status.time == self._estimated.last_time):
+            return
+        self._checked_at = now
+        self._plant.SetPositions(self._context, self._estimated.accepted_values[: self._plant.num_positions()])
+        self._plant.SetVelocities(self._context, self._estimated.velocity)
+        M, drag = self._dynamics.evaluate(self._context)
+        estimate = self._estimator.evaluate(self._estimated, status, now, M, drag)
+        self.fault = estimate.fault
+        self._update_state(now)
+        is_stopping = self._is_stopping
+        if self._is_holding:
+            self._driver.hold()
+        elif is_stopping:
+            self._command = self._torque(estimate, M)
+            self._driver.write(self._command, now)
+        command = np.zeros(len(M)) if self._command is None else self._command
+        self._estimated = self._estimator.advance(estimate, command)
+        self._num_heartbeats += 1
+        self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
+
+    @property
+    def _is_stopping(self) -> bool:
+        return self.state in (MonitorState.DAMPING, MonitorState.RESTING)
+
+    @property
+    def _is_holding(self) -> bool:
+        return self._is_stopping and self._driver.can_hold and self.fault in STATUS_FAULTS
 
     def _on_command(self, torque: np.ndarray) -> None:
-        self._commanded_at, self._has_torque = self._now, bool(np.any(torque))
+        if torque.shape != self._torque_limits.shape:
+            return
+        self._commanded_at = self._clock()
+        if self._is_stopping and self._command is not None and not self._is_holding:
+            self._driver.write(self._command, self._commanded_at)  # the robot obeys the last command
+            return
+        self._command = torque
         if self.state == MonitorState.IDLE:
             self.state = MonitorState.WATCHING
 
-    def _on_status(self, status: JointStatus) -> None:
-        if not status.is_readable or not np.isfinite(status.values()).all():
-            return
-        if len(status.positions) != self._plant.num_positions() or len(status.velocities) != len(status.positions):
-            return
-        if self._now - self._max_silence <= status.time < self._now:
-            return  # drop an out-of-order status
-        if self.state == MonitorState.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
-            # The robot's clock was set back, or this is its first status.
-            self._commanded_at = status.time
-            if self._now - status.time > self._max_silence and self._has_torque:
-                # A torque command sent before the restart of the robot may still arrive.
-                self.state, self._entered_at = MonitorState.DAMPING, status.time
-        self._now = status.time
-        self._update_state()
-        is_stopping = self.state in (MonitorState.DAMPING, MonitorState.RESTING)
-        if is_stopping:
-            self._driver.write(self._torque(status), self._now)
-        self._num_heartbeats += 1
-        self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping))
-
-    def _update_state(self) -> None:
-        if self.state == MonitorState.WATCHING and self._now - self._commanded_at > self._max_silence:
-            self.state, self._entered_at = (
-                MonitorState.DAMPING if self._has_torque else MonitorState.IDLE,
-                self._now,
-            )
-        if self.state in (MonitorState.DAMPING, MonitorState.RESTING) and self._now < self._entered_at:
-            self._entered_at = self._now
-        if self.state == MonitorState.DAMPING and self._now - self._entered_at >= self._limits.damping_time:
-            self.state, self._entered_at = MonitorState.RESTING, self._now
-        if self.state == MonitorState.RESTING and self._now - self._entered_at > ZERO_TORQUE_TIME:
+    def _update_state(self, now: float) -> None:
+        is_silent = now - self._commanded_at > self._max_silence
+        has_fault = self.fault in STATUS_FAULTS and self.fault != Fault.NO_STATUS
+        if self.state == MonitorState.WATCHING and (is_silent or has_fault):
+            has_torque = self._command is not None and bool(np.any(self._command))
+            if has_torque:
+                self.state, self._entered_at = MonitorState.DAMPING, now
+            elif is_silent:
+                self.state = MonitorState.IDLE
+        if self.state == MonitorState.DAMPING and now - self._entered_at >= self._limits.damping_time:
+            self.state, self._entered_at = MonitorState.RESTING, now
+        if self.state == MonitorState.RESTING and now - self._entered_at > ZERO_TORQUE_TIME:
             self.state = MonitorState.IDLE
 
-    def _torque(self, status: JointStatus) -> np.ndarray:
+    def _torque(self, estimate: Estimate, M: np.ndarray) -> np.ndarray:
         if self.state != MonitorState.DAMPING:
-            return np.zeros(len(status.positions))
-        self._plant.SetPositions(self._context, status.positions)
-        M = self._plant.CalcMassMatrix(self._context)
-        limits = np.array(self._limits.torque)
-        damping = damping_torque(M, status.velocities, self._limits.decay_time, period=self._driver.period)
-        return np.clip(damping, -limits, limits)
+            return np.zeros(len(M))
+        velocity = estimate.state.velocity
+        damping = damping_torque(M, velocity, self._limits.decay_time, period=self._driver.period)
+        return np.clip(damping, -self._torque_limits, self._torque_limits)

@@ -10,10 +10,11 @@ from pydrake.common.value import Value
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from guiderail.diagrams.envs.options import Number, Options
-from guiderail.diagrams.hardware.driver import Driver, PoseDriver, find_driver, safety_limits
+from guiderail.diagrams.hardware.driver import Driver, PoseDriver, find_driver, safety_limits, torque_tolerance
+from guiderail.diagrams.hardware.driver import status_limits as default_status_limits
 from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_rate_limiter, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.impedance_control import add_controller, add_energy_tank
@@ -135,9 +136,7 @@ class HardwareStation(Station):
         self.controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         plant = self.controller_plant.plant
         self.limits = limits or safety_limits(plant, driver)
-        self.status_limits = status_limits or StatusLimits.at_rate(
-            plant.GetVelocityUpperLimits().tolist(), period, settling_time=driver.hold_off
-        )
+        self.status_limits = default_status_limits(plant, driver, period) if status_limits is None else status_limits
         if self.status_limits.settling_time < driver.hold_off:
             raise InputError(
                 f"the driver {driver.name} accepts no commands for {driver.hold_off:g} s: the settling time must be as "
@@ -150,7 +149,10 @@ class HardwareStation(Station):
     def _build(self) -> None:
         period, model, builder = self.period, self.controller_plant, DiagramBuilder()
         n = model.plant.num_positions()
-        self._status = builder.AddNamedSystem("status", StatusWatchdog(self.status_limits, period=period))
+        self._status = builder.AddNamedSystem(
+            "status",
+            StatusWatchdog(model.plant, self.status_limits, torque_tolerance(self.limits), period=period),
+        )
         # Heartbeats come as often as statuses, and may be late by as much again.
         self._heartbeat = builder.AddNamedSystem(
             "heartbeat", HeartbeatMonitor(period=period, timeout=2.0 * MAX_MISSED_MESSAGES * period)
@@ -174,7 +176,9 @@ class HardwareStation(Station):
         if tank is not None:
             builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
             builder.Connect(tank.get_admitted_wrench_output_port(), controller.get_max_wrench_input_port())
-        self._limiter = builder.AddNamedSystem("limiter", TorqueSafetyLimiter(model.plant, self.limits, period=period))
+        self._limiter = builder.AddNamedSystem(
+            "limiter", TorqueSafetyLimiter(model.plant, self.limits, period=period, can_hold=self.driver.can_hold)
+        )
 
         status, heartbeat, limiter = self._status, self._heartbeat, self._limiter
         state, external_torque = status.get_estimated_state_output_port(), status.get_external_torque_output_port()
@@ -203,17 +207,24 @@ class HardwareStation(Station):
             (status.get_fault_output_port(), heartbeat.get_status_fault_input_port()),
             (heartbeat.get_fault_output_port(), limiter.get_status_fault_input_port()),
             (status.get_age_output_port(), limiter.get_status_age_input_port()),
-            (status.get_is_new_output_port(), limiter.get_status_is_new_input_port()),
+            (status.get_velocity_output_port(), limiter.get_velocity_input_port()),
             (watchdog.get_command_timed_out_output_port(), limiter.get_command_timed_out_input_port()),
         ):
             builder.Connect(source, target)
         if isinstance(self.driver, PoseDriver):
             limited_pose, arm_state = rate_limiter.get_limited_pose_output_port(), limiter.get_arm_state_output_port()
             add_pose_publisher(builder, self.driver, model, limited_pose, arm_state, period)
+            # The robot's own controller has the torques: velocities are compared with positions only.
+            no_torque = builder.AddSystem(ConstantVectorSource(np.zeros(n)))
+            builder.Connect(no_torque.get_output_port(), status.get_torque_input_port())
         else:
-            publisher = builder.AddNamedSystem("publisher", TorquePublisher(self.driver.write, n, period=period))
+            publisher = builder.AddNamedSystem(
+                "publisher", TorquePublisher(self.driver.write, n, period=period, hold=self.driver.hold)
+            )
             builder.Connect(limiter.get_safe_torque_output_port(), publisher.get_torque_input_port())
             builder.Connect(limiter.get_is_sending_output_port(), publisher.get_is_sending_input_port())
+            builder.Connect(limiter.get_is_holding_output_port(), publisher.get_is_holding_input_port())
+            builder.Connect(limiter.get_safe_torque_output_port(), status.get_torque_input_port())
         measured_wrench = wrench.get_wrench_output_port()
         if self._tare:
             skipped, averaged = (max(round(n * CONTROL_PERIOD / period), 1) for n in (TARE_SKIPPED, TARE_AVERAGED))
@@ -273,7 +284,7 @@ class HardwareStation(Station):
         self.driver.receive()
         status, heartbeat = (system.GetMyMutableContextFromRoot(context) for system in (self._status, self._heartbeat))
         self._status.get_status_input_port().FixValue(status, Value[object](self.driver.read()))
-        self._heartbeat.get_heartbeat_input_port().FixValue(heartbeat, Value[object](self.driver.read_heartbeat()))
+        self._heartbeat.get_heartbeats_input_port().FixValue(heartbeat, Value[object](self.driver.read_heartbeats()))
         if clock is not None:
             self._status.get_clock_input_port().FixValue(status, [clock])
 
@@ -304,7 +315,7 @@ class HardwareStation(Station):
         context.SetStateAndParametersFrom(other_context)
         for mine, theirs, port in (
             (self._status, other._status, "status"),
-            (self._heartbeat, other._heartbeat, "heartbeat"),
+            (self._heartbeat, other._heartbeat, "heartbeats"),
         ):
             value = theirs.GetInputPort(port).Eval(other.GetSubsystemContext(theirs, other_context))
             mine.GetInputPort(port).FixValue(self.GetMutableSubsystemContext(mine, context), Value[object](value))

@@ -105,9 +105,9 @@ def built():
         systems.SctInputMapping(template, frames, PERIOD),
         systems.SctStateMachine(template, frames, PERIOD),
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1, configuration_size=2),
-        systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
+        systems.StatusWatchdog(plant, StatusLimits((1.0,) * 7), (1.0,) * 7, period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
-        systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD),
+        systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD, hold=lambda: None),
         systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_center, RotationMatrix(), PERIOD, 0.0),
         systems.WrenchTare(PERIOD, 3, 5),
     ]

@@ -4,8 +4,8 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault, Heartbeat
-from guiderail.systems.heartbeat_monitor import HeartbeatMonitor
+from guiderail.models.control.joint_status import MAX_SENDERS, Fault, Heartbeat
+from guiderail.systems.heartbeat_monitor import FORGET_TIME, HeartbeatMonitor
 
 PERIOD, TIMEOUT = 0.125, 0.5
 
@@ -17,46 +17,113 @@ class Rig:
         self.system = HeartbeatMonitor(period=PERIOD, timeout=TIMEOUT)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.heartbeat = self.system.get_heartbeat_input_port().FixValue(self.context, Value[object]())
+        self.heartbeats = self.system.get_heartbeats_input_port().FixValue(self.context, Value[object]())
         self.status_fault = self.system.get_status_fault_input_port().FixValue(self.context, [0.0])
         self.simulator.Initialize()
         self.num_steps = 0
 
-    def step(self, heartbeat):
-        self.heartbeat.GetMutableData().set_value(heartbeat or object())
+    def set(self, *heartbeats):
+        self.heartbeats.GetMutableData().set_value(heartbeats)
+
+    def step(self, *heartbeats):
+        """Return the fault at this check, before the next one."""
+        self.set(*heartbeats)
+        fault = self.fault
         self.num_steps += 1
         self.simulator.AdvanceTo(self.num_steps * PERIOD)
-        return self.fault
+        return fault
 
     @property
     def fault(self):
         return Fault(int(self.system.get_fault_output_port().Eval(self.context)[0]))
 
+    @property
+    def is_alive(self):
+        return self.system.is_alive(self.context)
+
 
 def test_no_fault_before_the_first_heartbeat():
     rig = Rig()
-    assert {rig.step(None) for _ in range(10)} == {Fault.NONE}
-    assert not rig.system.is_alive(rig.context)
+    assert {rig.step() for _ in range(10)} == {Fault.NONE}
+    assert not rig.is_alive
+    rig.heartbeats.GetMutableData().set_value(object())
+    assert rig.fault == Fault.NONE
 
 
-def test_fault_is_raised_while_the_monitor_is_stopping():
+def test_fault_is_raised_while_a_monitor_is_stopping():
     rig = Rig()
     assert rig.step(Heartbeat(1, False)) == Fault.NONE
-    rig.heartbeat.GetMutableData().set_value(Heartbeat(2, True))
-    assert rig.fault == Fault.MONITOR_STOP
-    assert rig.step(Heartbeat(3, True)) == Fault.MONITOR_STOP
-    assert rig.step(Heartbeat(4, False)) == Fault.NONE
+    assert rig.step(Heartbeat(2, True)) == Fault.MONITOR_STOP
+    assert rig.step(Heartbeat(2, True), Heartbeat(1, False, 5)) == Fault.MONITOR_STOP
+    assert rig.step(Heartbeat(3, False), Heartbeat(2, True, 5)) == Fault.MONITOR_STOP
+    assert rig.step(Heartbeat(4, False), Heartbeat(3, False, 5)) == Fault.NONE
 
 
 def test_fault_is_raised_when_the_heartbeat_times_out():
+    """Ages are 0, 1, … periods; the timeout is four periods, which is no fault yet."""
+    rig = Rig()
+    faults = [rig.step(Heartbeat(1, False)) for _ in range(20)]
+    assert faults == [Fault.NONE] * 5 + [Fault.MONITOR_STOP] * 15
+    assert not rig.is_alive
+    assert rig.step(Heartbeat(2, False)) == Fault.NONE
+    assert rig.is_alive
+
+
+@pytest.mark.parametrize("sequence", [4, 5])
+def test_repeated_or_older_heartbeat_is_no_sign_of_life(sequence):
+    rig = Rig()
+    rig.step(Heartbeat(5, False))
+    for _ in range(5):
+        rig.step(Heartbeat(sequence, False))
+    assert rig.fault == Fault.MONITOR_STOP
+
+
+def test_silent_monitor_is_noticed_while_another_one_speaks():
+    rig = Rig()
+    rig.step(Heartbeat(1, False, 7), Heartbeat(1, False, 8))
+    faults = [rig.step(Heartbeat(1, False, 7), Heartbeat(2 + k, False, 8)) for k in range(12)]
+    assert faults[:4] == [Fault.NONE] * 4
+    missed = round(FORGET_TIME / PERIOD) - 4
+    assert faults[4 : 4 + missed] == [Fault.MONITOR_STOP] * missed
+    assert set(faults[4 + missed :]) == {Fault.NONE}  # replaced
+    assert rig.is_alive
+    # It is missed again if it has returned meanwhile.
+    rig.step(Heartbeat(2, False, 7), Heartbeat(90, False, 8))
+    faults = [rig.step(Heartbeat(2, False, 7), Heartbeat(91 + k, False, 8)) for k in range(5)]
+    assert faults == [Fault.NONE] * 4 + [Fault.MONITOR_STOP]
+
+
+def test_last_monitor_is_never_forgotten():
+    rig = Rig()
+    for _ in range(100):
+        rig.step(Heartbeat(1, False, 7))
+    assert rig.fault == Fault.MONITOR_STOP
+
+
+def test_stop_of_a_silent_monitor_is_forgotten_with_it():
+    rig = Rig()
+    rig.step(Heartbeat(1, True, 7), Heartbeat(1, False, 8))
+    for k in range(20):
+        fault = rig.step(Heartbeat(1, True, 7), Heartbeat(2 + k, False, 8))
+    assert fault == Fault.NONE
+
+
+def test_number_of_senders_is_limited_to_the_newest():
+    rig = Rig()
+    for sender in range(3 * MAX_SENDERS):
+        rig.step(Heartbeat(1, False, sender))
+        senders = rig.context.get_discrete_state(0).value()[::3]
+        known = sorted(senders[np.isfinite(senders)].tolist())
+        assert known == list(range(max(sender + 1 - MAX_SENDERS, 0), sender + 1))
+    assert rig.is_alive
+
+
+def test_initialization_forgets_all_monitors():
     rig = Rig()
     rig.step(Heartbeat(1, False))
-    faults = [rig.step(Heartbeat(1, False)) for _ in range(6)]
-    assert faults == [Fault.NONE] * 4 + [Fault.MONITOR_STOP] * 2
-    assert rig.step(Heartbeat(1, False)) == Fault.MONITOR_STOP
-    assert not rig.system.is_alive(rig.context)
-    assert rig.step(Heartbeat(2, False)) == Fault.NONE
-    assert rig.system.is_alive(rig.context)
+    rig.set()
+    rig.simulator.Initialize()
+    assert not rig.is_alive
 
 
 def test_status_fault_takes_precedence():
@@ -65,7 +132,7 @@ def test_status_fault_takes_precedence():
     assert rig.step(Heartbeat(1, True)) == Fault.STALE
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"timeout": 0.0}, {"timeout": np.nan}])
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"timeout": 0.0}, {"timeout": np.nan}, {"timeout": np.inf}])
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         HeartbeatMonitor(**{"period": PERIOD, "timeout": TIMEOUT} | wrong)

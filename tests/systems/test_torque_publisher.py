@@ -9,26 +9,33 @@ PERIOD = 0.125
 
 
 def test_message_is_sent_once_per_period_only_while_enabled():
-    written = []
-    system = TorquePublisher(lambda torque, time: written.append((time, *torque)), 2, period=PERIOD)
+    written, held = [], []
+    system = TorquePublisher(
+        lambda torque, time: written.append((time, *torque)), 2, period=PERIOD, hold=lambda: held.append(True)
+    )
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_torque_input_port().FixValue(context, [1.0, -2.0])
     sending = system.get_is_sending_input_port().FixValue(context, [0.0])
+    holding = system.get_is_holding_input_port().FixValue(context, [0.0])
     simulator.AdvanceTo(4 * PERIOD)
     assert written == []
     sending.GetMutableData().set_value([1.0])
     simulator.AdvanceTo(7 * PERIOD)
     assert written == [(step * PERIOD, 1.0, -2.0) for step in (5, 6, 7)]
+    assert held == []
+    holding.GetMutableData().set_value([1.0])
+    simulator.AdvanceTo(9 * PERIOD)
+    assert (len(written), held) == (3, [True, True])
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"num_joints": 0}])
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
-        TorquePublisher(print, **({"num_joints": 2, "period": PERIOD} | wrong))
+        TorquePublisher(print, **({"num_joints": 2, "period": PERIOD, "hold": print} | wrong))
 
 
 def test_torques_of_another_size_are_refused():
-    system = TorquePublisher(print, 2, period=PERIOD)
+    system = TorquePublisher(print, 2, period=PERIOD, hold=print)
     with pytest.raises(RuntimeError):
         system.get_torque_input_port().FixValue(system.CreateDefaultContext(), np.zeros(3))

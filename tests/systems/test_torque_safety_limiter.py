@@ -9,7 +9,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.robots.robot import DEFAULT_ROBOT, find_robot
-from guiderail.systems.torque_safety_limiter import MAX_VELOCITY_AGE, ArmState, SafetyLimits, TorqueSafetyLimiter
+from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, ArmState, SafetyLimits, TorqueSafetyLimiter
 
 PERIOD = 1.0 / 256.0
 n = 7
@@ -29,9 +29,9 @@ def plant():
 class Rig:
     """Limiter of a moving arm without faults, in state RUNNING by default."""
 
-    def __init__(self, plant, running=True):
+    def __init__(self, plant, running=True, can_hold=False):
         self.plant = plant
-        self.system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD)
+        self.system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD, can_hold=can_hold)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         ok = {
@@ -43,7 +43,7 @@ class Rig:
             "desired_pose": np.zeros(6),
             "status_fault": [0.0],
             "status_age": [0.0],
-            "status_is_new": [1.0],
+            "velocity": SPEED,
             "command_timed_out": [0.0],
         }
         self.ports = {name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()}
@@ -72,12 +72,11 @@ class Rig:
     def fault(self):
         return Fault(int(self["fault"][0]))
 
-    def damping(self, age=0.0):
+    def damping(self, velocity=SPEED):
         context = self.plant.CreateDefaultContext()
-        self.plant.SetPositionsAndVelocities(context, [*POSTURE, *SPEED])
-        momentum = self.plant.CalcMassMatrix(context) @ SPEED
-        T = LIMITS.decay_time
-        return -momentum * np.exp(-age / T) * (1.0 - np.exp(-PERIOD / T)) / PERIOD
+        self.plant.SetPositions(context, POSTURE)
+        momentum = self.plant.CalcMassMatrix(context) @ velocity
+        return -momentum * (1.0 - np.exp(-PERIOD / LIMITS.decay_time)) / PERIOD
 
 
 def test_commanded_torque_is_passed_through_without_faults(plant):
@@ -159,6 +158,7 @@ NOT_FINITE = {
     "pose": ({"pose": np.full(6, np.nan)}, Fault.WORKSPACE_LIMIT),
     "desired_pose": ({"desired_pose": np.full(6, np.nan)}, Fault.WORKSPACE_LIMIT),
     "status_age": ({"status_age": [np.nan]}, Fault.STALE),
+    "velocity": ({"velocity": np.full(n, np.nan), "wrench": np.full(6, np.nan)}, Fault.FORCE_LIMIT),
 }
 
 
@@ -183,10 +183,8 @@ def test_non_finite_input_is_a_fault_with_finite_torque(plant, what, blend_facto
     assert rig.arm_state == (ArmState.WAITING if blend_factor == "none" else ArmState.OFF)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"estimated_state": POSITION}, {"estimated_state": VELOCITY}, {"status_age": [np.nan]}]
-)
-def test_unknown_velocity_is_not_damped(plant, wrong):
+@pytest.mark.parametrize("wrong", [{"estimated_state": POSITION}, {"velocity": [*SPEED[:-1], np.inf]}])
+def test_unknown_velocity_or_posture_is_not_damped(plant, wrong):
     rig = Rig(plant)
     rig.set(status_fault=[Fault.NOT_FINITE], **wrong)
     for _ in range(3):
@@ -195,13 +193,22 @@ def test_unknown_velocity_is_not_damped(plant, wrong):
     assert rig.arm_state == ArmState.DAMPING
 
 
-def test_torque_is_zero_when_damping_is_not_finite(plant):
-    """The cause may be any value in a state copied from another station."""
+def test_stop_damps_the_estimated_velocity_and_not_the_reported(plant):
     rig = Rig(plant)
-    rig.set(status_fault=[Fault.STALE], status_is_new=[0.0])
-    assert rig["safe_torque"].any()
-    rig.context.SetDiscreteState(1, np.full(n, np.nan))
-    np.testing.assert_array_equal(rig["safe_torque"], 0.0)
+    rig.set(estimated_state=[*POSTURE, *(-5.0 * SPEED)], velocity=0.5 * SPEED, status_fault=[Fault.FROZEN])
+    for _ in range(3):
+        np.testing.assert_allclose(rig["safe_torque"], rig.damping(0.5 * SPEED), atol=1e-12)
+        rig.advance(PERIOD)
+
+
+def test_damping_multiplies_the_velocity_by_its_decay(plant):
+    rig = Rig(plant)
+    rig.system.stop(rig.context)
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, POSTURE)
+    M = plant.CalcMassMatrix(context)
+    slowed = SPEED + PERIOD * np.linalg.solve(M, rig.damping())
+    np.testing.assert_allclose(slowed, np.exp(-PERIOD / LIMITS.decay_time) * SPEED)
 
 
 def test_resume_is_refused_while_a_fault_is_present(plant):
@@ -217,50 +224,6 @@ def test_torque_is_within_its_limits(plant):
     rig = Rig(plant)
     rig.set(torque=np.linspace(-200.0, 200.0, n))
     np.testing.assert_array_equal(rig["safe_torque"], np.clip(np.linspace(-200.0, 200.0, n), -20.0, 20.0))
-
-
-@pytest.mark.parametrize("num_missing", [0, 1, 8])  # periods without status num_missing detection
-def test_damping_removes_exactly_the_momentum_and_impulse(plant, num_missing):
-    """Without status the velocity input is constant; the sum of the damping impulses is its momentum."""
-    rig, load = Rig(plant), np.full(n, 0.5)
-    rig.set(estimated_state=[*POSTURE, *(0.1 * SPEED)], external_torque=load)
-    rig.advance(PERIOD)
-    impulse, taken = np.zeros(n), np.zeros(n)
-    for age in range(num_missing):
-        if age > 0:
-            rig.set(status_age=[age * PERIOD], status_is_new=[0.0])
-        freshness = np.clip(2.0 - age, 0.0, 1.0)
-        np.testing.assert_allclose(rig["safe_torque"], freshness * COMMANDED)
-        impulse += PERIOD * freshness * (COMMANDED + load)
-        rig.advance(PERIOD)
-    rig.set(status_fault=[Fault.STALE])
-    for step in range(round(LIMITS.damping_time / PERIOD)):
-        rig.set(status_age=[(num_missing + step) * PERIOD], status_is_new=[float(num_missing + step == 0)])
-        taken += PERIOD * rig["safe_torque"]
-        rig.advance(PERIOD)
-    momentum = -rig.damping() * PERIOD / (1.0 - np.exp(-PERIOD / LIMITS.decay_time))
-    np.testing.assert_allclose(taken, -0.1 * momentum - impulse, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize(("first", "then", "has_torque"), [(2, 3, False), (3, 3, True), (2, 2, True), (2, 4, True)])
-def test_restarted_robot_is_not_damped_by_its_old_velocity(plant, first, then, has_torque):
-    """Restart: a timeout, then a clock that was set back. A jump without timeout, or ahead, is no restart."""
-    rig = Rig(plant)
-    for status_fault in (first, first, then):
-        rig.set(status_fault=[float(status_fault)])
-        rig.advance(PERIOD)
-    assert rig["safe_torque"].any() == has_torque
-    assert rig.arm_state == (ArmState.DAMPING if has_torque else ArmState.OFF)
-
-
-@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (MAX_VELOCITY_AGE, True), (0.2, False)])
-def test_old_velocity_is_not_damped(plant, age, has_torque):
-    """After a delay of this program the safety monitor may have stopped the arm."""
-    rig = Rig(plant)
-    rig.set(status_age=[age], status_fault=[Fault.STALE])
-    for _ in range(3):
-        assert rig["safe_torque"].any() == has_torque
-        rig.advance(PERIOD)
 
 
 def test_commanded_torque_fades_out_when_the_status_is_old(plant):
@@ -376,7 +339,8 @@ def test_outputs_have_their_sizes_and_direct_feedthrough(plant):
     system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD)
     outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
     assert {port.get_name(): port.size() for port in outputs} == {
-        **{"safe_torque": n, "fault": 1, "arm_state": 1, "blend_factor": 1, "is_sending": 1, "not_following": 1}
+        **{"safe_torque": n, "fault": 1, "arm_state": 1, "blend_factor": 1, "is_sending": 1, "is_holding": 1},
+        "not_following": 1,
     }
     at_once = {
         port.get_name(): {
@@ -388,11 +352,12 @@ def test_outputs_have_their_sizes_and_direct_feedthrough(plant):
     }
     measured = {"estimated_state", "external_torque", "wrench", "pose", "desired_pose", "torque"}
     assert at_once == {
-        "safe_torque": measured | {"status_fault", "status_age", "status_is_new"},
+        "safe_torque": measured | {"status_fault", "status_age", "velocity"},
         "fault": measured | {"status_fault", "status_age"},
         "arm_state": set(),
         "blend_factor": set(),
         "is_sending": {"status_fault"},
+        "is_holding": measured | {"status_fault", "status_age"},
         "not_following": {"command_timed_out"},
     }
 
@@ -403,15 +368,15 @@ def test_arm_waits_before_the_initialization(plant):
     np.testing.assert_array_equal(rig["safe_torque"], 0.0)
 
 
-def test_ramping_damps_the_measured_velocity_only(plant):
+def test_ramping_damps_the_estimated_velocity(plant):
     rig = Rig(plant, running=False)
     rig.simulator.Initialize()
     rig.advance(LIMITS.ramp_time / 2)
     assert rig.arm_state == ArmState.RAMPING
-    rig.set(status_age=[PERIOD], status_is_new=[0.0])
+    rig.set(status_age=[PERIOD], velocity=0.5 * SPEED)
     rig.advance(PERIOD)
     share = rig["blend_factor"][0]
-    expected = share * COMMANDED + (1.0 - share) * rig.damping(age=PERIOD)
+    expected = share * COMMANDED + (1.0 - share) * rig.damping(0.5 * SPEED)
     np.testing.assert_allclose(rig["safe_torque"], np.clip(expected, -20.0, 20.0), atol=1e-12)
 
 
@@ -419,3 +384,85 @@ def test_not_following_is_set_when_commands_time_out(plant):
     rig = Rig(plant)
     rig.set(command_timed_out=[1.0])
     assert (rig.arm_state, rig["not_following"][0]) == (ArmState.RUNNING, 1.0)
+
+
+ABOVE = 1.001
+BEYOND = {
+    "velocity": {"estimated_state": [*POSTURE, *SPEED[:-1], ABOVE]},
+    "velocity, negative": {"estimated_state": [*POSTURE, -ABOVE, *SPEED[1:]]},
+    "external torque": {"external_torque": [-10.0 * ABOVE, *np.zeros(n - 1)]},
+    "force": {"wrench": [0.0, 60.0 * ABOVE, 0.0, 0.0, 0.0, 0.0]},
+    **{
+        f"{port} {name} {axis}": {port: [*(bound * ABOVE if i == axis else 0.0 for i in range(3)), 0.0, 0.0, 0.0]}
+        for port in ("pose", "desired_pose")
+        for name, corner in (("lower", LIMITS.lower), ("upper", LIMITS.upper))
+        for axis, bound in enumerate(corner)
+    },
+}
+
+
+@pytest.mark.parametrize("what", BEYOND)
+def test_fault_is_raised_just_beyond_each_limit(plant, what):
+    """Values exactly at the limits are no fault; see above."""
+    rig = Rig(plant)
+    assert rig.fault == Fault.NONE
+    rig.set(**BEYOND[what])
+    assert rig.fault != Fault.NONE
+
+
+def test_torque_just_beyond_its_limit_is_clipped(plant):
+    rig = Rig(plant)
+    rig.set(torque=[20.0 * ABOVE, -20.0 * ABOVE, 20.0, -20.0, 19.99, 0.0, 0.0])
+    np.testing.assert_array_equal(rig["safe_torque"], [20.0, -20.0, 20.0, -20.0, 19.99, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("state", [ArmState.DAMPING, ArmState.OFF])
+def test_damping_lasts_for_its_time(plant, state):
+    """The last damping torque is sent in the step that reaches the damping time, and not in the next."""
+    rig, steps = Rig(plant), round(LIMITS.damping_time / PERIOD)
+    rig.system.stop(rig.context)
+    rig.advance((steps - (state == ArmState.DAMPING)) * PERIOD)
+    assert rig.arm_state == state
+    assert rig["safe_torque"].any() == (state == ArmState.DAMPING)
+
+
+@pytest.mark.parametrize(("steps", "is_sending"), [(12, 1.0), (13, 0.0)])
+def test_zero_torque_is_sent_for_its_time(plant, steps, is_sending):
+    assert 12 * PERIOD <= ZERO_TORQUE_TIME < 13 * PERIOD
+    rig = Rig(plant)
+    rig.set(status_fault=[Fault.STALE])
+    while rig.arm_state != ArmState.OFF:
+        rig.advance(PERIOD)
+    rig.advance(steps * PERIOD)
+    assert rig["is_sending"][0] == is_sending
+
+
+@pytest.mark.parametrize("fault", [Fault.FROZEN, Fault.STALE, Fault.CLOCK_RATE, Fault.NO_STATUS])
+def test_driver_holds_the_arm_after_a_status_fault(plant, fault):
+    rig = Rig(plant, can_hold=True)
+    assert rig["is_holding"][0] == 0.0
+    rig.set(status_fault=[fault])
+    assert rig["is_holding"][0] == 1.0  # at once
+    rig.advance(PERIOD)
+    rig.set(status_fault=[0.0])
+    assert (rig["is_holding"][0], rig.arm_state) == (1.0, ArmState.DAMPING)
+    rig.advance(LIMITS.damping_time + 2 * PERIOD)
+    assert (rig["is_holding"][0], rig.arm_state) == (1.0, ArmState.OFF)
+    rig.system.resume(rig.context)
+    assert rig["is_holding"][0] == 0.0
+
+
+@pytest.mark.parametrize("can_hold", [True, False])
+def test_driver_does_not_hold_without_a_status_fault(plant, can_hold):
+    rig = Rig(plant, can_hold=can_hold)
+    rig.set(wrench=[61.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert (rig.fault, rig["is_holding"][0]) == (Fault.FORCE_LIMIT, 0.0)
+    rig.advance(PERIOD)
+    assert rig["is_holding"][0] == 0.0
+    waiting = Rig(plant, running=False, can_hold=can_hold)
+    waiting.set(status_fault=[Fault.NO_STATUS])
+    waiting.simulator.Initialize()
+    assert waiting["is_holding"][0] == 0.0
+    without = Rig(plant)
+    without.set(status_fault=[Fault.FROZEN])
+    assert without["is_holding"][0] == 0.0

@@ -119,13 +119,14 @@ def safety_monitor(
     task: Annotated[
         str, option("Task with the workpiece that the arm carries: {tasks}.", choices="tasks")
     ] = "BncConnector",
+    rate: Annotated[float, option("Rate of a simulated robot's clock relative to this machine's.")] = 1.0,
     imports: cli.Imports = None,
 ) -> None:
-    """Bring a robot to rest when torque commands stop arriving.
+    """Bring a robot to rest when torque commands stop arriving, or its status is wrong.
 
     For a driver that repeats the last torque when the program that sent it has ended. It runs next to the driver, on
     the same machine, until it is terminated; without it, guiderail deploy moves nothing.
     """
     from guiderail.tools.hardware.sim_driver import run_safety_monitor
 
-    run_safety_monitor(url, robot, cli.find_task(task, imports)[0], log=print_progress)
+    run_safety_monitor(url, robot, cli.find_task(task, imports)[0], rate=rate, log=print_progress)

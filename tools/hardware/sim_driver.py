@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
 from guiderail.diagrams.hardware.driver import find_driver, safety_limits
 from guiderail.diagrams.hardware.lcm.driver import IiwaDriver, open_bus
 from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
-from guiderail.diagrams.hardware.monitor import SafetyMonitor
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
@@ -95,40 +96,47 @@ def run_sim_driver(
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
     plant = robot.controller_plant.plant
-    monitor_driver = IiwaDriver(monitor_lcm)
-    SafetyMonitor(monitor_driver, plant, safety_limits(plant, IiwaDriver))
+    # A simulated robot may be slower than its clock; its monitor has the same one.
+    monitor = SafetyMonitor(
+        IiwaDriver(monitor_lcm), plant, safety_limits(plant, IiwaDriver), clock=simulator.get_context().get_time
+    )
     if reset is not None:
         fixture, workpiece = insertion.offsets.draw(np.random.default_rng(0), reset)
         insertion.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)
     subscribe_part_offsets(lcm if rate is None else monitor_lcm, insertion, robot, simulator.get_mutable_context())
     simulator.Initialize()
     if rate is None:
-        return serve_in_lockstep(simulator, robot_lcm, lcm, seconds, command_timeout) >= seconds
+        return serve_in_lockstep(simulator, robot_lcm, lcm, seconds, command_timeout, monitor.check) >= seconds
     set_realtime_priority()
-    serve_in_real_time(simulator, seconds, monitor_driver.receive, rate, log)
+    serve_in_real_time(simulator, seconds, monitor.receive, rate, log)
     return True
 
 
-def run_safety_monitor(url: str, robot: str, task: str, *, log: Callable[[str], None] = print) -> None:
-    """Damp a robot to rest when torque commands stop arriving, until this process is terminated.
+def run_safety_monitor(
+    url: str, robot: str, task: str, *, rate: float = 1.0, log: Callable[[str], None] = print
+) -> None:
+    """Damp a robot to rest when torque commands stop or its status is wrong, until this process is terminated.
 
     The arm carries the workpiece of the insertion task. The address of the robot's driver is LCM's default if empty.
+    The rate of the robot's clock relative to this machine's is 1 for a real robot.
 
     Raises:
         InputError: If the robot, the task or the address is unusable.
     """
+    check_rate(rate)
     driver_type = find_driver(robot)
     plant = ArmControllerPlant(_insertion_task(task).workcell(), robot).plant
     driver = driver_type(url)
-    monitor = SafetyMonitor(driver, plant, safety_limits(plant, driver))
+    monitor = SafetyMonitor(driver, plant, safety_limits(plant, driver), clock=lambda: rate * time.monotonic())
     suffix = "" if set_realtime_priority() else "; without real-time priority"
     log(f"watching {driver}{suffix}")
     state = monitor.state
     while True:
-        driver.receive(1.0)
+        monitor.receive(driver.period / rate)
         if monitor.state != state:
             state = monitor.state
-            log(state.name.lower())
+            cause = f": {monitor.fault.description}" if state == MonitorState.DAMPING and monitor.fault else ""
+            log(state.name.lower() + cause)
 
 
 def _insertion_task(name: str) -> InsertionTask:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import time as wall_time
 from collections import deque
+from dataclasses import replace
 from ipaddress import IPv4Address
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
@@ -13,15 +14,15 @@ import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 
-from guiderail.diagrams.hardware.driver import CommandCallback, Driver, StatusCallback, register_driver
+from guiderail.diagrams.hardware.driver import CommandCallback, Driver, register_driver
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.control.joint_status import MALFORMED_STATUS, Heartbeat, JointStatus
+from guiderail.models.control.joint_status import MALFORMED_STATUS, MAX_SENDERS, Heartbeat, JointStatus
 
 PROVIDERS = ("udpm", "mpudpm", "tcpq", "memq")
 MICROSECOND = 1e-6  # unit of a message's time [s]
 HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
-HEARTBEAT_FORMAT = struct.Struct(">q?")
+HEARTBEAT_FORMAT = struct.Struct(">q?q")
 
 
 def open_bus(url: str) -> DrakeLcm:
@@ -132,9 +133,10 @@ class LcmDriver(Driver):
         self.statuses = MessageCounter()
         self._message: bytes | None = None  # newest status
         self._status: JointStatus | None = None  # the same, decoded when it is read
-        self._heartbeat: Heartbeat | None = None
+        self._num_conflicts = 0  # statuses with the time stamp of their predecessor and another content
+        self._heartbeats: dict[int, Heartbeat] = {}  # by sender, the newest last
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
-        self._listeners: list[tuple[StatusCallback, CommandCallback]] = []
+        self._listeners: list[CommandCallback] = []
         if handlers_are_safe():
             self.lcm.Subscribe(self.command_channel, self._on_command)
             self.lcm.Subscribe(self.heartbeat_channel(), self._on_heartbeat)
@@ -173,7 +175,7 @@ class LcmDriver(Driver):
     def read(self) -> JointStatus | None:
         """Return the newest status, or None before the first."""
         if self._status is None and self._message is not None:
-            self._status = self.decode(self._message)
+            self._status = replace(self.decode(self._message), conflicts=self._num_conflicts)
         return self._status
 
     def write(self, torque: np.ndarray, time: float) -> None:
@@ -190,28 +192,28 @@ class LcmDriver(Driver):
         """Raise `InputError` if a message handler in Python would end the process."""
         check_handlers()
 
-    def add_listener(self, on_status: StatusCallback, on_command: CommandCallback) -> None:
-        """Call back for every status, and for the torques of every readable command of another program."""
-        self._listeners.append((on_status, on_command))
+    def add_listener(self, on_command: CommandCallback) -> None:
+        """Call back for the torques of every readable command of another program."""
+        self._listeners.append(on_command)
 
-    def read_heartbeat(self) -> Heartbeat | None:
-        """Return the newest heartbeat of the safety monitor, or None before the first."""
-        return self._heartbeat
+    def read_heartbeats(self) -> tuple[Heartbeat, ...]:
+        """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`."""
+        return tuple(self._heartbeats.values())
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat of the safety monitor."""
-        self.lcm.Publish(self.heartbeat_channel(), HEARTBEAT_FORMAT.pack(heartbeat.sequence, heartbeat.is_stopping))
+        message = HEARTBEAT_FORMAT.pack(heartbeat.sequence, heartbeat.is_stopping, heartbeat.sender)
+        self.lcm.Publish(self.heartbeat_channel(), message)
 
     def __str__(self) -> str:
         """Return bus and channel of the statuses."""
         return f"{self.url or 'LCM'}, channel {self.status_channel}"
 
     def _on_status(self, message: bytes) -> None:
+        self._num_conflicts += message[:HEAD_SIZE] == self.statuses.head and message != self._message
         self._message, self._status = message, None
         self.statuses.add(message)
         self.num_statuses = self.statuses.count
-        for on_status, _ in self._listeners:
-            on_status(self.decode(message))
 
     def _on_command(self, message: bytes) -> None:
         if message in self._written:
@@ -219,12 +221,16 @@ class LcmDriver(Driver):
         self.num_foreign_commands += 1
         torque = self.decode_command(message)
         if torque is not None:
-            for _, on_command in self._listeners:
+            for on_command in self._listeners:
                 on_command(torque)
 
     def _on_heartbeat(self, message: bytes) -> None:
         if len(message) == HEARTBEAT_FORMAT.size:
-            self._heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
+            heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
+            self._heartbeats.pop(heartbeat.sender, None)
+            self._heartbeats[heartbeat.sender] = heartbeat
+            while len(self._heartbeats) > MAX_SENDERS:
+                self._heartbeats.pop(next(iter(self._heartbeats)))
 
 
 @register_driver("iiwa14")

@@ -159,7 +159,12 @@ class LockstepClock:
 
 
 def serve_in_lockstep(
-    simulator: Simulator, robot_lcm: DrakeLcm, lcm: DrakeLcm, seconds: float, command_timeout: float
+    simulator: Simulator,
+    robot_lcm: DrakeLcm,
+    lcm: DrakeLcm,
+    seconds: float,
+    command_timeout: float,
+    after_status: Callable[[], object] = lambda: None,
 ) -> float:
     """Simulate an arm for another process, and wait after each step until its status is acknowledged.
 
@@ -173,6 +178,7 @@ def serve_in_lockstep(
         lcm: Bus shared with the other process.
         seconds: Simulated time to run [s].
         command_timeout: Longest wall clock time to wait for each acknowledgement, and ten times that for the first [s].
+        after_status: Function that is called after every status, for a safety monitor.
 
     Returns:
         The simulated time of the end [s]; less than `seconds` if acknowledgements stopped.
@@ -199,6 +205,9 @@ def serve_in_lockstep(
         return abs(status_time * MICROSECOND - steps * period) < 0.5 * period
 
     def handle_messages() -> None:
+        while robot_lcm.HandleSubscriptions(0):
+            pass
+        after_status()
         while robot_lcm.HandleSubscriptions(0):
             pass
 

@@ -1,19 +1,23 @@
-"""Safety monitor on a bus in memory."""
+"""Safety monitor on a bus in memory, by a clock of the test."""
 
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.driver import safety_limits, torque_tolerance
+from guiderail.diagrams.hardware.lcm.driver import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
+from guiderail.systems.support.joint_dynamics import JointDynamics
+from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME
 
 PERIOD = IiwaDriver.period
-MOVING = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.1, -0.1])
+MOVING = np.array([0.3, -0.2, 0.1, 0.2, 0.05, 0.1, -0.1])
+PUSH = np.array([0.5, 0.4, 0.5, 0.3, 0.1, 0.1, 0.1])
+NAMES = lcmt_iiwa_status.__slots__[2:]
 
 
 @pytest.fixture(scope="module")
@@ -22,142 +26,223 @@ def known():
 
 
 class Bus:
-    """Bus with statuses of a robot, a safety monitor, and records of commands and heartbeats."""
+    """Bus with a simulated robot, a safety monitor, and records of the monitor's commands and heartbeats."""
 
-    def __init__(self, known):
-        self.lcm, self.time, self.commands, self.heartbeats = DrakeLcm("memq://"), 100.0, [], []
+    def __init__(self, known, velocity=MOVING):
+        self.lcm, self.step, self.commands, self.heartbeats = DrakeLcm("memq://"), 0, [], []
+        self.plant, self.dynamics = known.plant, JointDynamics(known.plant)
+        self.context = self.plant.CreateDefaultContext()
         self.limits = safety_limits(known.plant, IiwaDriver)
-        self.monitor = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits)
+        self.positions, self.velocities, self.torque = np.full(7, 0.2), np.array(velocity), np.zeros(7)
+        self.clock = self.offset = 0.0
+        self.monitor = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits, clock=lambda: self.now)
         self.lcm.Subscribe("IIWA_COMMAND", self.record_command)
         self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self.heartbeats.append)
 
+    @property
+    def now(self):
+        return 7.0 + self.step * PERIOD
+
+    @property
+    def is_stopping(self):
+        return HEARTBEAT_FORMAT.unpack(self.heartbeats[-1])[1]
+
     def record_command(self, message):
         torque = IiwaDriver.decode_command(message)
-        if torque is not None:
+        if torque is not None and len(torque) == 7:
             self.commands.append(torque)
+            self.torque = torque
 
-    def status(self, velocities=MOVING, steps=1, **changed):
+    def go(self, steps=1, status=True, command=False, **changed):
+        """Advance the robot, send its status (or another message, or none), and possibly a command."""
         for _ in range(steps):
-            self.time += PERIOD
+            self.step += 1
+            self.plant.SetPositionsAndVelocities(self.context, [*self.positions, *self.velocities])
+            M, drag = self.dynamics.evaluate(self.context)
+            self.velocities = self.velocities + PERIOD * np.linalg.solve(M, self.torque - drag)
+            self.positions = self.positions + PERIOD * self.velocities
             message = lcmt_iiwa_status()
-            message.utime, message.num_joints = round(self.time * 1e6), 7
-            for name in message.__slots__[2:]:
+            message.utime, message.num_joints = round((100.0 + self.step * PERIOD) * 1e6), 7
+            for name in NAMES:
                 setattr(message, name, [0.0] * 7)
-            message.joint_velocity_estimated = list(velocities)
+            message.joint_position_measured = self.positions.tolist()
+            message.joint_velocity_estimated = self.velocities.tolist()
             for name, value in changed.items():
                 setattr(message, name, value)
-            self.publish("IIWA_STATUS", message.encode())
+            if status:
+                self.lcm.Publish("IIWA_STATUS", message.encode() if status is True else status)
+            self.monitor.receive()
+            if command:
+                self.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(PUSH, self.now))
+            self.settle()
 
-    def command(self, torque):
-        self.publish("IIWA_COMMAND", IiwaDriver.encode(np.array(torque), self.time))
-
-    def publish(self, channel, message):
-        self.lcm.Publish(channel, message)
+    def settle(self):
         while self.lcm.HandleSubscriptions(0):
             pass
 
+    def watch(self):
+        """Command the arm until the monitor accepts its statuses."""
+        self.go(100)
+        self.go(10, command=True)
+        assert (self.monitor.state, self.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
+        assert not self.is_stopping
+        self.commands.clear()
+        return self
+
+    @property
+    def speed(self):
+        return np.abs(self.velocities).max()
+
 
 def test_monitor_damps_then_rests_when_commands_stop(known):
-    bus = Bus(known)
-    for _ in range(10):
-        bus.status()
-        bus.command([1.0] * 7)
-    bus.commands.clear()
-    bus.status(steps=MAX_MISSED_MESSAGES)
+    bus = Bus(known).watch()
+    bus.go(MAX_MISSED_MESSAGES)
     assert bus.commands == []
-    bus.status(velocities=10.0 * MOVING, steps=2)
-    assert bus.monitor.state == MonitorState.DAMPING
-    M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
-    decay_time = bus.limits.decay_time
-    wanted = -(M @ (10.0 * MOVING)) * (1.0 - np.exp(-PERIOD / decay_time)) / PERIOD
-    np.testing.assert_allclose(bus.commands[-1], np.clip(wanted, -np.array(bus.limits.torque), bus.limits.torque))
-    assert (np.abs(wanted) > bus.limits.torque).any()
-    bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
+    moving = bus.speed
+    bus.go(1)
+    assert (bus.monitor.state, bus.is_stopping) == (MonitorState.DAMPING, True)
+    bus.go(20)
+    assert bus.speed < 0.02 * moving
+    bus.go(round(bus.limits.damping_time / PERIOD) - 20)
     assert bus.monitor.state == MonitorState.RESTING
     np.testing.assert_array_equal(bus.commands[-1], 0.0)
-    bus.status(steps=20)
-    assert bus.monitor.state == MonitorState.IDLE
+    bus.go(round(ZERO_TORQUE_TIME / PERIOD) - 1)
+    assert bus.monitor.state == MonitorState.RESTING
+    bus.go(2)
+    assert (bus.monitor.state, bus.is_stopping) == (MonitorState.IDLE, False)
     count = len(bus.commands)
-    bus.status(steps=20)
+    bus.go(20)
     assert len(bus.commands) == count
 
 
+def test_damping_torque_is_clipped_to_its_limits(known):
+    bus = Bus(known, velocity=5.0 * MOVING).watch()
+    bus.go(MAX_MISSED_MESSAGES + 1)
+    assert (np.abs(bus.commands[-1]) <= np.array(bus.limits.torque)).all()
+    assert np.isclose(np.abs(bus.commands[-1]), bus.limits.torque).any()
+
+
 def test_monitor_finishes_damping_when_commands_return(known):
-    bus = Bus(known)
-    bus.status()
-    bus.command([1.0] * 7)
-    bus.status(steps=MAX_MISSED_MESSAGES + 2)
-    acting = bus.heartbeats[-1]
-    assert acting[-1] == 1
-    for _ in range(5):
-        bus.command([1.0] * 7)
-        bus.status()
-    assert bus.monitor.state == MonitorState.DAMPING
-    assert bus.heartbeats[-1][-1] == 1
-    assert bus.heartbeats[-1] != acting
+    bus = Bus(known).watch()
+    bus.go(MAX_MISSED_MESSAGES + 1)
+    bus.go(5, command=True)
+    assert (bus.monitor.state, bus.is_stopping) == (MonitorState.DAMPING, True)
 
 
 def test_monitor_is_idle_without_a_torque_to_stop(known):
     bus = Bus(known)
-    bus.status(steps=50)
+    bus.go(50)
     assert bus.monitor.state == MonitorState.IDLE
-    bus.command([1.0] * 7)
-    bus.status()
-    bus.command([0.0] * 7)
+    bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.zeros(7), 0.0))
+    bus.settle()
     bus.commands.clear()
-    bus.status(steps=50)
+    assert bus.monitor.state == MonitorState.WATCHING
+    bus.go(50)
     assert (bus.monitor.state, bus.commands) == (MonitorState.IDLE, [])
 
 
-def test_monitor_ignores_malformed_messages(known):
-    bus = Bus(known)
-    bus.status()
-    bus.command([1.0] * 7)
-    count = len(bus.heartbeats)
-    for message in (bytes(range(100)), b""):
-        bus.publish("IIWA_STATUS", message)
-        bus.publish("IIWA_COMMAND", message)
-    bus.status(joint_velocity_estimated=[np.nan] * 7)
-    bus.status(num_joints=3, **{name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]})
-    assert len(bus.heartbeats) == count
-    bus.status(steps=MAX_MISSED_MESSAGES)
+FAULTY = {
+    "NaN in a velocity": ({"joint_velocity_estimated": [np.nan] * 7}, Fault.NOT_FINITE),
+    "NaN in an external torque": ({"joint_torque_external": [np.nan, *[0.0] * 6]}, Fault.NOT_FINITE),
+    "wrong joint count": ({"num_joints": 3} | {name: [0.0] * 3 for name in NAMES}, Fault.WRONG_SIZE),
+    "position jump": ({"joint_position_measured": [1.0] * 7}, Fault.POSITION_JUMP),
+    "velocity jump": ({"joint_velocity_estimated": [2.0] * 7}, Fault.VELOCITY_JUMP),
+    "frozen time stamp": ({"utime": 100_500_000}, Fault.OUT_OF_ORDER),
+    "clock from zero": ({"utime": 1000}, Fault.OUT_OF_ORDER),
+    "clock ahead": ({"utime": 900_000_000}, Fault.FUTURE),
+}
+
+
+@pytest.mark.parametrize("name", FAULTY)
+def test_monitor_stops_the_arm_when_a_status_is_wrong(known, name):
+    """And while it stays wrong, although the commanding program goes on, it never repeats a torque."""
+    bus, (changed, fault) = Bus(known).watch(), FAULTY[name]
+    moving = bus.speed
+    bus.go(1, command=True, **changed)
+    assert (bus.monitor.state, bus.monitor.fault, bus.is_stopping) == (MonitorState.DAMPING, fault, True)
+    for _ in range(20):
+        bus.go(1, **changed)
+        assert bus.speed < 1.1 * moving
+    assert bus.speed < 0.15
+    bus.go(round(bus.limits.damping_time / PERIOD) + 1, **changed)
+    np.testing.assert_array_equal(bus.commands[-1], 0.0)
+    assert bus.speed < 0.15
+
+
+@pytest.mark.parametrize("message", [bytes(range(100)), b"\x00"])
+def test_monitor_stops_the_arm_when_a_status_cannot_be_decoded(known, message):
+    bus = Bus(known).watch()
+    bus.go(1, status=message)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.MALFORMED)
+
+
+def test_monitor_stops_the_arm_when_statuses_stop(known):
+    """By its own clock; torques are sent without any status, and become zero."""
+    bus = Bus(known).watch()
+    bus.go(MAX_MISSED_MESSAGES + 1, status=False, command=True)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.STALE)
+    bus.go(round(bus.limits.damping_time / PERIOD) + 1, status=False)
+    np.testing.assert_array_equal(bus.commands[-1], 0.0)
+    assert bus.speed < 0.15
+
+
+def test_monitor_ignores_commands_of_another_size(known):
+    bus = Bus(known).watch()
+    for _ in range(MAX_MISSED_MESSAGES + 1):
+        bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.ones(3), bus.now))
+        bus.lcm.Publish("IIWA_COMMAND", bytes(range(60)))
+        bus.go(1)
     assert bus.monitor.state == MonitorState.DAMPING
 
 
-def test_monitor_damps_at_once_when_the_robot_restarts(known):
-    """Commands for the robot before its restart may still arrive; reordered statuses have no effect."""
+def test_monitor_drops_reordered_statuses(known):
+    bus = Bus(known).watch()
+    old = round((100.0 + (bus.step - 1) * PERIOD) * 1e6)
+    bus.go(1, command=True, utime=old)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
+
+
+def test_monitors_heartbeats_have_its_number(known):
+    first, second = Bus(known), Bus(known)
+    first.go(3)
+    second.go(1)
+    sent = [HEARTBEAT_FORMAT.unpack(message) for message in first.heartbeats]
+    assert [sequence for sequence, _, _ in sent] == [1, 2, 3]
+    assert len({sender for _, _, sender in sent}) == 1
+    assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
+
+
+def test_monitor_checks_once_per_period_without_a_new_status(known):
     bus = Bus(known)
-    bus.status(steps=5)
-    bus.command([1.0] * 7)
-    bus.time -= 3.5 * PERIOD
-    bus.status()
-    assert bus.monitor.state == MonitorState.WATCHING
+    bus.go(1)
+    bus.monitor.receive()
+    bus.settle()
+    assert len(bus.heartbeats) == 1
+    bus.go(1, status=False)
+    assert len(bus.heartbeats) == 2
+
+
+def test_monitor_asks_the_driver_to_hold_after_a_status_fault(known):
+    held = []
+
+    class Holding(IiwaDriver):
+        can_hold = True
+
+        def hold(self):
+            held.append(True)
+
+    bus = Bus(known)
+    bus.monitor = SafetyMonitor(Holding(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
+    bus.watch()
+    bus.go(3, joint_velocity_estimated=[np.nan] * 7)
+    assert (len(held), bus.commands) == (3, [])
+    bus.go(100)
+    bus.go(10, command=True)
     bus.commands.clear()
-    bus.time = 0.0
-    bus.status(velocities=0.1 * MOVING)
-    assert bus.monitor.state == MonitorState.DAMPING
-    M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
-    share = -np.expm1(-PERIOD / bus.limits.decay_time)
-    np.testing.assert_allclose(bus.commands[-1], -(M @ (0.1 * MOVING)) * share / PERIOD, rtol=1e-6)
+    bus.go(MAX_MISSED_MESSAGES + 2)  # no fault of the status: damped
+    assert (len(held) <= 3 + round(0.5 / PERIOD), len(bus.commands)) == (True, 2)
 
 
-def test_monitor_rests_in_time_when_the_clock_is_set_back(known):
-    bus = Bus(known)
-    bus.status()
-    bus.command([1.0] * 7)
-    bus.time = 3.0
-    bus.status(steps=MAX_MISSED_MESSAGES + 3)
-    assert bus.monitor.state == MonitorState.DAMPING
-    bus.time = 1.0
-    bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
-    assert bus.monitor.state == MonitorState.RESTING
-
-
-def test_monitor_damps_in_time_with_reordered_statuses(known):
-    bus = Bus(known)
-    bus.status()
-    bus.command([1.0] * 7)
-    for _ in range(MAX_MISSED_MESSAGES):
-        for ahead in (2, 0):  # the second of two arrives first
-            bus.status(utime=round((bus.time + ahead * PERIOD) * 1e6))
-    assert bus.monitor.state == MonitorState.DAMPING
+def test_torque_tolerances_are_a_share_of_the_limits(known):
+    limits = safety_limits(known.plant, IiwaDriver)
+    np.testing.assert_allclose(torque_tolerance(limits), 0.02 * np.array(limits.torque))

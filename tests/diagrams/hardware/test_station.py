@@ -243,7 +243,7 @@ def test_copy_state_from_continues_without_a_gap():
     simulator = Simulator(other)
     context = simulator.get_mutable_context()
     other.get_desired_pose_input_port().FixValue(context, goal)
-    both.lcm.Publish("IIWA_STATUS", status(both))
+    both.robot.ForcedPublish(both.robot_simulator.get_context())
     other.start(simulator)
     other.copy_state_from(context, both.station, both.context)
     time = both.robot_simulator.get_context().get_time()
@@ -321,7 +321,7 @@ def test_heartbeat_is_received_within_a_larger_diagram():
     station.get_desired_pose_input_port().FixValue(context, START)
     station.receive(simulator.get_mutable_context())
     assert not station.has_safety_monitor(context)
-    lcm.Publish(IiwaDriver.heartbeat_channel(), bytes(9))
+    lcm.Publish(IiwaDriver.heartbeat_channel(), bytes(17))
     station.receive(simulator.get_mutable_context())
     assert station.has_safety_monitor(context)
 

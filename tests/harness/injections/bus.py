@@ -53,7 +53,8 @@ class Bus:
     """Both programs, and the bus between them.
 
     Attributes:
-        on_status: Function from a status to the messages that arrive.
+        on_sensor: Function from a status to the messages that the driver sends to station and safety monitor.
+        on_status: Function from such a message to those that arrive at the station.
         on_command: Function from a command to the messages that arrive.
         has_robot: True if the robot is stepped.
         has_controller: True if the station is stepped.
@@ -63,20 +64,23 @@ class Bus:
 
     def __init__(self) -> None:
         workcell = BncWorkcell()
-        self.near_robot, self.near_station = DrakeLcm("memq://"), DrakeLcm("memq://")
-        self.robot = SimulatedIiwa(workcell, self.near_robot)
+        self._arm, self.near_robot, self.near_station = (DrakeLcm("memq://") for _ in range(3))
+        self.robot = SimulatedIiwa(workcell, self._arm)
         limits = safety_limits(self.robot.controller_plant.plant, IiwaDriver)
         limits = dataclasses.replace(limits, damping_time=0.2, ramp_time=0.1)
         self.limits = np.array(limits.torque)
         self.station = HardwareStation(workcell, IiwaDriver(self.near_station), robot_timeout=1.0, limits=limits)
-        self.monitor = SafetyMonitor(IiwaDriver(self.near_robot), self.robot.controller_plant.plant, limits)
-        self.on_status = self.on_command = passes
+        self._stop_limits = limits
+        self.on_sensor = self.on_status = self.on_command = passes
         self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []
         self.step = 0
+        self.start_monitor()
         self._statuses: list[bytes] = []
         self._heartbeats: list[bytes] = []
         self._commands: list[bytes] = []
+        self._measured: list[bytes] = []
+        self._arm.Subscribe(IiwaDriver.status_channel, self._measured.append)
         self.near_robot.Subscribe(IiwaDriver.status_channel, self._statuses.append)
         self.near_robot.Subscribe(HEARTBEAT_CHANNEL, self._heartbeats.append)
         self.near_robot.Subscribe(IiwaDriver.command_channel, self._arrive)
@@ -102,8 +106,20 @@ class Bus:
             plant.SetPositions(plant.GetMyMutableContextFromRoot(context), state)
         self.robot_simulator.Initialize()
         self.robot_time, self.has_robot = 0, True
-        self._settle(self.near_robot)
         self._relay_statuses()
+
+    def start_over(self) -> None:
+        """Start all programs again with the robot at its initial pose."""
+        self.step = 0
+        self.start_robot()
+        self.start_monitor()
+        self.start_controller()
+
+    def start_monitor(self) -> None:
+        """Start the safety monitor without any earlier state."""
+        plant, clock = self.robot.controller_plant.plant, lambda: self.step * PERIOD
+        self.monitor = SafetyMonitor(IiwaDriver(self.near_robot), plant, self._stop_limits, clock=clock)
+        self.has_safety_monitor = True
 
     def start_controller(self) -> None:
         """Start the station's program without any earlier state."""
@@ -111,7 +127,6 @@ class Bus:
         context.SetTime(0.0)
         self.station.get_desired_pose_input_port().FixValue(context, START)
         self.robot.ForcedPublish(self.robot_simulator.get_context())
-        self._settle(self.near_robot)
         self._relay_statuses(settle=False)
         self.station.start(self.simulator)
         self.has_controller, self._station_step = True, 0
@@ -157,7 +172,6 @@ class Bus:
         if self.has_robot:
             self.robot_time += 1
             self.robot_simulator.AdvanceTo(self.robot_time * PERIOD)
-            self._settle(self.near_robot)
         self._relay_statuses()
         if self.has_controller:
             self._station_step += 1
@@ -177,6 +191,13 @@ class Bus:
         return START + [RADIUS * np.cos(phase), RADIUS * np.sin(phase), 0.0, TURN * np.sin(phase), 0.0, 0.0]
 
     def _relay_statuses(self, settle: bool = True) -> None:
+        self._settle(self._arm)
+        measured, self._measured[:] = list(self._measured), []
+        for message in measured:
+            self._send(self.near_robot, IiwaDriver.status_channel, self.on_sensor(message))
+        if self.has_safety_monitor:
+            self.monitor.check()
+        self._settle(self.near_robot)
         statuses, self._statuses[:] = list(self._statuses), []
         heartbeats, self._heartbeats[:] = list(self._heartbeats), []
         for message in statuses:
@@ -197,6 +218,7 @@ class Bus:
             pass
 
     def _arrive(self, message: bytes) -> None:
+        self._arm.Publish(IiwaDriver.command_channel, message)
         try:
             command = lcmt_iiwa_command.decode(message)
         except ValueError:

@@ -21,11 +21,17 @@ class Together:
         self.robot = SimulatedIiwa(workcell, lcm)
         plant = self.robot.controller_plant.plant
         if has_monitor:
-            self.monitor = SafetyMonitor(IiwaDriver(lcm), plant, safety_limits(plant, IiwaDriver))
+            self.monitor = SafetyMonitor(
+                IiwaDriver(lcm), plant, safety_limits(plant, IiwaDriver), clock=lambda: self.step * IiwaDriver.period
+            )
         self.simulator = self.robot.simulator()
         self.robot.set_pose(self.simulator.get_mutable_context(), start)
         self.simulator.Initialize()
         self.step, self.happens, self.is_silent = 0, {}, False
+
+    def receive(self):
+        if hasattr(self, "monitor"):
+            self.monitor.receive()
 
     def begin(self):
         pass
@@ -37,6 +43,7 @@ class Together:
             self.happens.get(self.step, lambda: None)()
             if not self.is_silent:
                 self.simulator.AdvanceTo(self.step * IiwaDriver.period)
+                self.receive()
             if self.clock is not None:
                 self.clock += IiwaDriver.period
             advance(simulator, station, start + (step + 1) * IiwaDriver.period, self.clock)

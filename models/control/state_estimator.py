@@ -1,0 +1,396 @@
+"""Estimator of a robot's joint state that compares status messages with each other, with the clock and with a model.
+
+Used by the hardware station (`StatusWatchdog`) and by the safety monitor. docs/robot.md derives the thresholds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
+
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED)  # the status itself is valid
+# The message is dropped, and the next one is compared with its predecessor. After every other fault statuses are in
+# doubt: one is accepted only if it agrees with the prediction, until all have been valid for the settling time.
+DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
+FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping by a velocity does not oscillate
+AGREEMENT = 0.1  # largest difference from the predicted velocity of a status that is accepted in doubt [rad/s]
+# Fraction by which the clock offset follows a status that arrives earlier than expected. With 1, a single stray message
+# would make all others late.
+EARLY_FRACTION = 0.2
+EARLY_WINDOW = 0.5  # decay time of the sum of these corrections [s]
+MAX_EARLY = 1.0 / 3.0  # largest sum of these corrections, in maximum leads: the robot's clock is too fast
+POSITION_WINDOW = 0.1  # decay time of the difference between positions and integrated velocities [s]
+REACTION_WINDOW = 0.02  # time in which the external torque must explain a change of velocity [s]
+MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
+MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # of a joint whose values must change [rad], [rad/s]
+MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # statuses with the same value of a moving joint that are a fault
+MODEL_ERROR, SENSOR_ERROR = 0.3, 0.1  # largest relative error of inertia times acceleration, and of external torque
+EXTERNAL_STEP = 2.0  # largest change of the predicted external torque between statuses, in torque tolerances
+LAG = 1.0  # largest delay of a velocity's filter [periods]
+DELAY = 2.0  # largest time from a command or a contact to its effect on torques [periods]
+REACTION = 1.5  # accepted change of velocity that no torque explains, per measured change
+MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
+BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time in which the bias is learned, with and without commanded torque [s]
+MAX_PREDICTION_TIME = 0.1  # age of the accepted status above which the velocity is unknown [s]
+
+
+@dataclass(frozen=True)
+class EstimatorState:
+    """State of the estimator between two checks.
+
+    Attributes:
+        check_time: Local time of the next check [s].
+        receipt_time: Local time of the last readable status [s].
+        fault: Last fault, a code of `Fault`.
+        fault_time: Local time of that fault [s].
+        doubt_time: Local time of the last fault that put statuses in doubt [s]; NaN if none.
+        early: Sum of the recent corrections of the clock offset for early statuses [s].
+        conflicts: `JointStatus.conflicts` of the last status.
+        last_time: Time stamp of the last readable status [s]; NaN before the first.
+        last_offset: Its offset from the robot's clock to the local clock [s].
+        accepted_time: Time stamp of the accepted status [s]; NaN before the first.
+        accepted_offset: Its clock offset [s].
+        last_values: `JointStatus.values` of the last readable status, valid or not, (3n,).
+        accepted_values: `JointStatus.values` of the accepted status, (3n,), with its velocity limited to the interval
+            of the other two sources of the velocity; zero before the first.
+        velocity: Velocity estimate from several sources, (n,) [rad/s]; zero where it is unknown.
+        residual: Recent difference between positions and integrated velocities, (n,) [rad].
+        equal_positions: Number of consecutive equal positions of each moving joint, (n,).
+        equal_velocities: Number of consecutive equal velocities of each moving joint, (n,).
+        external: External torque in the prediction, which follows the accepted one at a limited rate, (n,) [Nm].
+        torque: Torques in effect until the next check, (n,) [Nm].
+        variation: Last change of torques and external torques, (n,) [Nm].
+        predicted: Recent impulse of the torques, (n,) [Nms].
+        commanded: The same without the external torques, (n,) [Nms].
+        measured: Recent change of momentum, (n,) [Nms].
+        reaction: Recent changes of velocity, (n,) [rad/s], not negative.
+        tolerance: Largest difference of predicted and measured by errors of the torques, (n,) [Nms].
+        bias: Learned constant error of the torques, (n,) [Nm].
+    """
+
+    check_time: float
+    receipt_time: float
+    fault: float
+    fault_time: float
+    doubt_time: float
+    early: float
+    conflicts: float
+    last_time: float
+    last_offset: float
+    accepted_time: float
+    accepted_offset: float
+    last_values: np.ndarray
+    accepted_values: np.ndarray
+    velocity: np.ndarray
+    residual: np.ndarray
+    equal_positions: np.ndarray
+    equal_velocities: np.ndarray
+    external: np.ndarray
+    torque: np.ndarray
+    variation: np.ndarray
+    predicted: np.ndarray
+    commanded: np.ndarray
+    measured: np.ndarray
+    reaction: np.ndarray
+    tolerance: np.ndarray
+    bias: np.ndarray
+
+    @classmethod
+    def initial(cls, num_joints: int) -> "EstimatorState":
+        """Return the state before the first check."""
+        scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
+        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((13, num_joints)))
+
+    @classmethod
+    def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
+        """Return the state that `vector` returned as a vector."""
+        values, vectors = np.split(vector[11:], [6 * num_joints])
+        return cls(*vector[:11].tolist(), *values.reshape(2, -1), *vectors.reshape(13, -1))
+
+    def vector(self) -> np.ndarray:
+        """Return the state as one vector, (11 + 19 n,)."""
+        return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
+
+    @property
+    def last(self) -> LastStatus:
+        """Last readable status, valid or not."""
+        return LastStatus(self.last_time, self.last_offset, self.last_values)
+
+    @property
+    def accepted(self) -> LastStatus:
+        """Last accepted status."""
+        return LastStatus(self.accepted_time, self.accepted_offset, self.accepted_values)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Result of a check.
+
+    Attributes:
+        fault: Present or recent fault, or `Fault.NONE`.
+        age: Age of the accepted status relative to the earliest arrival [s]; infinite before the first.
+        is_new: True if a status is accepted at this check.
+        state: State for the next check; has the accepted values and the velocity estimate.
+    """
+
+    fault: Fault
+    age: float
+    is_new: bool
+    state: EstimatorState
+
+
+class StateEstimator:
+    """Checks each status of a robot and estimates its joint state.
+
+    `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
+    with a model, for each joint:
+
+    - *Equal values*: a moving joint has the same position, or the same velocity, to the bit in consecutive statuses.
+    - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
+      the position tolerance.
+    - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay,
+      |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
+      The last term, with a faster decay, accepts collisions, which change the velocity before the external torque. It
+      is zero for a joint that does not react.
+
+    A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
+    three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
+    One wrong source cannot move it out of the interval of the other two. While no status is accepted, the third source
+    continues alone, so that damping removes the momentum once and then ends. The accepted velocity, with which the arm
+    is controlled, is the reported one, limited to the interval of the other two and their noise.
+
+    The clocks are synchronized with the first status. Afterwards the offset follows early statuses quickly and late
+    ones slowly; after a fault or a timeout the clocks are synchronized again. Delays of this program are not attributed
+    to the robot; one that is too long is a fault of its own.
+
+    Args:
+        limits: Plausibility limits of a status.
+        torque_tolerance: Largest error of each joint's torque [Nm], positive: friction, gravity compensation, sensor.
+        period: Period of the check [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float):
+        self._limits, self._period, n = limits, period, len(limits.velocity)
+        self._torque_tolerance = np.array(torque_tolerance, dtype=float)
+        if len(self._torque_tolerance) != n:
+            raise InputError(f"a robot with {n} joints needs a torque tolerance for each of them")
+        if not ((self._torque_tolerance > 0.0) & (self._torque_tolerance < np.inf)).all():
+            raise InputError("the torque tolerances of a robot must be positive and finite")
+        self._zeros = np.zeros(n)
+        self._positions, self._velocities, self._torques = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+
+    def evaluate(
+        self, before: EstimatorState, status: JointStatus | None, now: float, M: np.ndarray, drag: np.ndarray
+    ) -> Estimate:
+        """Check the newest status.
+
+        Args:
+            before: State after the last check.
+            status: Newest status; None before the first.
+            now: Local time [s].
+            M: Mass matrix at the accepted positions, (n, n).
+            drag: Torques that oppose the estimated velocity in the model (Coriolis, damping), (n,) [Nm].
+        """
+        state = self._predict(before, now, M, drag)
+        is_doubted = np.isfinite(before.doubt_time)
+        is_trusted = not is_doubted or (status is not None and self._agrees(status, state, now))
+        last = before.accepted if is_doubted and is_trusted else before.last
+        fault = self._find_fault(before, last, status, now)
+        if status is None or fault in DROPPED_FAULTS:
+            return self._finish(state, before, fault, now)
+        values = status.values()
+        state = replace(state, conflicts=float(status.conflicts))
+        is_reordered = status.time <= last.time and not fault
+        if is_reordered or (status.time == last.time and np.array_equal(values, last.values)):
+            return self._finish(state, before, fault, now)
+
+        elapsed, change = status.time - last.time, values - last.values
+        is_comparable = 0.0 < elapsed <= self._limits.max_age and fault in ACCEPTABLE_FAULTS
+        if (is_doubted and is_trusted) or not is_comparable:
+            state = self._restart(state)
+        if is_comparable:
+            state = self._update_positions(state, values, change, elapsed)
+        if is_comparable and not is_doubted and state.torque.any():
+            state = self._update_momentum(state, M, change[self._velocities], elapsed)
+        else:
+            is_learning = is_comparable and not state.torque.any()
+            state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
+        fault = fault or self._find_contradiction(state, M)
+        state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
+        state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
+        velocity = values[self._velocities]
+        if is_comparable:
+            others, margin = (change[self._positions] / elapsed, state.velocity), self._limits.velocity_noise
+            values = values.copy()
+            values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
+            velocity = np.median((velocity, *others), axis=0)
+        if fault == Fault.NOT_REACTING:
+            # If the velocity is wrong, it misses the effect of the torques with and without the external ones; if only
+            # one of the two is missing, the external torque is wrong.
+            missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
+            is_missing = np.prod(np.sign(missing), axis=1) > 0.0
+            smaller = np.sign(missing[:, 0]) * np.abs(missing).min(axis=1)
+            state = replace(state, velocity=velocity + np.where(is_missing, smaller, 0.0))
+        if fault not in ACCEPTABLE_FAULTS or not is_trusted:
+            return self._finish(state, before, fault, now)
+        age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
+        reach = EXTERNAL_STEP * self._torque_tolerance
+        external = np.clip(values[self._torques], before.external - reach, before.external + reach)
+        variation = np.abs(external - before.external)
+        state = replace(state, velocity=velocity, variation=variation, accepted_values=values, external=external)
+        state = replace(state, accepted_time=status.time, accepted_offset=state.last_offset)
+        return self._finish(state, before, fault, now, age)
+
+    def advance(self, estimate: Estimate, torque: np.ndarray) -> EstimatorState:
+        """Return the state for the next check, until which the torques (n,) [Nm] are in effect."""
+        state = estimate.state
+        torque = np.where(np.isfinite(torque), torque, 0.0)
+        return replace(state, torque=torque, variation=state.variation + np.abs(torque - state.torque))
+
+    def _predict(self, before: EstimatorState, now: float, M: np.ndarray, drag: np.ndarray) -> EstimatorState:
+        """Return the state with the effect of the torques since the last check."""
+        step = max(now - before.check_time + self._period, 0.0)
+        # Without a recent status the external torque is unknown, and a wrong one may be what put statuses in doubt.
+        age = now - step - (before.accepted_time + before.accepted_offset)
+        is_known = np.isfinite(age) and not np.isfinite(before.doubt_time)
+        freshness = np.clip(2.0 - age / self._period, 0.0, 1.0) if is_known else 0.0
+        external = freshness * before.external
+        net = before.torque + external - drag + before.bias
+        error = self._torque_tolerance + MODEL_ERROR * np.abs(net) + SENSOR_ERROR * np.abs(external)
+        return replace(
+            before,
+            velocity=before.velocity + step * np.linalg.solve(M, net),
+            predicted=before.predicted + step * net,
+            commanded=before.commanded + step * (net - external),
+            tolerance=before.tolerance + step * (error + DELAY * before.variation),
+            variation=self._zeros,
+        )
+
+    def _find_fault(self, before: EstimatorState, last: LastStatus, status: JointStatus | None, now: float) -> Fault:
+        fault = check_status(status, last, now, self._limits)
+        if not fault and status is not None and status.conflicts > before.conflicts and np.isfinite(last.time):
+            return Fault.CONFLICT
+        if not fault and now - before.check_time > self._limits.max_check_interval:
+            return Fault.DEADLINE_MISSED
+        return fault
+
+    def _agrees(self, status: JointStatus, state: EstimatorState, now: float) -> bool:
+        """Return True if a status is valid and fresh relative to the accepted one, and moves as predicted."""
+        accepted, elapsed = state.accepted, status.time - state.accepted_time
+        is_fresh = elapsed > 0.0 and now - (status.time + accepted.offset) <= FRESH_FRACTION * self._limits.max_age
+        if not is_fresh or check_status(status, accepted, now, self._limits) != Fault.NONE:
+            return False
+        values = status.values()
+        deviation = self._deviation(values, values - accepted.values, elapsed)
+        is_moving_as_predicted = np.abs(values[self._velocities] - state.velocity) <= AGREEMENT
+        return bool((is_moving_as_predicted & (np.abs(deviation) <= self._limits.position_tolerance)).all())
+
+    def _deviation(self, values: np.ndarray, change: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return by how much the change of each position is not explained by the velocities, (n,) [rad]."""
+        acceleration = change[self._velocities]
+        error = change[self._positions] - elapsed * (values[self._velocities] - 0.5 * acceleration)
+        return np.sign(error) * np.maximum(np.abs(error) - LAG * elapsed * np.abs(acceleration), 0.0)
+
+    def _update_positions(
+        self, state: EstimatorState, values: np.ndarray, change: np.ndarray, elapsed: float
+    ) -> EstimatorState:
+        speed, is_equal = np.abs(values[self._velocities]), change == 0.0
+        equal_positions = is_equal[self._positions] & (speed * elapsed > MIN_MOTION)
+        equal_velocities = is_equal[self._velocities] & (speed > MIN_SPEED)
+        decay = np.exp(-elapsed / POSITION_WINDOW)
+        return replace(
+            state,
+            residual=decay * state.residual + self._deviation(values, change, elapsed),
+            equal_positions=np.where(equal_positions, state.equal_positions + 1.0, 0.0),
+            equal_velocities=np.where(equal_velocities, state.equal_velocities + 1.0, 0.0),
+        )
+
+    def _restart(self, state: EstimatorState) -> EstimatorState:
+        """Return the state without a predecessor of the status."""
+        return replace(state, residual=self._zeros, equal_positions=self._zeros, equal_velocities=self._zeros)
+
+    def _update_momentum(
+        self, state: EstimatorState, M: np.ndarray, change: np.ndarray, elapsed: float
+    ) -> EstimatorState:
+        decay, share = np.exp(-elapsed / MOMENTUM_WINDOW), elapsed / (MOMENTUM_WINDOW * BIAS_TIME)
+        predicted, measured = decay * state.predicted, decay * (state.measured + M @ change)
+        return replace(
+            state,
+            predicted=predicted,
+            commanded=decay * state.commanded,
+            measured=measured,
+            reaction=np.exp(-elapsed / REACTION_WINDOW) * (state.reaction + np.abs(change)),
+            tolerance=decay * state.tolerance,
+            bias=self._limited_bias(state.bias - share * (predicted - measured)),
+        )
+
+    def _update_rest(self, state: EstimatorState, change: np.ndarray) -> EstimatorState:
+        """Return the state without a momentum to compare; without command its change is due to other torques."""
+        bias = self._limited_bias(state.bias - (state.predicted - change) / REST_BIAS_TIME)
+        zero = self._zeros
+        state = replace(state, bias=bias, predicted=zero, commanded=zero, measured=zero)
+        return replace(state, reaction=zero, tolerance=zero)
+
+    def _limited_bias(self, bias: np.ndarray) -> np.ndarray:
+        limit = MAX_BIAS * self._torque_tolerance
+        return np.clip(bias, -limit, limit)
+
+    def _find_contradiction(self, state: EstimatorState, M: np.ndarray) -> Fault:
+        if (state.equal_positions >= MAX_EQUAL_POSITIONS).any() or (
+            state.equal_velocities >= MAX_EQUAL_VELOCITIES
+        ).any():
+            return Fault.FROZEN
+        if (np.abs(state.residual) > self._limits.position_tolerance).any():
+            return Fault.INCONSISTENT
+        inverse, limits = np.linalg.inv(M), self._limits
+        deviation = np.abs(inverse @ (state.predicted - state.measured))
+        reaction = np.minimum(REACTION * state.reaction, limits.velocity_jump)
+        allowed = limits.velocity_noise + np.abs(inverse) @ state.tolerance + reaction
+        return Fault.NOT_REACTING if (deviation > allowed).any() else Fault.NONE
+
+    def _synchronize(
+        self, state: EstimatorState, offset: float, measured: float, now: float, fault: Fault
+    ) -> tuple[EstimatorState, Fault]:
+        """Return the state with the clock offset after a status with the offset `measured` [s], and the fault."""
+        receipt_age = now - state.receipt_time
+        is_synchronized = fault in ACCEPTABLE_FAULTS and np.isfinite(state.last_time)
+        is_late = fault == Fault.STALE and receipt_age <= self._limits.max_age
+        if not (is_synchronized or is_late):
+            return replace(state, last_offset=measured, early=0.0), fault
+        delay = measured - offset
+        change = min(delay, self._limits.clock_drift * self._period) if delay > 0.0 else EARLY_FRACTION * delay
+        early = state.early * np.exp(-receipt_age / EARLY_WINDOW) - min(change, 0.0)
+        if early > MAX_EARLY * self._limits.max_lead:
+            return replace(state, last_offset=measured, early=0.0), fault or Fault.CLOCK_RATE
+        return replace(state, last_offset=offset + change, early=early), fault
+
+    def _finish(
+        self, state: EstimatorState, before: EstimatorState, fault: Fault, now: float, age: float | None = None
+    ) -> Estimate:
+        """Return the result of a check; `age` is that of a status that is accepted now [s]."""
+        is_new = age is not None
+        if age is None:
+            accepted_at = before.accepted_time + before.accepted_offset
+            age = max(now - accepted_at, 0.0) if np.isfinite(accepted_at) else np.inf
+        # The controller of a robot that returns after a timeout with its clock set back has restarted.
+        has_restarted = fault == Fault.OUT_OF_ORDER and before.fault == Fault.STALE
+        if age > MAX_PREDICTION_TIME or has_restarted or not np.isfinite(state.velocity).all():
+            state = replace(state, velocity=self._zeros)
+        # Added up instead of read from a context, so that the state can be copied to a diagram with another time.
+        check_time = now + self._period
+        state = replace(state, check_time=check_time)
+        if fault:
+            state = replace(state, fault=float(fault), fault_time=now)
+        elif check_time - state.fault_time > self._limits.settling_time:
+            state = replace(state, fault=float(Fault.NONE))
+        if fault and fault not in DROPPED_FAULTS and fault not in ACCEPTABLE_FAULTS:
+            state = replace(state, doubt_time=now)
+        elif check_time - state.doubt_time > self._limits.settling_time:
+            state = replace(state, doubt_time=np.nan)
+        return Estimate(fault or Fault(int(before.fault)), age, is_new, state)

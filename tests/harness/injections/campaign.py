@@ -1,0 +1,176 @@
+"""Campaign: every kind of fault at many instants of a motion, and sampled pairs of faults, by simulated time.
+
+    python tests/harness/injections/campaign.py --instants 25 --pairs 200
+
+Robot, safety monitor and station are stepped in turn in one process, so that the same seed gives the same result;
+`processes.py` runs the same kinds with real processes. Required of every detectable fault: detected within its bound,
+all joints below 0.15 rad/s within 100 ms of the fault, and never faster than 1.25 times the speed at the fault (or
+the speed that the undisturbed motion has within the bound, if it is higher). The exit code is 1 otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from injections.bus import FREQUENCY, PERIOD, Bus, passes
+from injections.kinds import KINDS, Kind
+
+SLOW, SLOW_AFTER, GROWTH = 0.15, 0.1, 1.25  # [rad/s], [s], required of every fault
+DURATION = 0.3  # of a fault [s]
+
+
+@dataclass
+class Result:
+    """Effect of a fault.
+
+    Attributes:
+        detected: Time from the fault to its detection [s]; NaN if it was not detected.
+        cause: The station's fault.
+        late_speed: Largest joint speed from `SLOW_AFTER` after the fault [rad/s].
+        growth: Largest joint speed after the fault over that at the fault or of the undisturbed motion.
+        wrong: Failed requirements.
+    """
+
+    detected: float
+    cause: str
+    late_speed: float
+    growth: float
+    wrong: list[str]
+
+
+def fastest(bus: Bus) -> float:
+    """Return the true speed of the fastest joint [rad/s]."""
+    return float(np.abs(bus.velocities).max())
+
+
+def undisturbed_speeds(bus: Bus) -> np.ndarray:
+    """Return the speed of the fastest joint in each step of a period of the motion [rad/s]."""
+    steps = round(1.0 / FREQUENCY / PERIOD)
+    speeds = np.zeros(steps)
+    bus.run_in(0.5)
+    for _ in range(steps):
+        bus.one()
+        speeds[bus.step % steps] = fastest(bus)
+    return speeds
+
+
+def begin(bus: Bus, kind: Kind, rng: np.random.Generator) -> Callable[[], None]:
+    """Begin a fault; return the function that ends it."""
+    if kind.make is not None:
+        start, fault = bus.step + 1, kind.make(rng)
+        where = {"sensor": "on_sensor", "network": "on_status", "command": "on_command"}[kind.where]
+
+        def relay(message: bytes) -> list[bytes]:
+            return fault(message, (bus.step - start) * PERIOD) if message else [message]
+
+        setattr(bus, where, relay)
+        return lambda: setattr(bus, where, passes)
+    action, program = kind.action
+    name = {"robot": "has_robot", "controller": "has_controller", "monitor": "has_safety_monitor"}[program]
+    setattr(bus, name, False)
+    if action == "stop":
+        return lambda: setattr(bus, name, True)
+    return {"robot": bus.start_robot, "controller": bus.start_controller, "monitor": bus.start_monitor}[program]
+
+
+def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random.Generator) -> Result:
+    """Inject one fault, or several at once, at a random instant of the motion."""
+    try:
+        bus.run_in(float(rng.uniform(0.1, 0.6)))
+    except AssertionError as error:
+        result = Result(np.nan, "", 0.0, 0.0, [f"before the fault: {error}"])
+        bus.start_over()
+        return result
+    speed, start = fastest(bus), bus.step
+    bound = min((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
+    ends = [begin(bus, kind, rng) for kind in kinds]
+    ahead = (bus.step + np.arange(1 + round((bound if np.isfinite(bound) else DURATION) / PERIOD) + 4)) % len(speeds)
+    speed = max(speed, speeds[ahead].max())
+    result = Result(np.nan, "", 0.0, 0.0, [])
+    while (bus.step - start) * PERIOD < DURATION - 1e-9:
+        bus.one()
+        elapsed = (bus.step - start) * PERIOD
+        if np.isnan(result.detected) and bus.is_detected:
+            result.detected = elapsed
+            result.cause = bus.fault.name if bus.has_controller and bus.fault else f"monitor: {bus.monitor.fault.name}"
+        if bus.has_robot:
+            result.growth = max(result.growth, fastest(bus) / speed)
+            if elapsed > SLOW_AFTER - 1e-9:
+                result.late_speed = max(result.late_speed, fastest(bus))
+    for end in ends:
+        end()
+    is_detectable = any(kind.is_detectable for kind in kinds)
+    if is_detectable and not result.detected <= bound + 1e-9:
+        result.wrong.append(f"detected after {1000.0 * result.detected:.0f} ms")
+    if is_detectable and result.late_speed >= SLOW:
+        result.wrong.append(f"{result.late_speed:.2f} rad/s after {SLOW_AFTER} s")
+    if is_detectable and result.growth > GROWTH:
+        result.wrong.append(f"{result.growth:.2f} times as fast")
+    return result
+
+
+def table(results: dict[str, list[Result]]) -> int:
+    """Print a row for each kind; return the number of failed injections."""
+    bounds = {kind.name: kind.bound for kind in KINDS}
+    print(f"{'kind':<32}{'bound':>6}{'median':>7}{'worst':>6} [ms]  {'missed':>6}{'speed':>7}{'growth':>7}{'wrong':>6}")
+    for name, rows in results.items():
+        times = 1000.0 * np.array([row.detected for row in rows])
+        found = times[np.isfinite(times)]
+        middle, worst = (np.median(found), found.max()) if len(found) else (np.nan, np.nan)
+        causes = ", ".join(sorted({row.cause for row in rows if row.cause}))
+        late, growth = max(row.late_speed for row in rows), max(row.growth for row in rows)
+        wrong = sum(bool(row.wrong) for row in rows)
+        missed = len(times) - len(found)
+        print(
+            f"{name:<32}{1000.0 * bounds.get(name, np.nan):>6.0f}{middle:>7.0f}{worst:>6.0f}       {missed:>6}"
+            f"{late:>7.2f}{growth:>7.2f}{wrong:>6}  {causes}"
+        )
+    return sum(bool(row.wrong) for rows in results.values() for row in rows)
+
+
+def main() -> int:
+    """Run the campaign; return 1 if a requirement was not met, otherwise 0."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--instants", type=int, default=25, help="instants for each kind of fault")
+    parser.add_argument("--pairs", type=int, default=200, help="pairs of faults that begin together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", nargs="*", help="names of kinds (default: all)")
+    arguments = parser.parse_args()
+    started, bus = time.monotonic(), Bus()
+    speeds = undisturbed_speeds(bus)
+    kinds = [kind for kind in KINDS if not arguments.kinds or kind.name in arguments.kinds]
+    results: dict[str, list[Result]] = defaultdict(list)
+    for index, kind in enumerate(kinds):
+        for instant in range(arguments.instants):
+            rng = np.random.default_rng([arguments.seed, index, instant])
+            result = inject(bus, (kind,), speeds, rng)
+            results[kind.name].append(result)
+            for problem in result.wrong:
+                print(f"WRONG  {kind.name}, instant {instant}: {problem} ({result.cause})", flush=True)
+    rng = np.random.default_rng([arguments.seed, len(KINDS)])
+    messages = [kind for kind in kinds if kind.make is not None]
+    for _ in range(arguments.pairs if len(messages) > 1 else 0):
+        first, second = (messages[i] for i in rng.choice(len(messages), 2, replace=False))
+        if first.where == second.where:
+            continue
+        result = inject(bus, (first, second), speeds, rng)
+        results["pairs"].append(result)
+        for problem in result.wrong:
+            print(f"WRONG  {first.name} and {second.name}: {problem} ({result.cause})", flush=True)
+    wrong = table(results)
+    total = sum(len(rows) for rows in results.values())
+    print(f"{total} injections, {wrong} with a failed requirement, in {time.monotonic() - started:.0f} s")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,712 @@
+"""Estimator of a robot's joint state: a robot with two coupled joints whose statuses can be falsified."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control import state_estimator as module
+from guiderail.models.control.joint_status import (
+    MALFORMED_STATUS,
+    Fault,
+    JointStatus,
+    StatusLimits,
+    damping_torque,
+)
+from guiderail.models.control.state_estimator import EstimatorState, StateEstimator
+
+PERIOD = 1.0 / 256.0
+LIMITS = StatusLimits(velocity=(2.0, 2.0))
+CLOCK = 1000.0  # robot time at local time zero [s]
+TOLERANCE = (1.0, 0.5)
+M = np.array([[2.0, 0.25], [0.25, 1.0]])
+DAMPING = np.array([0.25, 0.5])
+EXTERNAL = np.array([0.5, 0.25])
+CRUISE = np.array([0.4, 0.2])
+SETTLED = round(LIMITS.settling_time / PERIOD) + 3
+
+
+class Rig:
+    """Robot and estimator, checked once per period with the robot's newest status."""
+
+    def __init__(self, velocity=CRUISE, limits=LIMITS, external=EXTERNAL):
+        self.estimator = StateEstimator(limits, TOLERANCE, period=PERIOD)
+        self.state = EstimatorState.initial(2)
+        self.q, self.v, self.external, self.step = np.zeros(2), np.array(velocity), np.array(external), 0
+        self.balance = DAMPING * self.v - self.external  # torque that keeps the velocity
+        self.now, self.torque = 0.0, np.zeros(2)
+
+    def status(self, **changed):
+        # A velocity that does not change at all would be that of a frozen sensor.
+        velocity = self.v + 1e-12 * (-1) ** self.step
+        status = JointStatus(CLOCK + self.step * PERIOD, self.q.copy(), velocity, self.external.copy())
+        return replace(status, **changed)
+
+    def check(self, status="true", torque=None, gap=PERIOD):
+        """Move the robot for a period, check a status, command a torque, and return the fault."""
+        self.v = self.v + PERIOD * np.linalg.solve(M, self.torque + self.external - DAMPING * self.v)
+        self.q = self.q + PERIOD * self.v
+        self.step += 1
+        self.now += gap
+        status = status(self.status()) if callable(status) else self.status() if status == "true" else status
+        self.estimate = self.estimator.evaluate(self.state, status, self.now, M, DAMPING * self.state.velocity)
+        self.torque = self.balance if torque is None else torque
+        self.state = self.estimator.advance(self.estimate, self.torque)
+        return self.estimate.fault
+
+    def settle(self):
+        for _ in range(SETTLED):
+            self.torque = self.balance  # also before the first command
+            self.check()
+        assert self.estimate.fault == Fault.NONE
+        assert self.estimate.is_new
+        return self
+
+    @property
+    def accepted(self):
+        return self.estimate.state.accepted_values
+
+    def detected(self, change, limit=60, torque=None):
+        """Return after how many falsified statuses a fault is reported, and the fault; None if there is none."""
+        for count in range(1, limit + 1):
+            if fault := self.check(change, torque):
+                return count, fault
+        return None
+
+
+def test_valid_status_is_accepted_at_once():
+    rig = Rig().settle()
+    assert rig.check() == Fault.NONE
+    np.testing.assert_array_equal(rig.accepted, rig.status().values())
+    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=1e-12)
+    assert rig.estimate.age == pytest.approx(0.0, abs=1e-9)
+
+
+def test_fault_is_reported_during_the_settling_time():
+    rig = Rig()
+    faults = [rig.check(None)] + [rig.check() for _ in range(round(LIMITS.settling_time / PERIOD) - 1)]
+    assert set(faults) == {Fault.NO_STATUS}
+    assert [rig.check() for _ in range(3)][-1] == Fault.NONE
+
+
+def test_settling_time_is_exact():
+    rig = Rig()
+    while rig.check() == Fault.NO_STATUS:
+        pass
+    # The last fault is that of the state before the first check, at time zero.
+    assert LIMITS.settling_time < rig.now <= LIMITS.settling_time + PERIOD + 1e-9
+
+
+def moved(**by):
+    def change(status):
+        return replace(status, **{name: getattr(status, name) + np.array(value) for name, value in by.items()})
+
+    return change
+
+
+WRONG = {
+    Fault.OUT_OF_ORDER: moved(time=-1.0),
+    Fault.FUTURE: moved(time=1.0),
+    Fault.MALFORMED: lambda status: MALFORMED_STATUS,
+    Fault.WRONG_SIZE: lambda status: replace(status, velocities=np.zeros(3)),
+    Fault.NOT_FINITE: lambda status: replace(status, external_torque=np.array([np.nan, 0.0])),
+    Fault.CONFLICT: lambda status: replace(status, conflicts=1),
+    Fault.POSITION_JUMP: moved(positions=[0.0, 0.05]),
+    Fault.VELOCITY_JUMP: moved(velocities=[2.0, 0.0]),
+    Fault.INCONSISTENT: moved(positions=[0.0, 0.0012]),
+}
+
+
+@pytest.mark.parametrize("fault", WRONG, ids=lambda fault: fault.name)
+def test_faulty_status_is_reported_and_not_accepted(fault):
+    rig = Rig().settle()
+    before = rig.accepted
+    assert rig.check(WRONG[fault]) == fault
+    np.testing.assert_array_equal(rig.accepted, before)
+    assert not rig.estimate.is_new
+    assert rig.estimate.age == pytest.approx(PERIOD)
+    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=1e-9)  # predicted
+    # A single outlier: the next statuses agree with the prediction, and the fault is reported until they have settled.
+    steps = 0
+    while rig.check():
+        steps += 1
+        assert rig.estimate.is_new
+        np.testing.assert_array_equal(rig.accepted, rig.status().values())
+    assert LIMITS.settling_time <= steps * PERIOD <= LIMITS.settling_time + 2 * PERIOD
+
+
+@pytest.mark.parametrize("fault", [*WRONG, Fault.STALE], ids=lambda fault: fault.name)
+def test_lasting_fault_is_reported_as_long_as_it_lasts(fault):
+    rig = Rig().settle()
+    last = rig.status()
+    conflicts = iter(range(1, 1000))
+    change = {
+        Fault.STALE: lambda status: last,
+        Fault.CONFLICT: lambda status: replace(status, conflicts=next(conflicts)),
+    }.get(fault, WRONG.get(fault))
+    for _ in range(20):
+        rig.check(change)
+    before = rig.accepted
+    for _ in range(30):
+        assert rig.check(change) != Fault.NONE
+        if fault not in (Fault.OUT_OF_ORDER, Fault.FUTURE):
+            np.testing.assert_array_equal(rig.accepted, before)
+
+
+def test_repeated_status_is_stale_just_above_the_maximum_age():
+    rig = Rig().settle()
+    last = rig.status()
+    count, fault = rig.detected(lambda status: last)
+    assert fault == Fault.STALE
+    assert LIMITS.max_age < count * PERIOD <= LIMITS.max_age + PERIOD
+    assert rig.estimate.age == pytest.approx(count * PERIOD)
+
+
+def test_velocity_is_predicted_and_then_unknown_without_status():
+    rig = Rig().settle()
+    push = np.array([1.0, -2.0])
+    for step in range(1, 40):
+        rig.check(None, torque=push)
+        predicted = rig.estimate.state.velocity
+        if rig.estimate.age <= module.MAX_PREDICTION_TIME:
+            # Without a recent status the external torque is unknown.
+            assert np.abs(predicted - rig.v).max() <= step * PERIOD * 0.6
+            assert predicted.any()
+        else:
+            np.testing.assert_array_equal(predicted, 0.0)
+    assert module.MAX_PREDICTION_TIME == 0.1
+
+
+def test_prediction_is_exact_without_external_torque():
+    rig = Rig(external=np.zeros(2)).settle()
+    push = np.array([1.0, -2.0])
+    for _ in range(10):
+        rig.check(None, torque=push)
+        np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, rtol=1e-9)
+
+
+@pytest.mark.parametrize("drift", [-9e-4, 9e-4])
+def test_clock_drift_is_no_fault(drift):
+    rig = Rig().settle()
+    for _ in range(1500):
+        assert rig.check(lambda status: replace(status, time=status.time + drift * (status.time - CLOCK))) == 0
+
+
+@pytest.mark.parametrize(
+    ("rate", "fault", "bound"),
+    [
+        (2.0, Fault.CLOCK_RATE, 0.04),
+        (1.5, Fault.CLOCK_RATE, 0.06),
+        (1.1, Fault.CLOCK_RATE, 0.25),
+        (0.5, Fault.STALE, 0.07),
+    ],
+)
+def test_rate_of_the_clock_is_checked(rate, fault, bound):
+    rig = Rig(velocity=np.zeros(2)).settle()  # at rest, so that no motion contradicts the clock
+    start = rig.status().time
+    count, found = rig.detected(lambda status: replace(status, time=start + rate * (status.time - start)))
+    assert found == fault
+    assert count * PERIOD <= bound
+
+
+def test_small_rate_of_the_clock_is_no_fault():
+    rig = Rig(velocity=np.zeros(2)).settle()
+    start = rig.status().time
+    assert rig.detected(lambda status: replace(status, time=start + 1.015 * (status.time - start)), 1000) is None
+
+
+def test_earliest_status_determines_the_delay_of_others():
+    rig = Rig(velocity=np.zeros(2)).settle()
+    for _ in range(20):
+        assert rig.check(moved(time=-0.4 * LIMITS.max_age)) == Fault.NONE
+    assert rig.estimate.age == pytest.approx(0.4 * LIMITS.max_age, rel=0.05)
+    assert rig.check() == Fault.NONE
+    assert rig.estimate.age == 0.0
+    for _ in range(20):
+        rig.check(moved(time=-0.95 * LIMITS.max_age))
+    assert rig.estimate.fault == Fault.NONE
+    assert rig.check(moved(time=-1.05 * LIMITS.max_age)) == Fault.STALE
+
+
+def test_offset_follows_early_statuses_by_a_fraction():
+    rig = Rig(velocity=np.zeros(2)).settle()
+    offset, lead = rig.state.last_offset, 0.25 * LIMITS.max_lead
+    rig.check(moved(time=lead))
+    assert rig.state.last_offset == pytest.approx(offset - 0.2 * lead)
+    assert rig.state.early == pytest.approx(0.2 * lead)
+    offset = rig.state.last_offset
+    rig.check()  # older than the one before: dropped
+    rig.check()
+    rig.check()
+    assert rig.state.last_offset == pytest.approx(offset + LIMITS.clock_drift * PERIOD)
+    assert rig.state.early == pytest.approx(0.2 * lead * np.exp(-3 * PERIOD / 0.5))
+
+
+def test_single_early_status_is_no_fault():
+    rig = Rig(velocity=np.zeros(2)).settle()
+    assert rig.check(moved(time=0.9 * LIMITS.max_lead)) == Fault.NONE
+    for _ in range(50):
+        assert rig.check() == Fault.NONE
+
+
+def test_clocks_are_synchronized_again_after_a_restart():
+    rig = Rig(velocity=np.zeros(2)).settle()
+    assert rig.check(moved(time=-500.0)) == Fault.OUT_OF_ORDER
+    for _ in range(SETTLED):
+        rig.check(moved(time=-500.0))
+    assert rig.estimate.fault == Fault.NONE
+    assert rig.estimate.age == pytest.approx(0.0, abs=1e-9)
+    assert rig.estimate.is_new
+
+
+def test_velocity_is_unknown_when_the_robot_restarts_after_a_timeout():
+    rig = Rig().settle()
+    last = rig.status()
+    rig.detected(lambda status: last)
+    rig.check(lambda status: last)
+    assert rig.estimate.state.velocity.any()
+    assert rig.check(moved(time=-500.0)) == Fault.OUT_OF_ORDER
+    np.testing.assert_array_equal(rig.estimate.state.velocity, 0.0)
+
+
+def test_reordered_status_is_dropped():
+    rig = Rig().settle()
+    late = rig.status(external_torque=np.array([50.0, 0.0]))
+    rig.check()
+    before = rig.accepted
+    assert rig.check(late) == Fault.NONE
+    np.testing.assert_array_equal(rig.accepted, before)
+    assert not rig.estimate.is_new
+    assert rig.check() == Fault.NONE
+    assert rig.estimate.is_new
+
+
+def test_repeated_status_is_not_new():
+    rig = Rig().settle()
+    last = rig.status()
+    assert rig.check(last) == Fault.NONE
+    assert not rig.estimate.is_new
+
+
+def test_lost_statuses_are_no_fault():
+    rig = Rig().settle()
+    for _ in range(20):
+        for _ in range(4):
+            assert rig.check(None if False else rig.status(), torque=np.array([0.5, -0.3])) == Fault.NONE
+            rig.step -= 0
+        for _ in range(5):
+            last = rig.state
+            assert rig.check(JointStatus(last.last_time, *np.split(last.last_values, 3))) == Fault.NONE
+
+
+def test_delay_of_this_program_is_no_fault_of_the_robot():
+    rig = Rig(velocity=np.zeros(2)).settle()
+    rig.step += 5
+    assert rig.check(gap=6 * PERIOD) == Fault.NONE
+    rig.step += 51
+    assert rig.check(gap=52 * PERIOD) == Fault.DEADLINE_MISSED
+    assert rig.estimate.is_new
+
+
+@pytest.mark.parametrize(("late", "fault"), [(0.0, Fault.NONE), (1e-6, Fault.DEADLINE_MISSED)])
+def test_check_interval_is_checked_at_its_limit(late, fault):
+    rig = Rig(velocity=np.zeros(2)).settle()
+    gap = LIMITS.max_check_interval + PERIOD - 1e-9 + late
+    status = replace(rig.status(), time=rig.status().time + gap)
+    assert rig.check(status, gap=gap) == fault
+
+
+# Frozen values.
+
+
+@pytest.mark.parametrize(
+    ("fields", "joint", "expected"),
+    [
+        (("positions", "velocities", "external_torque"), slice(None), 2),
+        (("positions",), 0, 2),
+        (("positions",), 1, 2),
+        (("velocities",), 0, 4),
+        (("velocities",), 1, 4),
+    ],
+)
+def test_frozen_values_of_a_moving_joint_are_a_fault(fields, joint, expected):
+    """The velocity changes a little, so that a frozen one is equal only by the fault."""
+    limits = replace(LIMITS, position_tolerance=1.0)  # no other check is to find it
+    rig = Rig(limits=limits).settle()
+    kept = rig.status()
+
+    def freeze(status):
+        parts = {name: getattr(status, name).copy() for name in fields}
+        for name, values in parts.items():
+            values[joint] = getattr(kept, name)[joint]
+        return replace(status, **parts)
+
+    rig.balance = rig.balance + [0.01, -0.01]
+    assert rig.detected(freeze) == (expected, Fault.FROZEN)
+
+
+@pytest.mark.parametrize(("speed", "is_fault"), [(0.99, False), (1.01, True)])
+@pytest.mark.parametrize("field", ["positions", "velocities"])
+def test_values_of_a_slow_joint_may_be_equal(field, speed, is_fault):
+    limits = replace(LIMITS, position_tolerance=1.0)
+    slow = speed * (module.MIN_MOTION / PERIOD if field == "positions" else module.MIN_SPEED)
+    rig = Rig(velocity=[slow, 0.0], limits=limits)
+    for _ in range(SETTLED):
+        rig.torque = rig.balance
+        rig.check(lambda status: replace(status, velocities=np.array([slow, 0.0]) + 1e-12 * rig.step))
+    kept = {"positions": rig.q.copy(), "velocities": np.array([slow, 0.0])}[field]
+    found = rig.detected(
+        lambda status: replace(
+            status, **{"velocities": np.array([slow, 0.0]) + 1e-12 * rig.step * (field == "positions"), field: kept}
+        ),
+        10,
+    )
+    assert (found is not None) == is_fault
+
+
+def test_equal_values_of_an_arm_at_rest_are_no_fault():
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    assert rig.detected(lambda status: status, 50) is None
+
+
+def test_counters_restart_when_values_change():
+    rig = Rig().settle()
+    for _ in range(10):
+        kept = rig.q.copy()
+        assert rig.check(lambda status: replace(status, positions=kept)) in (Fault.NONE, Fault.INCONSISTENT)  # noqa: B023
+        np.testing.assert_array_equal(rig.estimate.state.equal_positions, [1.0, 1.0])
+        rig.check()
+        np.testing.assert_array_equal(rig.estimate.state.equal_positions, [0.0, 0.0])
+
+
+# Position against velocity.
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(("size", "is_fault"), [(0.999, False), (1.001, True)])
+def test_position_is_checked_at_its_tolerance(size, is_fault, joint, sign):
+    rig = Rig().settle()
+    step = np.zeros(2)
+    step[joint] = sign * size * LIMITS.position_tolerance
+    fault = rig.check(moved(positions=step))
+    assert fault == (Fault.INCONSISTENT if is_fault else Fault.NONE)
+    np.testing.assert_allclose(rig.estimate.state.residual, step, atol=1e-9)
+
+
+def test_residual_decays():
+    rig = Rig().settle()
+    rig.check(moved(positions=[5e-4, 0.0]))
+    rig.check(moved(positions=[5e-4, 0.0]))
+    assert rig.estimate.state.residual[0] == pytest.approx(5e-4 * np.exp(-PERIOD / 0.1), rel=1e-4)
+
+
+@pytest.mark.parametrize(("bias", "is_fault"), [(0.0095, False), (0.0125, True)])
+def test_velocity_bias_is_detected_above_the_tolerance_over_the_window(bias, is_fault):
+    """A bias b adds up to b T = 1e-3 rad at b = 0.01 rad/s."""
+    rig = Rig().settle()
+    found = rig.detected(moved(velocities=[0.0, bias]), 400)
+    assert (found is not None) == is_fault
+
+
+@pytest.mark.parametrize(("bias", "count"), [(1.2, 2), (0.3, 3), (0.05, 9)])
+def test_velocity_bias_is_detected_in_time(bias, count):
+    found, fault = Rig().settle().detected(moved(velocities=[bias, 0.0]))
+    assert fault == Fault.INCONSISTENT
+    assert found <= count
+
+
+def test_velocity_change_within_a_period_is_no_contradiction():
+    """A collision may change the velocity at any time between two statuses."""
+    for share in (0.0, 0.5, 1.0):
+        rig = Rig().settle()
+        change = np.array([-0.8, 0.0])
+        impact = rig.status()
+        rig.v = rig.v + change
+        rig.balance = DAMPING * rig.v - rig.external
+        rig.torque = rig.balance
+        rig.q = rig.q - share * PERIOD * change
+        assert rig.check() == Fault.NONE, share
+        assert rig.estimate.state.residual[0] == pytest.approx(0.0, abs=1e-9)
+        assert impact.is_readable
+
+
+# Velocity against torque.
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_joint_that_does_not_react_is_a_fault(joint):
+    """Frozen near rest, where no velocity contradicts the position."""
+    rig = Rig(velocity=np.zeros(2)).settle()
+    kept = rig.status()
+    push = rig.balance.copy()
+    push[joint] += 6.0
+
+    def freeze(status):
+        return replace(kept, time=status.time)
+
+    count, fault = rig.detected(freeze, torque=push)
+    assert fault == Fault.NOT_REACTING
+    assert count * PERIOD < 0.07
+    assert np.abs(rig.v).max() < 0.3
+    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.3 * rig.v.max())
+
+
+@pytest.mark.parametrize(("share", "is_fault"), [(0.95, False), (1.05, True)])
+def test_reaction_is_checked_at_its_tolerance(share, is_fault):
+    """In the limit T |M⁻¹ τ| exceeds Δv_noise + T |M⁻¹| (tolerance + 0.3 |τ| + 0.1 |τ_external|)."""
+    inverse = np.linalg.inv(M)
+    decay = np.exp(-PERIOD / module.MOMENTUM_WINDOW)
+    window = PERIOD * decay / (1.0 - decay)
+    error = np.array(TOLERANCE) + 0.1 * EXTERNAL
+    total = LIMITS.velocity_noise / window + (np.abs(inverse) @ error)[0]
+    push = share * total / ((1.0 - module.MODEL_ERROR) * inverse[0, 0])
+    rig = Rig(velocity=np.zeros(2)).settle()
+    rig.estimator._limited_bias = lambda bias: np.zeros(2)  # see test_constant_error_of_a_torque_is_learned
+    rig.state = replace(rig.state, bias=np.zeros(2))
+    kept = rig.status()
+    found = rig.detected(lambda status: replace(kept, time=status.time), 400, rig.balance + [push, 0.0])
+    assert (found is not None) == is_fault
+
+
+def test_reacting_joint_is_no_fault():
+    rng = np.random.default_rng(0)
+    rig = Rig().settle()
+    for _ in range(300):
+        if rig.step % 20 == 0 or rig.step == SETTLED:
+            torque = rig.balance + rng.uniform(-4.0, 4.0, 2) - 4.0 * rig.v
+        assert rig.check(torque=torque) == Fault.NONE
+    np.testing.assert_allclose(rig.estimate.state.predicted, rig.estimate.state.measured, atol=0.02)
+
+
+@pytest.mark.parametrize(("delay", "is_fault"), [(1, False), (2, False)])
+def test_delayed_torque_is_no_fault(delay, is_fault):
+    rig, rng = Rig(velocity=np.zeros(2)).settle(), np.random.default_rng(1)
+    queue = [rig.balance] * delay
+    faults = set()
+    for _ in range(200):
+        queue.append(rig.balance + (rng.uniform(-5.0, 5.0, 2) if rig.step % 10 == 0 else queue[-1] - rig.balance))
+        faults.add(rig.check(torque=queue[-1]))
+        rig.torque = queue.pop(0)  # in effect on the robot
+    assert (faults != {Fault.NONE}) == is_fault
+
+
+@pytest.mark.parametrize(("speed", "is_fault"), [(1.4, False), (2.2, True)])
+def test_collision_is_no_fault_up_to_the_velocity_jump(speed, is_fault):
+    """Statuses change consistently without a torque, as in a collision whose external torque comes later."""
+    rig = Rig(velocity=np.zeros(2), limits=replace(LIMITS, velocity_jump=1.5)).settle()
+    pushes = [speed / 2, speed / 2]
+    faults = []
+    for push in pushes:
+        rig.v = rig.v + [push, 0.0]
+        rig.torque = DAMPING * rig.v - rig.external
+        faults.append(rig.check(torque=DAMPING * rig.v - rig.external))
+    assert Fault.VELOCITY_JUMP not in faults
+    assert (Fault.NOT_REACTING in faults) == is_fault
+
+
+def test_constant_error_of_a_torque_is_learned():
+    """A payload that is not configured acts like a torque; a joint that stops reacting is still found."""
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2))
+    offset = np.array([3.0, -1.0])
+    for _ in range(100):
+        rig.torque = np.zeros(2)
+        rig.check(moved(external_torque=offset), torque=np.zeros(2))
+    np.testing.assert_allclose(rig.state.bias, -offset, rtol=0.01)
+    for _ in range(100):
+        assert rig.check(moved(external_torque=offset), torque=np.array([1e-9, 0.0])) == Fault.NONE
+    kept = rig.status(external_torque=offset)
+    count, fault = rig.detected(lambda status: replace(kept, time=status.time), torque=np.array([8.0, 0.0]))
+    assert (fault, count * PERIOD < 0.06) == (Fault.NOT_REACTING, True)
+
+
+def test_learned_error_is_limited():
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2))
+    for _ in range(300):
+        rig.torque = np.zeros(2)
+        rig.check(moved(external_torque=[50.0, -50.0]), torque=np.zeros(2))
+    np.testing.assert_allclose(rig.state.bias, [-6.0, 3.0])
+
+
+def test_error_is_learned_slowly_while_torques_are_commanded():
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    for _ in range(64):
+        rig.check(torque=np.array([1e-9, 0.0]))
+    for _ in range(128):
+        assert rig.check(moved(external_torque=[0.5, 0.0]), torque=np.array([1e-9, 0.0])) == Fault.NONE
+    assert -0.25 < rig.state.bias[0] < -0.1
+    assert abs(rig.state.bias[1]) < 0.02
+
+
+# Estimated velocity.
+
+
+def test_velocity_is_the_median_of_three_sources():
+    rig = Rig().settle()
+    true = rig.v.copy()
+    rig.check(moved(velocities=[1.2, -1.2]))
+    np.testing.assert_allclose(rig.estimate.state.velocity, true, atol=1e-6)
+    other = Rig().settle()
+    other.check(moved(positions=[9e-4, -9e-4]))
+    np.testing.assert_allclose(other.estimate.state.velocity, true, atol=1e-6)
+    third = Rig().settle()  # the robot's torque is another one than the estimator's
+    third.state = replace(third.state, torque=third.state.torque + [1.5, -1.0])
+    third.check()
+    np.testing.assert_allclose(third.estimate.state.velocity, true, atol=1e-6)
+
+
+def test_accepted_velocity_is_limited_to_the_other_sources():
+    rig = Rig().settle()
+    true = rig.v.copy()
+    assert rig.check(moved(velocities=[1.2, -1.2])) == Fault.NONE
+    np.testing.assert_allclose(rig.accepted[2:4], true + [0.02, -0.02], atol=1e-4)
+    other = Rig().settle()
+    other.check(moved(velocities=[0.019, -0.019]))
+    np.testing.assert_allclose(other.accepted[2:4], true + [0.019, -0.019], atol=1e-6)
+
+
+def test_external_torque_of_the_prediction_follows_at_a_limited_rate():
+    rig = Rig().settle()
+    np.testing.assert_allclose(rig.state.external, EXTERNAL)
+    rig.check(moved(external_torque=[50.0, -50.0]))
+    np.testing.assert_allclose(rig.state.external, EXTERNAL + [2.0, -1.0])
+    np.testing.assert_allclose(rig.accepted[4:], EXTERNAL + [50.0, -50.0])
+
+
+# Agreement in doubt.
+
+
+def doubted():
+    rig = Rig().settle()
+    rig.check(WRONG[Fault.MALFORMED])
+    rig.state = replace(rig.state, doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("change", "is_accepted"),
+    [
+        ({"velocities": [0.09, 0.0]}, True),
+        ({"velocities": [0.11, 0.0]}, False),
+        ({"velocities": [0.0, -0.11]}, False),
+        ({"positions": [0.0, 9e-4]}, True),
+        ({"positions": [0.0, 1.1e-3]}, False),
+        ({"positions": [-1.1e-3, 0.0]}, False),
+        ({"time": -0.4 * LIMITS.max_age}, False),  # before the accepted one
+        ({"external_torque": [1.0, 1.0]}, True),
+    ],
+    ids=str,
+)
+def test_status_in_doubt_is_accepted_when_it_agrees(change, is_accepted):
+    rig = doubted()
+    rig.check(moved(**change))
+    assert rig.estimate.is_new == is_accepted
+
+
+@pytest.mark.parametrize(("late", "is_accepted"), [(0.45, True), (0.55, False)])
+def test_status_in_doubt_must_be_fresh(late, is_accepted):
+    rig = doubted()
+    for _ in range(6):
+        rig.check(None)
+    rig.check(moved(time=-late * LIMITS.max_age, positions=-late * LIMITS.max_age * CRUISE))
+    assert rig.estimate.is_new == is_accepted
+
+
+def test_new_clock_is_not_accepted_before_settling():
+    rig = Rig().settle()
+    before = None
+    for step in range(round(0.9 * LIMITS.settling_time / PERIOD)):
+        rig.check(moved(time=-1.0))
+        before = rig.accepted if before is None else before
+        np.testing.assert_array_equal(rig.accepted, before, str(step))
+    for _ in range(round(0.2 * LIMITS.settling_time / PERIOD)):
+        rig.check(moved(time=-1.0))
+    assert rig.estimate.fault == Fault.NONE
+    assert rig.estimate.is_new
+
+
+def test_jumped_position_is_not_accepted_before_settling():
+    """Damping with the inertia of another posture may drive the arm."""
+    rig = Rig().settle()
+    for _ in range(round(0.9 * LIMITS.settling_time / PERIOD)):
+        assert rig.check(moved(positions=[2.5, 0.0])) == Fault.POSITION_JUMP
+        assert rig.accepted[0] < 1.0
+    for _ in range(round(0.2 * LIMITS.settling_time / PERIOD)):
+        rig.check(moved(positions=[2.5, 0.0]))
+    assert rig.estimate.fault == Fault.NONE
+    assert rig.accepted[0] > 2.5
+
+
+# Stop with one wrong signal.
+
+SIGNALS = {
+    "position step": lambda rng, t: {"positions": rng.uniform(-0.5, 0.5, 2)},
+    "velocity bias": lambda rng, t: {"velocities": rng.uniform(-2.0, 2.0, 2)},
+    "small velocity bias": lambda rng, t: {"velocities": rng.uniform(-0.05, 0.05, 2)},
+    "external torque": lambda rng, t: {"external_torque": rng.uniform(-30.0, 30.0, 2)},
+    "clock": lambda rng, t: {"time": rng.uniform(-0.5, 0.5)},
+}
+
+
+def stop(rig, change, steps=50):
+    """Damp the arm from now on; return the largest kinetic energy, and the speed of the fastest joint at the end."""
+    energies = []
+    for _ in range(steps):
+        torque = damping_torque(M, rig.state.velocity, 0.02, period=PERIOD)
+        rig.check(change, torque=torque)
+        energies.append(0.5 * rig.v @ M @ rig.v)
+    return max(energies), np.abs(rig.v).max()
+
+
+@pytest.mark.parametrize("signal", SIGNALS)
+@pytest.mark.parametrize("seed", range(8))
+def test_no_single_wrong_signal_adds_energy_to_a_stop(signal, seed):
+    rng = np.random.default_rng(seed)
+    rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
+    before = 0.5 * rig.v @ M @ rig.v
+    energy, speed = stop(rig, moved(**SIGNALS[signal](rng, 0)))
+    assert energy <= before * (1.0 + 1e-9)
+    assert speed < 0.1
+
+
+@pytest.mark.parametrize("fields", [("velocities",), ("positions",), ("positions", "velocities", "external_torque")])
+@pytest.mark.parametrize("seed", range(8))
+def test_no_frozen_signal_adds_energy_to_a_stop(fields, seed):
+    rng = np.random.default_rng(seed)
+    rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
+    before, kept = 0.5 * rig.v @ M @ rig.v, rig.status()
+    energy, speed = stop(rig, lambda status: replace(status, **{name: getattr(kept, name) for name in fields}))
+    assert energy <= before * (1.0 + 1e-9)
+    assert speed < 0.1
+
+
+# State and arguments.
+
+
+def test_state_is_restored_from_its_vector():
+    rig = Rig().settle()
+    rig.check(WRONG[Fault.FUTURE])
+    restored = EstimatorState.from_vector(rig.state.vector(), 2)
+    np.testing.assert_array_equal(restored.vector(), rig.state.vector())
+    np.testing.assert_array_equal(restored.bias, rig.state.bias)
+    assert (restored.doubt_time, restored.last_time) == (rig.state.doubt_time, rig.state.last_time)
+    assert EstimatorState.initial(3).vector().shape == (11 + 19 * 3,)
+
+
+def test_torque_that_is_not_finite_counts_as_zero():
+    rig = Rig().settle()
+    np.testing.assert_array_equal(rig.estimator.advance(rig.estimate, np.array([np.nan, 2.0])).torque, [0.0, 2.0])
+
+
+def test_estimator_is_finite_when_its_state_is_not():
+    rig = Rig().settle()
+    rig.state = replace(rig.state, velocity=np.array([np.nan, 0.1]))
+    rig.check(None)
+    np.testing.assert_array_equal(rig.estimate.state.velocity, 0.0)
+
+
+@pytest.mark.parametrize("tolerance", [(1.0,), (1.0,) * 3, (0.0, 1.0), (np.inf, 1.0), (np.nan, 1.0), (-1.0, 1.0)])
+def test_constructor_refuses_torque_tolerances_out_of_range(tolerance):
+    with pytest.raises(InputError):
+        StateEstimator(LIMITS, tolerance, period=PERIOD)
