@@ -63,6 +63,7 @@ forces: $(VENV)/.ready  ## adversarial actions against the force limit, an hour
 
 injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 	$(BIN)/python tests/harness/injections/inject.py --injections 500
+	$(BIN)/python tests/harness/injections/campaign.py --instants 25 --pairs 200
 	$(BIN)/python tests/harness/injections/processes.py
 
 scaling: $(VENV)/.ready  ## constraints in every scale against an adversary, minutes

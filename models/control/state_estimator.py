@@ -219,7 +219,8 @@ class StateEstimator:
         if is_comparable and not is_doubted and state.torque.any():
             state = self._update_momentum(state, M, change[self._velocities], elapsed)
         else:
-            is_learning = is_comparable and not state.torque.any()
+            # The sums begin with the last status.
+            is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
         fault = fault or self._find_contradiction(state, M)
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
@@ -230,13 +231,15 @@ class StateEstimator:
             values = values.copy()
             values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
             velocity = np.median((velocity, *others), axis=0)
-        if fault == Fault.NOT_REACTING:
+        if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING):
             # If the velocity is wrong, it misses the effect of the torques with and without the external ones; if only
             # one of the two is missing, the external torque is wrong.
             missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
-            is_missing = np.prod(np.sign(missing), axis=1) > 0.0
+            is_frozen = (change[self._positions] == 0.0) | (fault == Fault.NOT_REACTING)
+            is_missing = is_frozen & (np.prod(np.sign(missing), axis=1) > 0.0)
             smaller = np.sign(missing[:, 0]) * np.abs(missing).min(axis=1)
-            state = replace(state, velocity=velocity + np.where(is_missing, smaller, 0.0))
+            reported = status.velocities + smaller
+            state = replace(state, velocity=np.where(is_missing, reported, velocity))
         if fault not in ACCEPTABLE_FAULTS or not is_trusted:
             return self._finish(state, before, fault, now)
         age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0

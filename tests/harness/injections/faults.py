@@ -48,7 +48,7 @@ class Injection:
         """Inject the fault while the arm moves; check its effect, and that the arm can resume."""
         bus.run_in()
         self.begin(bus)
-        standstill = buses.STANDSTILL_WITHOUT_STATUS if self.kind.startswith("status") else buses.STANDSTILL
+        standstill = buses.STANDSTILL_WITHOUT_STATUS if self.kind.startswith(("status", "clock")) else buses.STANDSTILL
         observation = bus.watch(self.duration + 0.35, lambda: self.end(bus), self.duration, standstill)
         if self.stops is not None and self.stops != (observation.detected is not None):
             observation.wrong.append("not detected" if self.stops else f"stopped the arm: {observation.fault}")

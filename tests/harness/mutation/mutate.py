@@ -52,6 +52,9 @@ TARGETS = {
         "tests/models/control/test_cartesian_impedance.py",
         "tests/models/control/test_reachable_inertia.py",
     ],
+    "models/control/joint_status.py": ["tests/models/control/test_joint_status.py"],
+    "models/control/state_estimator.py": ["tests/models/control/test_state_estimator.py"],
+    "diagrams/hardware/monitor.py": ["tests/diagrams/hardware/test_monitor.py"],
     **{
         f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
         for path in sorted((ROOT / "systems").glob("*.py"))

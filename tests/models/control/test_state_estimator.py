@@ -450,7 +450,7 @@ def test_joint_that_does_not_react_is_a_fault(joint):
     assert fault == Fault.NOT_REACTING
     assert count * PERIOD < 0.07
     assert np.abs(rig.v).max() < 0.3
-    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.3 * rig.v.max())
+    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.5 * rig.v.max())
 
 
 @pytest.mark.parametrize(("share", "is_fault"), [(0.95, False), (1.05, True)])
@@ -710,3 +710,12 @@ def test_estimator_is_finite_when_its_state_is_not():
 def test_constructor_refuses_torque_tolerances_out_of_range(tolerance):
     with pytest.raises(InputError):
         StateEstimator(LIMITS, tolerance, period=PERIOD)
+
+
+def test_commanded_impulse_is_not_learned_when_the_command_ends():
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    for _ in range(10):
+        rig.check(torque=np.array([3.0, -2.0]))
+    for _ in range(10):
+        assert rig.check(torque=np.zeros(2)) == Fault.NONE
+    np.testing.assert_allclose(rig.state.bias, 0.0, atol=0.02)
