@@ -50,7 +50,7 @@ class Robot:
 
     @property
     def state(self):
-        self.time += 0.005
+        self.time += 0.0025  # the driver reads twice per period
         return SimpleNamespace(
             q=self.positions,
             dq=np.zeros(7),
