@@ -23,7 +23,7 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.driver import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 
@@ -63,7 +63,7 @@ class Listener:
         self.commands.append((time.monotonic(), float(np.abs(torque).max())))
 
     def _heartbeat(self, message: bytes) -> None:
-        self.is_acting = bool(message[-1])
+        self.is_acting = HEARTBEAT_FORMAT.unpack(message)[1]
         if self.is_acting:
             self.acting.append(self.clock)
 
