@@ -24,6 +24,7 @@ NEUTRAL = {
     "guidance": "the method, which is named next to the differences",
     "solver": "all solvers return the same solution",
     "kernel_parameters": "parameters of a kernel other than the thesis's",
+    "driver": "the program that drives a robot",
     "robot_url": "the address of a robot's messages",
     "robot_timeout": "the time after which a silent robot is given up",
 }

@@ -136,7 +136,7 @@ def test_robot_page_has_the_limits_of_the_code():
         "jump of a position": f"{status.position_jump} rad ",
         "jump of a velocity": f"{status.velocity_jump} rad/s",
         "delay of this program": f"{status.max_check_interval / MM:.0f} ms ",
-        "safety monitor": f"{age} without a command; a robot clock that goes back by {age}; "
+        "safety monitor": f"{age} without a command; every fault of a status in this table; "
         f"{2 * MAX_MISSED_MESSAGES * station.period / MM:.0f} ms without",
         "joint speed": f"{VELOCITY_SHARE:.0%} of its limit".replace("%", " %"),
         "position of the tool and of the command": f"±{limits.upper[0]} m lateral, −{-limits.lower[2]} to "

@@ -68,7 +68,8 @@ OTHER_VALUES = {
     "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
     "time_step": 0.005, "control_period": 0.004, "robot": "other.urdf", "end_effector": "other", "robot_url": "udpm://",
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
-    "wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.1), "wrench_drift": (1.0, 0.1), "wrench_noise": (1.0, 0.1),
+    "force_limit_range": (12.0, 12.0), "wrench_scale": (0.5, 2.0),
+    "wrench_bias": (1.0, 0.1), "wrench_drift": (1.0, 0.1), "wrench_noise": (1.0, 0.1),
     "wrench_delay": 3, "calibration_error": (0.001, 0.01), "tare": True,
 }  # fmt: skip
 TOGETHER = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}

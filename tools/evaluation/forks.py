@@ -51,7 +51,8 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
         RuntimeError: If a process is killed. An exception of `compute` is raised as it is.
     """
     processes = min(processes, count)
-    if processes < 2 or "fork" not in multiprocessing.get_all_start_methods():
+    can_fork = "fork" in multiprocessing.get_all_start_methods() and not multiprocessing.current_process().daemon
+    if processes < 2 or not can_fork:
         yield from map(compute, range(count))
         return
     context = multiprocessing.get_context("fork")

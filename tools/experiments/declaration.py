@@ -200,11 +200,11 @@ def load_study(file: Path | str) -> Study:
 def _sentence(error: ValidationError) -> str:
     """Return the first error as a sentence: where it is and what is allowed."""
     first = error.errors()[0]
-    where = ", ".join(str(part) for part in first["loc"])
+    where = " ".join(", ".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
     if first["type"] == "extra_forbidden":
         kinds = (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio)
         known = {name for kind in kinds for name in kind.model_fields}
         return f"a study has no key {where}: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
+        return " ".join(str(first["ctx"]["error"]).split())
     return f"{where}: {first['msg'][:1].lower()}{first['msg'][1:]}, not {first['input']!r}"[:300]

@@ -8,12 +8,12 @@ from guiderail.models.common.errors import InputError
 
 @pytest.mark.parametrize("url", ["memq://", "udpm://239.255.76.67:7668?ttl=0"])
 def test_open_bus_has_the_given_url(url):
-    assert open_bus(url).get_robot_url() == url
+    assert open_bus(url).get_lcm_url() == url
 
 
 def test_open_bus_uses_lcms_default_without_a_url(monkeypatch):
     monkeypatch.delenv("LCM_DEFAULT_URL", raising=False)
-    assert open_bus("").get_robot_url().startswith("udpm://")
+    assert open_bus("").get_lcm_url().startswith("udpm://")
 
 
 @pytest.mark.parametrize(

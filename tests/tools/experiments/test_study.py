@@ -300,7 +300,7 @@ WRONG = [
     ({"methods": {"one": {"policy": "magic"}}}, "no policy 'magic'"),
     ({"methods": {"one": {"env": {"guidanse": "kmp"}}}}, "did you mean guidance"),
     ({"learner": {"preset": "tqc_contct"}}, "did you mean tqc_contact"),
-    ({"learner": {"algorithm": "ppo"}}, "sac, tqc"),
+    ({"learner": {"algorithm": "sacc"}}, "did you mean sac"),
     ({"learner": {"settings": {"batchsize": 3}}}, "batch_size"),
     ({"eval_set": [{"episodes": 0}]}, "eval_set"),
     ({"eval_set": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),

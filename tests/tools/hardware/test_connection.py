@@ -35,7 +35,7 @@ def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
         served.append(type(EnvConfig.resolve(task, {}).make_task()).__name__)
         return True
 
-    def run_safety_monitor(url, robot, task, log):
+    def run_safety_monitor(url, robot, task, rate, log):
         run_sim_driver(url, 0.0, 0.0, task)
 
     monkeypatch.setattr("guiderail.tools.hardware.connection.subprocess_tied_to_parent", subprocess_tied_to_parent)

@@ -227,7 +227,7 @@ def test_monitor_check_fails_without_a_heartbeat(make_executor):
     ("wrong", "message"),
     [
         ({"synchronous": True}, "does not wait"),
-        ({"sim": True, "robot": "panda"}, "only the"),
+        ({"sim": True, "robot": "panda"}, "have a simulated robot"),
         ({"rate": 0.0}, "rate"),
     ],
 )
