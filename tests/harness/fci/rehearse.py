@@ -25,7 +25,7 @@ from guiderail.tools.hardware.sim_driver import START
 
 FORCE_LIMIT = 18.0  # bound of the impedance's force [N]
 CONTROL_STEPS = 4  # status periods of a control step
-DOWN, TURN = 0.01, 0.6  # speed of the insertion [m/s] and of the turn [rad/s]
+DOWN, TURN = 0.01, 0.25  # speed of the insertion [m/s] and of the turn [rad/s], below those of `motion_limits`
 PRESSED = -0.006  # commanded height while the plug is turned [m]
 
 
