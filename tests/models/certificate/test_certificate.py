@@ -704,7 +704,7 @@ def test_no_alteration_of_a_field_is_accepted_unless_its_claims_hold(history, tm
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 checker.check(write(tmp_path, other))
-        except Exception:
+        except (checker.Rejected, ValueError):  # a refusal, or one of NumPy's reader
             continue
         if compare_subject(other, made, *IMPEDANCE, ABOUT) is not None:
             continue
