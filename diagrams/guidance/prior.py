@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -12,7 +12,9 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import LinearConstraints
-from guiderail.models.templates import SharedControlTemplate
+
+if TYPE_CHECKING:
+    from guiderail.models.templates import SharedControlTemplate
 
 
 @dataclass(frozen=True)

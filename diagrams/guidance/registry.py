@@ -55,8 +55,12 @@ class GuidanceKind:
 
         `known` are the requirements that the task provides.
         """
-        lacking = [tuple(one for one in needed if one not in known) for needed in self.needs]
-        return min(lacking, key=len, default=())
+        return _missing_requirements(self.needs, known)
+
+
+def _missing_requirements(needs: tuple[tuple[str, ...], ...], known: Collection[str]) -> tuple[str, ...]:
+    lacking = [tuple(one for one in needed if one not in known) for needed in needs]
+    return min(lacking, key=len, default=())
 
 
 GUIDANCE: Registry[GuidanceKind] = Registry(
@@ -99,7 +103,7 @@ def register_guidance(
 
 def possible_guidance(known: Collection[str]) -> list[str]:
     """Return the names of all kinds of guidance with requirements among `known`."""
-    return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).missing_requirements(known)]
+    return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), known)]
 
 
 def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:

@@ -64,4 +64,4 @@ def register_station(
 
 def stations_for(world: str) -> list[str]:
     """Return the names of the stations that work on a kind of world."""
-    return [name for name in STATIONS.names() if STATIONS.get(name).world == world]
+    return [name for name in STATIONS.names() if STATIONS.declared(name, "world") == world]

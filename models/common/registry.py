@@ -5,11 +5,12 @@ import difflib
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property, partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 from guiderail.models.common.errors import InputError, brief
 
@@ -72,8 +73,8 @@ class Registry(Generic[Entry]):
         """
         if not isinstance(name, str):
             raise InputError(f"a {self.noun} is named by a word, not {brief(name)}: {did_you_mean('', self.names())}")
-        if name not in self._entries and name in self._modules:
-            import_module(self._modules[name])
+        if name not in self._entries and name in self._declarations:
+            import_module(self._declarations[name].module)
         if name not in self._entries and name in self._points:
             value = self._points[name].load()
             if name not in self._entries:  # importing the module may have registered it
@@ -84,11 +85,21 @@ class Registry(Generic[Entry]):
 
     def names(self) -> list[str]:
         """Return the names of all entries, sorted."""
-        return sorted({*self._modules, *self._points, *self._entries})
+        return sorted({*self._declarations, *self._points, *self._entries})
+
+    def declared(self, name: str, keyword: str) -> Any:
+        """Return an entry's attribute that is a keyword argument of its decorator.
+
+        The module of an entry that is not imported yet is only imported if that argument is missing or no literal.
+        """
+        literals = self._declarations[name].literals if name in self._declarations else {}
+        if name not in self._entries and keyword in literals:
+            return literals[keyword]
+        return getattr(self.get(name), keyword)
 
     @cached_property
-    def _modules(self) -> dict[str, str]:
-        """Module of each name that the modules of the package register."""
+    def _declarations(self) -> dict[str, "_Declaration"]:
+        """Declaration of each name that the modules of the package register."""
         files = {
             ".".join((package, *file.relative_to(folder).with_suffix("").parts)): file
             for package in self._packages
@@ -101,14 +112,21 @@ class Registry(Generic[Entry]):
                 import_module(module)
             return {}
         return {
-            name: module
+            name: _Declaration(module, literals)
             for module, file in files.items()
-            for name in _registered(file.read_text(encoding="utf-8"), self._decorator)
+            for name, literals in _registered(file.read_text(encoding="utf-8"), self._decorator)
         }
 
     @cached_property
     def _points(self) -> dict[str, metadata.EntryPoint]:
         return {point.name: point for point in metadata.entry_points(group=self._group)} if self._group else {}
+
+
+class _Declaration(NamedTuple):
+    """Module that registers an entry, and the literals among the keyword arguments of its decorator."""
+
+    module: str
+    literals: dict[str, Any]
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:
@@ -130,15 +148,19 @@ def _folders(package: str) -> list[Path]:
     return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec is not None else []
 
 
-def _registered(source: str, decorator: str) -> Iterator[str]:
-    """Return the names with which the source of a module calls `decorator`."""
+def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Return the names and literal keyword arguments with which the source of a module calls `decorator`."""
     if not re.search(rf"\b{decorator}\(\s*[\"']", source):  # parsing takes longer
         return
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and getattr(node.func, "id", None) == decorator and node.args:
             name = node.args[0]
             if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                yield name.value
+                literals = {}
+                for argument in node.keywords:
+                    with suppress(ValueError):
+                        literals[str(argument.arg)] = ast.literal_eval(argument.value)
+                yield name.value, literals
 
 
 def _origin(value: object) -> tuple[str, str]:

@@ -29,7 +29,7 @@ from guiderail.tools.evaluation.evaluation import COLLISIONS, LABELS, Evaluation
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import PolicyFn, check_seed, is_compatible, rollout
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_seed, is_compatible, rollout
 from guiderail.tools.evaluation.scope import counts_collisions, evaluation_scope, refuse_guidance_change
 from guiderail.tools.evaluation.subject import Subject, find_subject, make_baselines
 from guiderail.tools.files import write_atomically
@@ -37,7 +37,6 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.visualization.style import is_demonstrated
 
-HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
 # Returns what is kept of an episode, from its environment and its row.

@@ -19,9 +19,10 @@ from guiderail.models.common.units import MM
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import POLICY
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, evaluate_once
+from guiderail.tools.evaluation.evaluate import evaluate_once
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import wilson
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.scope import default_baselines, hides, refuse_guidance_change
 from guiderail.tools.evaluation.subject import Subject, find_subject, make_baselines
 from guiderail.tools.learning.run_folder import RunConfig

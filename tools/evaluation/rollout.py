@@ -14,6 +14,8 @@ from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
 
+HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode
+
 
 @dataclass(frozen=True)
 class Transition:

@@ -9,9 +9,8 @@ from typing import Any
 
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import MakePolicy
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import COLLISION
-from guiderail.tools.evaluation.rollout import check_seed
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.scope import refuse_guidance_change
 from guiderail.tools.evaluation.subject import find_subject
 

@@ -17,8 +17,9 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.cache import BASELINES_FOLDER, POLICY, POLICY_FOLDER, policy_digest, stored_episodes
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, evaluate_once
+from guiderail.tools.evaluation.evaluate import evaluate_once
 from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder

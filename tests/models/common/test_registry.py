@@ -1,6 +1,7 @@
 """Registries refuse unknown and duplicate names with a sentence."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 
@@ -44,3 +45,20 @@ def test_register_accepts_reimport_and_refuses_another_file(tmp_path):
     with pytest.raises(InputError, match=r"there is a shape 'sphere' already, from \S*one\.py: choose another name"):
         shapes.register("sphere", _Kind(_from(tmp_path / "two.py")))
     assert shapes.get("sphere") is again
+
+
+def test_declared_reads_literals_without_importing(tmp_path, monkeypatch):
+    (tmp_path / "shapes_of_mine").mkdir()
+    (tmp_path / "shapes_of_mine/__init__.py").touch()
+    (tmp_path / "shapes_of_mine/some.py").write_text(
+        'SIDES = 4\n\n\n@register_shape("triangle", sides=3)\ndef triangle():\n    raise AssertionError\n\n\n'
+        '@register_shape("square", sides=SIDES)\ndef square():\n    pass\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    shapes = Registry("shape", package="shapes_of_mine", decorator="register_shape")
+    assert shapes.names() == ["square", "triangle"]
+    assert shapes.declared("triangle", "sides") == 3
+    with pytest.raises(NameError, match="register_shape"):  # no literal: the module is imported
+        shapes.declared("square", "sides")
+    shapes.register("triangle", SimpleNamespace(sides=30))
+    assert shapes.declared("triangle", "sides") == 30

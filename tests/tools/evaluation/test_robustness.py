@@ -13,7 +13,6 @@ from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation import robustness as module
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.cache import episodes_file
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.robustness import (
     AXES,
     Axis,
@@ -23,6 +22,7 @@ from guiderail.tools.evaluation.robustness import (
     select_axes,
     values_below,
 )
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.subject import Subject
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.trainer import run_training
