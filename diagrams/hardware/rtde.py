@@ -1,0 +1,287 @@
+"""Driver on Universal Robots' RTDE: the controller's force mode at 500 Hz, wrenches of an impedance from here.
+
+The client is ur-rtde (MIT license). Of its commands, `servoL` bounds no force, and `directTorque` would leave the loop
+of 500 Hz to Python and needs PolyScope 5.26. Force mode bounds the force by the commanded wrench, in the controller's
+own loop, and runs on every e-Series. Never run on a robot.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import threading
+import time as clock
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
+from scipy.spatial.transform import Rotation
+
+from guiderail.diagrams.hardware.driver import PoseDriver, RobotImpedance, register_driver
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
+from guiderail.models.control.motion_limits import MotionLimits
+from guiderail.models.robots.mounting import add_robot
+from guiderail.models.robots.robot import find_robot
+
+logger = logging.getLogger(__name__)
+
+EXTERNAL_TORQUE_LIMITS = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # of external joint torques [Nm]
+# Defaults of URScript's movel: 0.25 m/s, 1.2 m/s², 1.05 rad/s, 1.4 rad/s²; each acceleration is reached in 0.1 s.
+# Universal Robots publishes no limits of a commanded jerk.
+UR_MOTION_LIMITS = MotionLimits((0.25, 1.2, 12.0), (1.05, 1.4, 14.0))
+WATCHDOG_FREQUENCY = 10.0  # the controller ends its program when commands arrive less often [Hz]
+MAX_ZEROED_FORCE = 15.0  # largest force that a drifted sensor may show before it is zeroed [N]
+MAX_POSE_DIFFERENCE = 0.02  # between the robot's tool center and the model's, by its own calibration [m]
+NO_TRANSFORM = 2  # type of force mode whose frame is fixed
+RECOVERY_TIME = 2.0  # longest wait for the status after a recovery [s]
+NUM_ATTEMPTS = 10  # to read the values of one message
+# The frame "base" of the controller is turned against that of the model, which stretches the arm along x at zero.
+X_ControllerBase = RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0.0, 0.0, 0.0])
+VARIABLES = ["timestamp", "actual_q", "actual_qd", "actual_TCP_force", "actual_TCP_pose", "safety_status_bits"]
+
+
+@register_driver("rtde")
+class RtdeDriver(PoseDriver):
+    """Universal Robots UR5e with PolyScope 5.10 or later, in remote control.
+
+    The commanded wrench is K e, clipped to the largest wrench of the impedance, with the error e of the tool center's
+    pose in the axes of the base. In force mode the controller moves the tool with a bounded speed until its sensor
+    measures that wrench: at rest the arm acts as a spring with a bounded force. The controller's own loop damps it.
+
+    The measured wrench is that of the surroundings on the tool. It is reported as joint torques Jᵀ F. A protective or
+    emergency stop, and an ended program, make the status malformed until `recover`. If no command arrives for
+    1 / `WATCHDOG_FREQUENCY`, the controller ends its program and the arm stops.
+    """
+
+    name = "ur5e"
+    torque_reflex_limits = EXTERNAL_TORQUE_LIMITS
+    has_command_timeout = True
+    hold_off = 0.25  # the robot needs none; statuses are watched before the arm is taken over
+    motion_limits = UR_MOTION_LIMITS
+
+    def __init__(self, url: str = "", *, client: Any = None):
+        """Construct the driver; the first `read` connects to the robot.
+
+        Args:
+            url: Host name or address of the robot.
+            client: Namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`; those of
+                ur-rtde by default.
+
+        Raises:
+            InputError: If ur-rtde is not installed, or no host is named.
+        """
+        super().__init__(url)
+        if not url:
+            raise InputError("the driver rtde needs the robot's host: give --robot-url")
+        self._client = client or _import_client()
+        self._receiver: Any = None
+        self._control: Any = None
+        self._impedance: RobotImpedance | None = None
+        self._status: JointStatus | None = None
+        self._is_active = self._is_lost = False
+        self._stopping: threading.Thread | None = None
+        self._plant = MultibodyPlant(0.0)
+        self._flange = add_robot(self._plant, find_robot(self.name)).flange
+        self._plant.Finalize()
+        self._context = self._plant.CreateDefaultContext()
+        self._X_FlangeTool = RigidTransform()
+
+    def configure(self, impedance: RobotImpedance) -> None:
+        """Set tool center and payload, zero the force sensor and start the controller's program; nothing moves.
+
+        Raises:
+            InputError: If the robot refuses them, its tool is loaded, or its kinematics are not the model's.
+        """
+        self._impedance, self._X_FlangeTool = impedance, impedance.X_FlangeTool
+        if self._is_active:
+            return
+        if self._control is None:
+            try:
+                self._control = self._client.RTDEControlInterface(self.url)
+            except Exception as error:  # the client raises RuntimeError and its own types
+                raise InputError(f"the robot at {self.url} starts no program: {error}") from None
+        inertia = impedance.inertia
+        order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        self._check(
+            self._control.setTargetPayload(
+                impedance.mass, impedance.center_of_mass.tolist(), [float(inertia[i, j]) for i, j in order]
+            ),
+            "payload",
+        )
+        self._check(self._control.setTcp(_to_vector(impedance.X_FlangeTool)), "tool center")
+        force = float(np.linalg.norm(self._receiver.getActualTCPForce()[:3]))
+        if force > MAX_ZEROED_FORCE:
+            raise InputError(f"the robot measures {force:.0f} N: free its tool before the force sensor is zeroed")
+        self._check(self._control.zeroFtSensor(), "zeroing of the force sensor")
+
+    def read(self) -> JointStatus | None:
+        """Return the newest status, None while no robot answers."""
+        if self._is_lost:
+            return MALFORMED_STATUS
+        if self._receiver is None:
+            try:
+                self._receiver = self._client.RTDEReceiveInterface(self.url, -1.0, VARIABLES)
+            except RuntimeError:
+                return None
+        receiver = self._receiver
+        try:
+            if not receiver.isConnected():
+                raise RuntimeError("connection lost")
+            if self.error:
+                return MALFORMED_STATUS
+            for _ in range(NUM_ATTEMPTS):
+                time = receiver.getTimestamp()
+                getters = (receiver.getActualQ, receiver.getActualQd, receiver.getActualTCPForce)
+                q, v, F = (np.array(getter(), dtype=float) for getter in getters)
+                if receiver.getTimestamp() == time:
+                    break
+            else:
+                return self._status
+            self._keep_alive(time)
+        except RuntimeError:
+            self._is_lost = True
+            return MALFORMED_STATUS
+        if self._status is None or time != self._status.time:
+            self._status = JointStatus(time, q, v, self._calc_jacobian(q).T @ _turn(F))
+        return self._status
+
+    @property
+    def error(self) -> str:
+        """Reason why the robot accepts no commands, empty if there is none."""
+        if self._receiver.isEmergencyStopped():
+            return "emergency stop"
+        if self._receiver.isProtectiveStopped():
+            return "protective stop"
+        if self._control is not None and not self._control.isProgramRunning():
+            return "its program has ended"
+        return ""
+
+    def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
+        """Command the wrench of the impedance towards a pose of the tool center in the robot's base frame."""
+        del time
+        impedance, status = self._impedance, self._status
+        if impedance is None or status is None:
+            raise InputError("the driver rtde is used before it is configured")
+        if not self._is_active:
+            self._finish_stop()
+            self._check_kinematics()
+            self._check(self._control.setWatchdog(WATCHDOG_FREQUENCY), "watchdog")
+            self._is_active = True
+        # The model is that of the station, so that both agree where the calibrated robot is elsewhere by a millimeter.
+        X_BaseActual = self._calc_pose(status.positions)
+        turn = (X_BaseTool.rotation() @ X_BaseActual.rotation().inverse()).ToAngleAxis()
+        error = np.concatenate([X_BaseTool.translation() - X_BaseActual.translation(), turn.angle() * turn.axis()])
+        limits = impedance.max_wrench
+        wrench = np.clip(impedance.stiffness @ error, -limits, limits)
+        X_ControllerTool = X_ControllerBase @ X_BaseActual
+        frame = [*X_ControllerTool.translation(), 0.0, 0.0, 0.0]  # wrenches act at the tool center
+        speed = [self.motion_limits.linear[0]] * 3 + [self.motion_limits.angular[0]] * 3
+        if not self._control.forceMode(frame, [1] * 6, _turn(wrench).tolist(), NO_TRANSFORM, speed):
+            logger.warning("the robot at %s refused a command", self.url)
+
+    def stop(self) -> None:
+        """Leave force mode and brake the tool; the controller then holds the arm."""
+        if self._is_active:
+            self._is_active = False
+            # The client waits until the arm has stopped, and this program's loop must not.
+            self._stopping = threading.Thread(target=self._control.forceModeStop, daemon=True)
+            self._stopping.start()
+
+    def recover(self) -> None:
+        """End a protective stop, and start the controller's program again; the arm does not move.
+
+        Raises:
+            InputError: If the robot still accepts no commands.
+        """
+        self._is_active = False
+        if self._is_lost:
+            raise InputError(f"the connection to the robot at {self.url} is lost: start the program again")
+        self._finish_stop()
+        if self._receiver.isProtectiveStopped():
+            dashboard = self._client.DashboardClient(self.url)
+            dashboard.connect()
+            dashboard.closeSafetyPopup()
+            dashboard.unlockProtectiveStop()
+            dashboard.disconnect()
+        if self._control is not None and not self._control.isProgramRunning():
+            self._control.reuploadScript()
+        end = clock.monotonic() + RECOVERY_TIME
+        while self.error and clock.monotonic() < end:
+            clock.sleep(0.01)
+        if self.error:
+            raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
+
+    def _keep_alive(self, time: float) -> None:
+        """Feed the controller's watchdog while no wrench is commanded."""
+        is_new = self._status is None or time != self._status.time
+        is_stopping = self._stopping is not None and self._stopping.is_alive()
+        if is_new and self._control is not None and not self._is_active and not is_stopping:
+            self._control.kickWatchdog()
+
+    def _finish_stop(self) -> None:
+        if self._stopping is not None:
+            self._stopping.join()
+            self._stopping = None
+
+    def _check(self, accepted: bool, what: str) -> None:
+        if not accepted:
+            raise InputError(f"the robot at {self.url} refuses its configuration: {what}")
+
+    def _check_kinematics(self) -> None:
+        """Compare the tool center of the robot with that of the model.
+
+        Raises:
+            InputError: If they differ by more than the calibration of a robot.
+        """
+        actual = X_ControllerBase.inverse() @ _to_transform(self._receiver.getActualTCPPose())
+        assert self._status is not None
+        distance = np.linalg.norm(actual.translation() - self._calc_pose(self._status.positions).translation())
+        if distance > MAX_POSE_DIFFERENCE:
+            raise InputError(
+                f"the tool center of the robot at {self.url} is {1e3 * distance:.0f} mm from that of the {self.name}'s "
+                "model: it is another robot, or another tool is active"
+            )
+
+    def _calc_pose(self, positions: np.ndarray) -> RigidTransform:
+        self._plant.SetPositions(self._context, positions)
+        return self._flange.CalcPoseInWorld(self._context) @ self._X_FlangeTool
+
+    def _calc_jacobian(self, positions: np.ndarray) -> np.ndarray:
+        """Return the Jacobian of the tool center in the base's axes, (6, n), translational part first."""
+        self._plant.SetPositions(self._context, positions)
+        world = self._plant.world_frame()
+        J = self._plant.CalcJacobianSpatialVelocity(
+            self._context, JacobianWrtVariable.kV, self._flange, self._X_FlangeTool.translation(), world, world
+        )
+        return J[[3, 4, 5, 0, 1, 2]]
+
+
+def _import_client() -> Any:
+    try:
+        return SimpleNamespace(
+            RTDEControlInterface=importlib.import_module("rtde_control").RTDEControlInterface,
+            RTDEReceiveInterface=importlib.import_module("rtde_receive").RTDEReceiveInterface,
+            DashboardClient=importlib.import_module("dashboard_client").DashboardClient,
+        )
+    except ImportError:
+        raise InputError('the driver rtde needs ur-rtde: pip install "guiderail[rtde]"') from None
+
+
+def _turn(wrench: np.ndarray) -> np.ndarray:
+    """Return a wrench (6,) in the axes of the model's base for one in the controller's, and the other way round."""
+    return np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0]) * wrench
+
+
+def _to_vector(X: RigidTransform) -> list[float]:
+    """Return position and rotation vector (6,)."""
+    turn = X.rotation().ToAngleAxis()
+    return [*X.translation(), *(turn.angle() * turn.axis())]
+
+
+def _to_transform(vector: list[float]) -> RigidTransform:
+    """Return the transform of a position and a rotation vector (6,)."""
+    return RigidTransform(RotationMatrix(Rotation.from_rotvec(vector[3:]).as_matrix()), vector[:3])

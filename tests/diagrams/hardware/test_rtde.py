@@ -1,0 +1,259 @@
+"""Driver on Universal Robots' RTDE: the real client against a double of the robot's controller (`rtde_server`)."""
+
+import os
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from rtde_server import END_FORCE_MODE, FORCE_MODE, DirectClient, RtdeProcess, RtdeServer
+
+from guiderail.diagrams.hardware import rtde
+from guiderail.diagrams.hardware.pose_control import make_robot_impedance
+from guiderail.diagrams.hardware.rtde import RtdeDriver
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.stations.arm import ArmControllerPlant
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import Fault
+from guiderail.systems.torque_safety_limiter import ArmState
+from guiderail.tools.hardware.sim_driver import START
+
+WORKCELL = BncWorkcell()
+IMPEDANCE = Impedance().with_max_force(18.0)
+TIMEOUT = 60.0  # of the wall clock [s]
+
+
+def wait_until(condition):
+    """Wait until messages have made a condition true."""
+    end = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ArmControllerPlant(WORKCELL, "ur5e")
+
+
+@pytest.fixture(scope="module")
+def impedance(model):
+    return make_robot_impedance(model, IMPEDANCE)
+
+
+@pytest.fixture
+def robot(model):
+    return RtdeServer("192.0.2.1", model.solve(START, model.posture))
+
+
+@pytest.fixture
+def driver(robot, impedance):
+    driver = RtdeDriver(robot.host, client=DirectClient(robot))
+    driver.read()
+    driver.configure(impedance)
+    return driver
+
+
+def model_pose(model, driver):
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, driver.read().positions)
+    return model.tool_center.CalcPoseInWorld(context)
+
+
+def test_host_is_required():
+    with pytest.raises(InputError, match="--robot-url"):
+        RtdeDriver()
+
+
+def test_missing_client_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "rtde_control", None)
+    with pytest.raises(InputError, match=r"guiderail\[rtde\]"):
+        RtdeDriver("192.0.2.1")
+
+
+def test_configuration_sets_tool_and_payload(robot, driver, impedance):
+    np.testing.assert_allclose(robot.tcp[:3], impedance.X_FlangeTool.translation(), atol=1e-9)
+    np.testing.assert_allclose(robot.payload[0], impedance.mass)
+    np.testing.assert_allclose(robot.payload[1:4], impedance.center_of_mass)
+    expected = impedance.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    np.testing.assert_allclose(robot.payload[4:], expected)
+
+
+@pytest.mark.parametrize(("share", "is_refused"), [(0.95, False), (1.05, True)])
+def test_loaded_tool_is_refused_before_zeroing(robot, impedance, share, is_refused):
+    robot.bias = np.array([0.0, 0.0, share * rtde.MAX_ZEROED_FORCE, 0.0, 0.0, 0.0])
+    driver = RtdeDriver(robot.host, client=DirectClient(robot))
+    driver.read()
+    if is_refused:
+        with pytest.raises(InputError, match="free its tool"):
+            driver.configure(impedance)
+    else:
+        driver.configure(impedance)
+        np.testing.assert_array_equal(robot.bias, np.zeros(6))
+
+
+def test_status_has_the_torque_of_the_surroundings(robot, driver, model):
+    force = np.array([3.0, -5.0, 7.0, 0.2, 0.3, -0.4])
+    robot.bias = force
+    robot.advance(0.01)
+    status, work = driver.read(), []
+    before = model_pose(model, driver)
+    for joint in range(6):
+        q = status.positions.copy()
+        q[joint] += 1e-6
+        context = model.plant.CreateDefaultContext()
+        model.plant.SetPositions(context, q)
+        after = model.tool_center.CalcPoseInWorld(context)
+        turn = (after.rotation() @ before.rotation().inverse()).ToAngleAxis()
+        moved = np.concatenate([after.translation() - before.translation(), turn.angle() * turn.axis()]) / 1e-6
+        work.append(np.array([-1, -1, 1, -1, -1, 1]) * force @ moved)  # the controller's base is turned by half a turn
+    np.testing.assert_allclose(status.external_torque, work, atol=1e-4)
+
+
+def test_wrench_is_that_of_the_spring_and_bounded(robot, driver, model, impedance):
+    actual = model_pose(model, driver)
+    error = np.array([0.004, -0.003, 0.002])
+    driver.write_pose(RigidTransform(actual.rotation(), actual.translation() + error), 0.0)
+    spring = np.diag(impedance.stiffness)[:3] * error
+    np.testing.assert_allclose(robot.wrench, [-spring[0], -spring[1], spring[2], 0.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(robot.speed_limits[:3], RtdeDriver.motion_limits.linear[0])
+    np.testing.assert_allclose(robot.task_frame[:3], robot.pose()[:3], atol=1e-6)
+    driver.write_pose(RigidTransform([5.0, 5.0, -5.0]) @ actual, 0.0)
+    np.testing.assert_allclose(np.abs(robot.wrench[:3]), impedance.max_wrench[:3])
+    assert (np.abs(robot.wrench) <= impedance.max_wrench + 1e-12).all()
+
+
+@pytest.mark.parametrize(("share", "is_alive"), [(0.9, True), (1.2, False)])
+def test_program_ends_when_commands_stop(robot, driver, model, share, is_alive):
+    driver.write_pose(model_pose(model, driver), 0.0)
+    robot.advance(share / rtde.WATCHDOG_FREQUENCY)
+    assert robot.is_running == is_alive
+    if not is_alive:
+        assert not driver.read().is_readable
+        driver.recover()
+        assert driver.read().is_readable
+
+
+def test_robot_is_kept_alive_while_it_holds(robot, driver, model):
+    driver.write_pose(model_pose(model, driver), 0.0)
+    driver.stop()
+    driver.stop()
+    driver._stopping.join()
+    assert robot.wrench is None
+    assert robot.commands.count(END_FORCE_MODE) == 1
+    for _ in range(4):
+        robot.advance(0.5 / rtde.WATCHDOG_FREQUENCY)
+        assert driver.read().is_readable
+    assert robot.is_running
+    driver.write_pose(model_pose(model, driver), 0.0)
+    assert robot.commands[-1] == FORCE_MODE
+
+
+def test_protective_stop_is_a_fault_until_recovery(robot, driver, monkeypatch):
+    monkeypatch.setattr(rtde, "RECOVERY_TIME", 0.0)
+    robot.safety_bits = 1 + 4
+    assert not driver.read().is_readable
+    assert driver.error == "protective stop"
+    driver.recover()
+    assert driver.read().is_readable
+    robot.safety_bits = 128
+    assert not driver.read().is_readable
+    with pytest.raises(InputError, match="cannot recover: emergency stop"):
+        driver.recover()
+
+
+@pytest.mark.parametrize(("share", "is_refused"), [(0.9, False), (1.1, True)])
+def test_other_kinematics_are_refused(robot, driver, model, share, is_refused):
+    robot.calibration = np.array([0.0, share * rtde.MAX_POSE_DIFFERENCE, 0.0])
+    driver.read()
+    if is_refused:
+        with pytest.raises(InputError, match="another robot, or another tool"):
+            driver.write_pose(model_pose(model, driver), 0.0)
+        assert FORCE_MODE not in robot.commands
+    else:
+        driver.write_pose(model_pose(model, driver), 0.0)
+
+
+def test_pose_before_configuration_is_refused():
+    with pytest.raises(InputError, match="configured"):
+        RtdeDriver("192.0.2.1", client=SimpleNamespace()).write_pose(RigidTransform(), 0.0)
+
+
+def test_station_presses_with_the_bounded_force_and_stops(robot):
+    station = HardwareStation(WORKCELL, RtdeDriver(robot.host, client=DirectClient(robot)), IMPEDANCE, robot="ur5e")
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    station.get_desired_pose_input_port().FixValue(context, START)
+    station.start(simulator)
+    height = robot.pose()[2]
+    robot.plane = height - 0.003
+
+    def go(seconds):
+        for step in range(round(seconds / station.period)):
+            robot.advance(0.006 if step % 2 else 0.004)  # the robot's cycle is 2 ms, the station's period 5 ms
+            station.receive(context)
+            simulator.AdvanceTo(context.get_time() + station.period)
+
+    def state():
+        return ArmState(int(station.get_arm_state_output_port().Eval(context)[0]))
+
+    go(0.8)
+    assert state() == ArmState.RUNNING
+    assert abs(robot.pose()[2] - height) < 5e-4
+    station.get_desired_pose_input_port().FixValue(context, START - [0.0, 0.0, 0.05, 0.0, 0.0, 0.0])
+    go(0.4)
+    assert state() == ArmState.RUNNING, Fault(int(station.get_fault_output_port().Eval(context)[0])).description
+    force = station.get_wrench_output_port().Eval(context)[2]
+    assert force == pytest.approx(IMPEDANCE.limits[2], rel=0.05)
+    robot.safety_bits = 1 + 4
+    go(0.02)
+    assert state() == ArmState.DAMPING
+
+
+def test_lost_connection_is_a_fault(robot, driver):
+    driver._client.is_connected = False
+    assert not driver.read().is_readable
+    driver._client.is_connected = True
+    assert not driver.read().is_readable
+    with pytest.raises(InputError, match="is lost"):
+        driver.recover()
+
+
+def test_real_client_has_the_protocol_of_the_double(model, impedance, forkserver):
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
+    host = f"127.42.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
+    robot = RtdeProcess(host, model.solve(START, model.posture))
+    driver = RtdeDriver(host)
+    wait_until(lambda: driver.read() is not None)
+    driver.configure(impedance)
+    np.testing.assert_allclose(robot.tcp[:3], impedance.X_FlangeTool.translation(), atol=1e-9)
+    np.testing.assert_allclose(robot.payload[:4], [impedance.mass, *impedance.center_of_mass], atol=1e-9)
+    robot.bias = np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0])
+    robot.advance(0.01)
+    end = robot.time
+    wait_until(lambda: driver.read().time == end)
+    assert driver.read().external_torque @ driver.read().external_torque > 1.0
+    np.testing.assert_allclose(driver.read().positions, robot.positions)
+    X = RigidTransform([0.0, 0.0, 0.005]) @ model_pose(model, driver)
+    driver.write_pose(X, 0.0)
+    wait_until(lambda: robot.wrench is not None)
+    np.testing.assert_allclose(robot.wrench, [0.0, 0.0, 7.5, 0.0, 0.0, 0.0], atol=1e-4)
+    assert robot.watchdog == rtde.WATCHDOG_FREQUENCY
+    driver.stop()
+    driver._stopping.join(TIMEOUT)
+    assert robot.wrench is None
+    robot.safety_bits = 5
+    wait_until(lambda: not driver.read().is_readable)
+    driver.recover()
+    wait_until(lambda: driver.read().is_readable)
+    robot.advance(2.0 / rtde.WATCHDOG_FREQUENCY)
+    wait_until(lambda: driver.error == "its program has ended")
+    driver.recover()
+    wait_until(lambda: driver.read().is_readable)
+    driver._control.disconnect()
+    driver._receiver.disconnect()
+    robot.kill()
