@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.poses import POSE_SIZE, pose_difference
 from guiderail.models.control.energy_tank import admissible_share, spring_energy
 from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
@@ -118,10 +118,10 @@ class EnergyTank(LeafSystem):
             desired = reference
         requested = self._requested_bound(context).axes[_REVERSED]
         limits, K = np.minimum(last_limits, requested), self._stiffness
-        moved = _difference(pose, last_pose)
+        moved = pose_difference(pose, last_pose)
         dissipated = float(self._damping @ moved**2) / self._period
         energy = min(self._capacity, float(content[0]) + dissipated)
-        error, desired_error = _difference(reference, pose), _difference(desired, pose)
+        error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)
         released = spring_energy(K, last_limits, error) - spring_energy(K, limits, error)
         share = admissible_share(K, (limits, requested), (error, desired_error), energy + released)
         if share == 1.0:
@@ -129,7 +129,7 @@ class EnergyTank(LeafSystem):
         else:
             following = pose + error + share * (desired_error - error)
             admitted = limits + share * (requested - limits)
-        added = spring_energy(K, admitted, _difference(following, pose)) - spring_energy(K, last_limits, error)
+        added = spring_energy(K, admitted, pose_difference(following, pose)) - spring_energy(K, last_limits, error)
         return _Admitted(following, admitted, min(self._capacity, max(energy - added, 0.0)))
 
     def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
@@ -156,10 +156,3 @@ class EnergyTank(LeafSystem):
         discrete_state.set_value(self._last_limits, admitted.limits)
         discrete_state.set_value(self._last_pose, self._pose_port.Eval(context))
         discrete_state.set_value(self._content, [admitted.energy])
-
-
-def _difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return first − second of two poses (6,), angles in [−π, π)."""
-    difference = first - second
-    difference[3:] = (difference[3:] + np.pi) % (2.0 * np.pi) - np.pi
-    return difference

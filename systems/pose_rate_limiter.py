@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_difference
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
@@ -73,8 +74,7 @@ class PoseRateLimiter(LeafSystem):
         desired = self._desired_pose_port.Eval(context)
         if not np.isfinite(desired).all():
             return last  # NaN would remain in the state for ever
-        change = desired - last
-        change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
+        change = pose_difference(desired, last)
         distance = float(np.linalg.norm(change[:3]))
         if distance <= self._step and (np.abs(change[3:]) <= self._angular_step).all():
             return desired

@@ -21,6 +21,13 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
     return np.concatenate([X.translation(), rpy_angles(X.rotation())[::-1]])
 
 
+def pose_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return `first` minus `second`, two poses (6,), each angle in [−π, π)."""
+    difference = first - second
+    difference[3:] = (difference[3:] + np.pi) % (2.0 * np.pi) - np.pi
+    return difference
+
+
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Convert a generalized force along the coordinates of a pose to the wrench (6,) at P in T that does the same work.
 

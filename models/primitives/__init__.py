@@ -1,8 +1,7 @@
 """Movement primitives learned from demonstrations, and the constraints and actions that modulate them."""
 
-from guiderail.models.primitives.alignment import align_demonstrations
 from guiderail.models.primitives.constraints import LinearConstraints
-from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives.demonstrations import Demonstrations, align_demonstrations
 from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential, make_kernel, register_kernel
 from guiderail.models.primitives.kmp import Kmp
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp

@@ -5,11 +5,8 @@ import warnings
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.constraints import LinearConstraints
-from guiderail.models.primitives.features import window_features
 from guiderail.models.primitives.kernels import Kernel
 from guiderail.models.primitives.reference import ReferenceTrajectory
-from guiderail.models.primitives.window import StepFactor, Window
 
 MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
@@ -37,23 +34,43 @@ def measure_deviation(
         The distance in standard deviations of the reference, and the largest one of an output relative to its range.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
-    can_share = kernel.stationary and reference.uniform
-    squared, errors, features = [], [], None
-    for step in steps.tolist():
-        window = np.arange(step, step + horizon + 1)
-        held = np.minimum(window, reference.num_steps - 1)
-        if features is None or not can_share:
-            inputs = reference.inputs(window)
-            features = window_features(kernel, inputs[:0], inputs, 0.0)
-        G, c = LinearConstraints.none(reference.num_outputs).window(held)
-        free = Window(reference.means[held], reference.covariances[held], G, c)
-        error = StepFactor(free, features, lambda_, beta).output_offset - reference.means[step]
-        squared.append(error @ np.linalg.solve(reference.covariances[step], error) / reference.num_outputs)
-        errors.append(error)
+    errors = outputs_at(reference, kernel, lambda_ + beta, horizon, steps) - reference.means[steps]
+    squared = squared_distances(reference.covariances[steps], errors) / reference.num_outputs
     sizes, ranges = np.sqrt(np.mean(np.square(errors), axis=0)), np.ptp(reference.means, axis=0)
     with np.errstate(divide="ignore"):
         miss = np.divide(sizes, ranges, out=np.zeros_like(sizes), where=sizes > 0.0)
-    return float(np.sqrt(np.mean(squared))), float(miss.max())
+    return float(np.sqrt(squared.mean())), float(miss.max())
+
+
+def outputs_at(
+    reference: ReferenceTrajectory, kernel: Kernel, hbar: float, horizon: int, steps: np.ndarray
+) -> np.ndarray:
+    """Compute the outputs (n, O) at `steps` (n,) without actions, history and constraints: k* (K + ħΣ)⁻¹ μ.
+
+    Args:
+        reference: As in `LcNsKmp`.
+        kernel: As in `LcNsKmp`.
+        hbar: ħ = λ + β.
+        horizon: As in `LcNsKmp`.
+        steps: Steps of the reference; the window of each begins there.
+    """
+    outputs, at = reference.num_outputs, np.arange(horizon + 1)
+    window = np.minimum(steps[:, None] + at, reference.num_steps - 1)
+    is_shared = kernel.stationary and reference.uniform
+    inputs = [reference.inputs(at)] if is_shared else [reference.inputs(step + at) for step in steps.tolist()]
+    K = np.stack([np.kron(kernel(x, x), np.eye(outputs)) for x in inputs])
+    size = K.shape[1]
+    A = np.tile(K, (len(steps) if is_shared else 1, 1, 1))
+    blocks = A.reshape(len(steps), horizon + 1, outputs, horizon + 1, outputs)
+    blocks[:, at, :, at, :] += hbar * reference.covariances[window].transpose(1, 0, 2, 3)
+    means = reference.means[window].reshape(len(steps), size, 1)
+    return (K[:, :outputs] @ np.linalg.solve(A, means))[:, :, 0]
+
+
+def squared_distances(covariances: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Compute squared Mahalanobis distances (…, n) of errors (…, n, O)."""
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    return (np.einsum("nij,...nj->...ni", whiten, errors) ** 2).sum(axis=-1)
 
 
 def describe_deviation(deviation: float, miss: float) -> str:

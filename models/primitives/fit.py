@@ -14,6 +14,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives.deviation import outputs_at, squared_distances
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.reference import ReferenceTrajectory, fit_mixture, information_criteria, regress
@@ -179,7 +180,7 @@ def estimated_share(
         horizon: As in `LcNsKmp`.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
-    motion = _motion(reference, kernel, lambda_ + beta, horizon, steps)
+    motion = outputs_at(reference, kernel, lambda_ + beta, horizon, steps)
     return float(_within(reference, motion, steps).mean())
 
 
@@ -205,13 +206,7 @@ def _reference(
 
 def _within(reference: ReferenceTrajectory, motion: np.ndarray, steps: Any) -> np.ndarray:
     error = motion - reference.means[steps]
-    return _squared(reference.covariances[steps], error) <= 1.0
-
-
-def _squared(covariances: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Compute squared Mahalanobis distances (…, n) of errors (…, n, O)."""
-    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
-    return (np.einsum("nij,...nj->...ni", whiten, error) ** 2).sum(axis=-1)
+    return squared_distances(reference.covariances[steps], error) <= 1.0
 
 
 def _grid(resampled: Demonstrations, length_scale: float | None, lambda_: float | None) -> list[tuple[float, float]]:
@@ -234,14 +229,14 @@ def _validate(
     """Return all candidates with their errors; one whose motion leaves the spread of all demonstrations has none."""
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     kernels = [make(length_scale) for length_scale, _ in grid]
-    motions = [_motion(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]
+    motions = [outputs_at(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]
     shares = np.array([_within(reference, motion, steps).mean() for motion in motions])
     is_within = shares >= min(MIN_SHARE, shares.max())
     errors = np.full((len(grid), len(folds)), np.inf)
     for i in np.flatnonzero(is_within).tolist():
         for m, fold in enumerate(folds):
-            motion = _motion(fold, kernels[i], grid[i][1], horizon, steps)
-            errors[i, m] = _squared(reference.covariances[steps], outputs[m, steps] - motion).mean()
+            motion = outputs_at(fold, kernels[i], grid[i][1], horizon, steps)
+            errors[i, m] = squared_distances(reference.covariances[steps], outputs[m, steps] - motion).mean()
     worse = np.full(len(grid), np.inf)
     excess = errors[is_within] - errors[int(np.argmin(errors.mean(axis=1)))]
     standard_error = excess.std(axis=1, ddof=1) / np.sqrt(len(folds))
@@ -253,21 +248,6 @@ def _validate(
         Candidate(length_scale, hbar / 2, float(rms[i]), float(worse[i]), float(shares[i]))
         for i, (length_scale, hbar) in enumerate(grid)
     )
-
-
-def _motion(reference: ReferenceTrajectory, kernel: Kernel, hbar: float, horizon: int, steps: np.ndarray) -> np.ndarray:
-    """Compute outputs (n, O), k* (K + ħΣ)⁻¹ μ of the windows at `steps`, in double precision."""
-    outputs = reference.num_outputs
-    window = np.minimum(steps[:, None] + np.arange(horizon + 1), reference.num_steps - 1)
-    clock = reference.inputs(np.arange(horizon + 1))
-    K = np.kron(kernel(clock, clock), np.eye(outputs))
-    size = len(K)
-    A = np.tile(K, (len(steps), 1, 1))
-    at = np.arange(horizon + 1)
-    blocks = A.reshape(len(steps), horizon + 1, outputs, horizon + 1, outputs)
-    blocks[:, at, :, at, :] += hbar * reference.covariances[window].transpose(1, 0, 2, 3)
-    means = reference.means[window].reshape(len(steps), size, 1)
-    return (K[:outputs] @ np.linalg.solve(A, means))[:, :, 0]
 
 
 def _select(candidates: Sequence[Candidate]) -> Candidate:

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import typer
@@ -61,11 +61,3 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
             continue
         cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
         typer.echo("  ".join([f"{labels[key]:<{width}}", *(f"{text:<{COLUMN}}" for text in cells)]).rstrip())
-
-
-def print_lines(heading: str, lines: Sequence[str]) -> None:
-    """Print a heading and a list below it; nothing for an empty list."""
-    if lines:
-        typer.echo(heading)
-    for line in lines:
-        typer.echo(f"  · {line}")

@@ -2,19 +2,13 @@
 
 import numpy as np
 
+from guiderail.models.common.poses import pose_difference
 from guiderail.models.common.units import DEGREE, MM
 
 SPEED, ANGULAR_SPEED = 0.02, 0.1  # of a slow approach [m/s], [rad/s]
 MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum on the return path; slower segments are skipped [m/s], [rad/s]
 POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # of a reached pose
 SETTLING_TIME = 0.5  # at the end of an approach [s]
-
-
-def pose_difference(target: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return `target` minus `pose`, (6,), each angle in [−π, π)."""
-    change = target - pose
-    change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
-    return change
 
 
 def pose_distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
