@@ -45,7 +45,7 @@ class LcNsKmpSystem(LeafSystem):
     constraints of its step.
 
     The step is state and counts control periods since time zero. The command is a pure function of step, action and
-    history, evaluated once per control step (see CONTRIBUTING.md, "Rates and the order of events"). The evaluation
+    history, evaluated once per control step (see docs/concepts/rates.md). The evaluation
     raises an `InputError` if no primitive has the selected history length.
 
     Args:
@@ -76,7 +76,7 @@ class LcNsKmpSystem(LeafSystem):
         if any(not 0 < other.history < primitive.history for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
         if len({other.history for other, _ in shorter}) < len(shorter):
-            raise InputError("two shorter histories are of one length")
+            raise InputError("two shorter histories have the same length")
         for other, _ in shorter:
             constraints, others = primitive.constraints, other.constraints
             if not (np.array_equal(constraints.G, others.G) and np.array_equal(constraints.c, others.c)):

@@ -136,7 +136,7 @@ class TorqueSafetyLimiter(LeafSystem):
         check_period(period)
         num_joints = plant.num_positions()
         if len(limits.velocity) != num_joints:
-            raise InputError(f"an arm of {num_joints} joints has not {len(limits.velocity)} limits")
+            raise InputError(f"an arm of {num_joints} joints needs as many limits, not {len(limits.velocity)}")
         if limits.decay_time < 2.0 * period:
             raise InputError(f"an arm can't come to rest within {limits.decay_time} s at a period of {period} s")
         self._plant, self._limits, self._period, self._num_joints = plant, limits, period, num_joints
@@ -246,12 +246,10 @@ class TorqueSafetyLimiter(LeafSystem):
         """
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state != ArmState.OFF:
-            raise InputError(
-                f"only an arm that is stopped can go on, and this one is {ArmState(int(arm_state)).name.lower()}"
-            )
+            raise InputError(f"only a stopped arm can resume, and this one is {ArmState(int(arm_state)).name.lower()}")
         fault = self._present_fault.Eval(context)
         if fault:
-            raise InputError(f"the arm can't go on yet: {fault.description}")
+            raise InputError(f"the arm can't resume yet: {fault.description}")
         context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:

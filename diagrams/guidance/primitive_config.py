@@ -138,8 +138,8 @@ class PrimitiveConfig:
     def residual_gains(self) -> np.ndarray:
         """Return the displacement of the command by an action of one, (O,), equal for all outputs of a group.
 
-        It is √3 κ times the RMS over the motion of the demonstrations' standard deviations: the average displacement by
-        a null-space action of one, but at any time and in every direction.
+        It is √3 κ times the RMS of the demonstrations' standard deviations over the motion and the group. A null-space
+        action of one displaces the command as much on average, but differently over time and direction.
         """
         variances = np.mean(self.reference.standard_deviations**2, axis=0)
         gains = np.zeros(self.num_outputs)

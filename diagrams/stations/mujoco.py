@@ -37,8 +37,8 @@ class MujocoContact:
     """Parameters of MuJoCo's contact and integration, equal for all objects.
 
     Attributes:
-        time_step: Time step [s], rounded so that a whole number of them is the station's.
-        time_constant: Time constant of a contact [s]; the smallest that the engine integrates is two time steps.
+        time_step: Time step [s], rounded so that the station's is a multiple of it.
+        time_constant: Time constant of a contact [s]; the engine needs at least two time steps.
         impedance: Constraint impedance of a contact, between 0 and 1.
         friction_ratio: Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
         spring_step: Natural frequency times time step of a spring; its body is heavy enough for explicit integration.
@@ -70,7 +70,7 @@ def mujoco_model(
     pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
     if len(pairs) > MAX_PAIRS:
         raise InputError(
-            f"station='mujoco' tells at most {MAX_PAIRS} pairs of surfaces apart, and these are {len(pairs)}"
+            f"station='mujoco' distinguishes at most {MAX_PAIRS} pairs of surfaces, and the workcell has {len(pairs)}"
         )
     spec = mujoco.MjSpec()
     spec.modelname = "workcell"
@@ -184,8 +184,8 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
 class MujocoStation(Station):
     """`GantryStation` in MuJoCo, with the same ports, joints, impedance, watchdog and filter.
 
-    A Drake plant without joints and time step holds the poses of fixture and workpiece, which a reset sets in its
-    context, and the visual geometry.
+    A Drake plant without joints and time step contains the visual geometry, and the poses of fixture and workpiece,
+    which a reset sets in the plant's context.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class MujocoStation(Station):
         time_step = time_step or PLANT_PERIOD
         if not isinstance(workcell, ConvexWorkcell):
             raise InputError(
-                f"station='mujoco' collides convex solids, and {type(workcell).__name__} doesn't say which: "
+                f"station='mujoco' needs convex solids, which {type(workcell).__name__} does not provide: "
                 "give it the methods of ConvexWorkcell"
             )
         builder = DiagramBuilder()

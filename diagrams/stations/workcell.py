@@ -40,7 +40,7 @@ class Workcell(Protocol):
 
 @runtime_checkable
 class ConvexWorkcell(Protocol):
-    """Interface of a workcell with contact that other engines than Drake can compute too."""
+    """Interface of a workcell whose contacts engines other than Drake can compute, too."""
 
     def fixture_surfaces(self) -> list[Surface]:
         """Return the contact surfaces of the fixture, in its body's frame."""
@@ -102,7 +102,7 @@ class MovableWorkcell(ABC):
         plant.GetFrameByName("grasp").SetPoseInParentFrame(plant_context, X_PWorkpiece)
 
     def workpiece_in_target(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
-        """Return the pose of the workpiece from its place in the actual fixture: the identity when the task is done."""
+        """Return the pose of the workpiece relative to its goal in the actual fixture: the identity at the goal."""
         X_FWorkpiece = plant.GetFrameByName(self.workpiece).CalcPose(plant_context, plant.GetFrameByName(self.fixture))
         return self.X_FT.inverse() @ X_FWorkpiece
 

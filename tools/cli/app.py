@@ -11,7 +11,7 @@ import typer.core
 
 from guiderail.models.common.errors import InputError
 
-# Commands import their tools when they are called: PyTorch and Drake take seconds to import, and `--help` must not.
+# Commands import their tools when they are called, because PyTorch and Drake take seconds to import: `--help` is fast.
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 

@@ -128,7 +128,7 @@ def evaluate_run(
 ) -> pd.DataFrame:
     """Return the rows of held-out episodes in a run's environment, or with other options of it.
 
-    What is hidden and constant in the run is what it was in training.
+    Values that are hidden and constant in a run are those of its training.
 
     Args:
         config: Configuration of the run.
@@ -250,7 +250,9 @@ def evaluate(
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
     if config is None:
         if environment or resample_offsets or save is not None:
-            raise InputError("an environment that is given as an object has its options: give the name of a task")
+            raise InputError(
+                "options of an environment cannot change one that is given as an object: give the name of a task"
+            )
         where, scope = {}, "seeds of the environment as it was given"
     else:
         where = changed_environment(config.task, config.environment, environment or {})
@@ -336,7 +338,7 @@ def _baseline_file(subject: Subject, name: str, environment: Mapping[str, Any], 
 def _store(
     subject: Subject, name: str, rows: pd.DataFrame, environment: Mapping[str, Any], how: Mapping[str, Any]
 ) -> None:
-    """Store evaluated episodes in the run's folder: those of its policy only in its own environment."""
+    """Store evaluated episodes in the run's folder: those of its policy only if they are in its own environment."""
     file = _baseline_file(subject, name, environment, how)
     if file is None or subject.folder is None or subject.config is None:
         return

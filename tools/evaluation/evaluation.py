@@ -63,7 +63,7 @@ class Evaluation(Mapping[str, Any]):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Statistics `COMPARED`, one row for each policy; `success_low` and `success_high` end the 95 % interval."""
+        """Statistics `COMPARED`, one row for each policy; the 95 % interval is from `success_low` to `success_high`."""
         names = [self._name(name) for name in self.rows]
         rows = [statistics(rows) for rows in self.rows.values()]
         return pd.DataFrame(rows, index=pd.Index(names, name="policy")).dropna(axis="columns", how="all")
@@ -106,8 +106,8 @@ class Evaluation(Mapping[str, Any]):
 def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of a policy with that of baseline policies on the same episodes.
 
-    The test is McNemar's, exact and one-sided: of the episodes in which one policy succeeds and the other does not, the
-    policy would win half if it were not better. Of all baseline policies the largest p counts, so that "better than the
+    The test is McNemar's, exact and one-sided. Only episodes count in which exactly one of the two policies succeeds: a
+    policy that is not better wins half of them on average. Of all baseline policies the largest p counts, so that "better than the
     best baseline" means better than each of them (intersection-union test), without a correction for their number.
 
     Args:
@@ -130,7 +130,7 @@ def _mcnemar(won: Any, other: Any) -> float:
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
-    """Return the statistics `COMPARED` of episodes; None for one whose column an outside environment does not have."""
+    """Return the statistics `COMPARED` of episodes; None for one whose column is missing, as in environments made elsewhere."""
     if not len(rows):
         return summary(rows, COMPARED, prefix)
     found: dict[str, Any] = {}

@@ -163,7 +163,7 @@ class RobotEnv(DiagramEnv):
             InputError: If the start is not reached, or options are given for a real robot.
         """
         if options and self._randomize_parts is None:
-            raise InputError("a reset of a robot takes no options: its parts are where they are")
+            raise InputError("a reset of a robot takes no options: software cannot move its parts")
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
         self._return_to_start()
@@ -296,7 +296,7 @@ class RobotEnv(DiagramEnv):
         target = self._return_path[nearest]
         distance, angle = pose_distance(pose, target)
         self._log(
-            f"the arm was moved: slowly back to its path, {distance / MM:.0f} mm and {np.rad2deg(angle):.0f} degrees"
+            f"the arm was moved; it returns slowly to its path: {distance / MM:.0f} mm and {np.rad2deg(angle):.0f} degrees"
         )
         self._return_path.extend(slow_approach(pose, target, self.task.control_period)[::-1])
 
@@ -308,7 +308,7 @@ class RobotEnv(DiagramEnv):
         """Hold the arm until the transfer station has full authority."""
         self._switch_to_transfer()
         if self._arm_state == ArmState.WAITING:
-            self._clock.begin()  # nothing was sent yet, so the time since the last status is no gap
+            self._clock.begin()  # no command was sent yet: the time since the last status must not count as a gap
         pose, elapsed = self.pose, 0.0
         while self._arm_state != ArmState.RUNNING:
             self._command(pose)

@@ -77,11 +77,11 @@ def load_scenario(path: Path) -> Scenario:
     driver = scenario.model_drivers[scenario.robot]
     if driver.control_mode != "torque_only":
         raise InputError(
-            f"{path}: the impedance controller is not the driver's, which takes torques: control_mode: torque_only"
+            f"{path}: the impedance controller sends torques, so the driver must accept them: set control_mode: torque_only"
         )
     if driver.lcm_bus not in scenario.lcm_buses:
         raise InputError(
-            f"{path}: {scenario.robot}'s driver is on the bus {driver.lcm_bus!r}, which is none of its own"
+            f"{path}: {scenario.robot}'s driver is on the bus {driver.lcm_bus!r}, which lcm_buses does not define"
         )
     for config in (driver, scenario.lcm_buses[driver.lcm_bus]):
         for name in (one.name for one in getattr(config, "__fields__", ()) if one.name not in SUPPORTED):

@@ -77,7 +77,7 @@ def write_report(
         InputError: If there is nothing to report on, or `out` is not an HTML file.
     """
     if episodes < 0:
-        raise InputError(f"runs are evaluated on a number of episodes from 0, not {episodes}")
+        raise InputError(f"the number of episodes of an evaluation must be 0 or more, not {episodes}")
     check_page(out)
     gathered = gather(paths, episodes)
     write_atomically(out, render(gathered, describe_differences).encode())

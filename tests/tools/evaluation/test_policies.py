@@ -200,7 +200,7 @@ def test_environment_of_another_origin_is_evaluated():
     assert evaluate("constant", Pointer(), 2, baselines=["zero"])["baselines"] == ["zero"]
     with pytest.raises(InputError, match="no baseline policy 'scripted'"):
         evaluate("zero", Pointer(), 2, baselines=["scripted"])
-    with pytest.raises(InputError, match="has its options"):
+    with pytest.raises(InputError, match="given as an object"):
         evaluate("zero", Pointer(), 2, environment={"station": "arm"})
 
 

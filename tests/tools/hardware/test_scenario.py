@@ -54,7 +54,7 @@ def test_shipped_scenario_has_a_simulated_driver():
         ("station: both\n", "hardware or simulation"),
         ("{}\n", "exactly one robot"),
         ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "takes torques"),
-        (DRIVER, "none of its own"),
+        (DRIVER, "does not define"),
         ("directives: 3\n", "is no scenario"),
         ("{{", "is no scenario"),
         ("nonsense: 1\n", "nonsense"),
