@@ -22,7 +22,7 @@ class PolicySystem(LeafSystem):
     The observation is the one just before the instant k·period. The action is set by an unrestricted update, which
     Drake performs before the discrete updates of the same instant, so a `ZeroOrderHold` of the control period outputs
     the new action from that instant on. A `Simulator` of a task diagram with this system therefore gives bit for bit
-    the results of `DiagramEnv` with the same policy (see CONTRIBUTING.md, "Rates and the order of events").
+    the results of `DiagramEnv` with the same policy (see docs/concepts/rates.md).
 
     .. pydrake_system::
 

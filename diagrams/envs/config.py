@@ -62,7 +62,7 @@ class EnvConfig:
                 defaults, those of the difficulty, these.
 
         Raises:
-            InputError: If a task, an option or a word is unknown, a value is out of range, or two do not go together.
+            InputError: If a task, an option or a choice is unknown, a value is out of range, or two are incompatible.
         """
         if task not in TASKS.names() and is_task_folder(task):
             task = register_task_folder(task)
@@ -192,12 +192,12 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     }
     common = parts.pop("common")
     config = EnvConfig(name, **{option: getattr(common, option) for option in CommonOptions.model_fields}, parts=parts)
-    config.make_task()  # its constructor refuses options that do not go together
+    config.make_task()  # its constructor refuses incompatible options
     return config
 
 
 def _check_declared_options(task: type[Task], known: set[str]) -> None:
-    """Refuse a default or a difficulty that sets an option which the task has with no guidance on no station."""
+    """Refuse an option in the defaults or a difficulty that no guidance and no station of the task has."""
     for context, settings in {"defaults": task.defaults, **task.difficulties}.items():
         for option in set(settings) - known:
             anywhere = {

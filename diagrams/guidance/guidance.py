@@ -77,8 +77,8 @@ def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, ki
     missing_inputs = [name for name in INPUTS if not guidance.HasInputPort(name)]
     missing = missing_inputs + [name for name in OUTPUTS if not guidance.HasOutputPort(name)]
     if missing:
-        remedy = ", and an input that it doesn't use from a PassThrough of its size" if missing_inputs else ""
-        raise InputError(f"{name_of_guidance} exports no port {', '.join(missing)}: all guidance does{remedy}")
+        remedy = ", an unused input from a PassThrough of its size" if missing_inputs else ""
+        raise InputError(f"{name_of_guidance} lacks the port {', '.join(missing)}: export it{remedy}")
     sizes = {
         "pose": (guidance.GetInputPort("pose").size(), pose_size),
         "wrench": (guidance.GetInputPort("wrench").size(), wrench_size),

@@ -1,4 +1,4 @@
-"""Parts that overlap when assembled: where and how deep, and a plug that is smaller by that much."""
+"""Overlap of assembled parts, its position and depth, and a plug that is shrunk to avoid it."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ class SharedControlTemplate:
 
     @cached_property
     def _exits(self) -> tuple[tuple[tuple[int, float, int, float], ...], ...]:
-        """For each state (state of the distance, sign, next state, threshold), forward transitions first."""
+        """Exits of each state, forward ones first: state of the distance, sign, next state, threshold."""
         forward: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         back: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         for number, state in enumerate(self.states):

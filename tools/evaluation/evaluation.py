@@ -107,8 +107,9 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of a policy with that of baseline policies on the same episodes.
 
     The test is McNemar's, exact and one-sided. Only episodes count in which exactly one of the two policies succeeds: a
-    policy that is not better wins half of them on average. Of all baseline policies the largest p counts, so that "better than the
-    best baseline" means better than each of them (intersection-union test), without a correction for their number.
+    policy that is not better wins half of them on average. Of all baseline policies the largest p counts, so that "better
+    than the best baseline" means better than each of them (intersection-union test), without a correction for their
+    number.
 
     Args:
         rows: Episodes by the policy's name, with the same conditions in each; those of the policy are named `POLICY`.
@@ -130,7 +131,7 @@ def _mcnemar(won: Any, other: Any) -> float:
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
-    """Return the statistics `COMPARED` of episodes; None for one whose column is missing, as in environments made elsewhere."""
+    """Return the statistics `COMPARED` of episodes; None for one whose column the rows lack."""
     if not len(rows):
         return summary(rows, COMPARED, prefix)
     found: dict[str, Any] = {}

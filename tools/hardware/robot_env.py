@@ -296,7 +296,8 @@ class RobotEnv(DiagramEnv):
         target = self._return_path[nearest]
         distance, angle = pose_distance(pose, target)
         self._log(
-            f"the arm was moved; it returns slowly to its path: {distance / MM:.0f} mm and {np.rad2deg(angle):.0f} degrees"
+            f"the arm was moved; it returns slowly to its path: {distance / MM:.0f} mm and "
+            f"{np.rad2deg(angle):.0f} degrees"
         )
         self._return_path.extend(slow_approach(pose, target, self.task.control_period)[::-1])
 

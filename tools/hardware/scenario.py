@@ -77,7 +77,8 @@ def load_scenario(path: Path) -> Scenario:
     driver = scenario.model_drivers[scenario.robot]
     if driver.control_mode != "torque_only":
         raise InputError(
-            f"{path}: the impedance controller sends torques, so the driver must accept them: set control_mode: torque_only"
+            f"{path}: the impedance controller sends torques, so the driver must accept them: set "
+            "control_mode: torque_only"
         )
     if driver.lcm_bus not in scenario.lcm_buses:
         raise InputError(

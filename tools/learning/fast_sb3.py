@@ -21,7 +21,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from guiderail.tools.learning.batched_mlp import BatchedMLP, FlatAdam, Linear, flatten
 
 _SQUASH_EPSILON = 1e-6  # Stable-Baselines3 adds it to the derivative of tanh before taking the logarithm
-_MAX_GATHERED = 2**22  # numbers of states that are gathered at once: those of a whole training, unless they are images
+_MAX_GATHERED = 2**22  # most numbers in the batches of one gathering; observations without images need no second one
 
 # SAC and TQC have no common interface that a type checker could use.
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ else:
 
 
 class FastTrainingStep(_Algorithm):
-    """Mixin that replaces the training step of SAC or TQC; a base class before either of them.
+    """Mixin that replaces the training step; list it before SAC or TQC among the base classes.
 
     A subclass implements `_target_value`, `_critic_gradient`, `_value_gradient` and `_critic_loss`.
 

@@ -33,8 +33,8 @@ class PipelinedLearner(Learner):
     """Learner that acts in this process and trains in a second one, on each episode during the next.
 
     Episode k is acted with the weights learned from the episodes before k − 1, so training on an episode may take as
-    long as an episode. With `waits` that is always so, independent of durations, and the same seed gives the same run.
-    Without, an episode never waits: it starts with the newest weights there are.
+    long as an episode. With `waits`, an episode waits for these weights, so that the same seed gives the same run
+    whatever the durations. Without `waits`, an episode starts at once with the newest weights.
 
     Exploration and checkpoint selection stay in this process; the second one only trains.
 
@@ -110,7 +110,7 @@ class PipelinedLearner(Learner):
     def on_step(self, transition: Transition) -> None:
         """Keep a transition until the end of the episode, when it is known whether the episode is learned from.
 
-        After a failed simulation the transition before becomes the episode's last, as at a time limit.
+        If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
         """
         if "simulation_failure" in transition.info:
             if self._transitions:

@@ -251,7 +251,7 @@ class Unknown:
 
 
 def test_station_raises_when_surfaces_are_missing():
-    with pytest.raises(InputError, match="Unknown doesn't say which"):
+    with pytest.raises(InputError, match="which Unknown does not provide"):
         MujocoStation(Unknown())
 
 

@@ -234,7 +234,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | None:
-    """Return the column of a name, or the only one that ends in it and is not a velocity or force; None without one.
+    """Return the column `wanted`, or the only position whose name ends in it; None if there is none.
 
     Raises:
         InputError: If there are several.

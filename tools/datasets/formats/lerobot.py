@@ -108,7 +108,9 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         )
     fps = round(1.0 / period, 6)
     if fps == 0.0:
-        raise InputError(f"a LeRobot dataset has frames per second, and these are {period:g} s apart: give --rate")
+        raise InputError(
+            f"a LeRobot dataset states frames per second, and a period of {period:g} s is too long: give --rate"
+        )
     fps = int(fps) if float(fps).is_integer() else fps
     size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
     outputs = np.concatenate(demonstrations.outputs)
