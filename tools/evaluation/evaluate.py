@@ -251,8 +251,8 @@ def evaluate(
     if config is None:
         if environment or resample_offsets or save is not None:
             raise InputError(
-                "an environment that is given as an object takes no options, resample_offsets or save: give the name of "
-                "a task"
+                "an environment that is given as an object takes no options, resample_offsets or save: give the name "
+                "of a task"
             )
         where, scope = {}, "seeds of the environment as it was given"
     else:

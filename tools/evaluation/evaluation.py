@@ -107,9 +107,9 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of a policy with that of baseline policies on the same episodes.
 
     The test is McNemar's, exact and one-sided. Only episodes count in which exactly one of the two policies succeeds: a
-    policy that is not better wins half of them on average. Of all baseline policies the largest p counts, so that "better
-    than the best baseline" means better than each of them (intersection-union test), without a correction for their
-    number.
+    policy that is not better wins half of them on average. Of all baseline policies the largest p counts, so that
+    "better than the best baseline" means better than each of them (intersection-union test), without a correction for
+    their number.
 
     Args:
         rows: Episodes by the policy's name, with the same conditions in each; those of the policy are named `POLICY`.

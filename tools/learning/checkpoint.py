@@ -36,8 +36,8 @@ class CheckpointSelection:
     """Selection of the latest actor in the middle of the longest streak of successful greedy episodes.
 
     Learning at the edge of contact oscillates: a policy that succeeds for twenty episodes can fail for two and recover,
-    so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. Successes of the next few episodes
-    are no proof either, because the actors that achieved them were its successors.
+    so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. Successes of the
+    next few episodes are no proof either, because the actors that achieved them were its successors.
     """
 
     def __init__(self, window: int):

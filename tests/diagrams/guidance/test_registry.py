@@ -45,5 +45,5 @@ def test_guidance_that_lacks_a_port_is_named_by_its_kind(monkeypatch):
         builder.BuildInto(guidance)
         return guidance
 
-    with pytest.raises(InputError, match=r"guidance 'deaf_of_mine' exports no port pose, wrench, .*from a PassThrough"):
+    with pytest.raises(InputError, match=r"guidance 'deaf_of_mine' lacks the port pose, wrench, .*from a PassThrough"):
         make_env("NarrowPassage", guidance="deaf_of_mine")

@@ -109,7 +109,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     fps = round(1.0 / period, 6)
     if fps == 0.0:
         raise InputError(
-            f"a LeRobot dataset states frames per second, and a period of {period:g} s is too long: give --rate"
+            f"a LeRobot dataset states frames per second, and {period:g} s between frames is too long: give --rate"
         )
     fps = int(fps) if float(fps).is_integer() else fps
     size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
