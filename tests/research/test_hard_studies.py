@@ -16,6 +16,8 @@ HARD = (
     "narrow_passage_hard",
     "narrow_passage_hard_baselines",
     "connector_robot_sensing",
+    "connector_robot_sensing_transfer",
+    "grid_clamp_robot_sensing",
 )
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
 # Study whose policies a sweep evaluates.

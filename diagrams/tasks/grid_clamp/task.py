@@ -79,9 +79,12 @@ class GridClampOptions(ForceOptions):
         return GridClampWorkcell(dimensions, friction=self.friction)
 
 
-HARD: dict[str, Any] = {"force_limit": 10.0}
-"""Options of difficulty="hard": a lower force limit. A clamp that is pushed down outside of its holes exceeds it before
-it slides into them by itself; snapping in alone takes six of the ten newtons."""
+HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
+"""Options of difficulty="hard": a low force limit, of which snapping in takes six newtons, and little time.
+
+The force is bounded below the limit, so that an untrained policy does not end by force but may search for as long as an
+episode takes: random actions find the holes in 10 of 14 episodes of 10 s and in 4 of 14 of 6 s, a scripted search in all.
+"""
 
 
 SUCCESS_REWARD = 50.0
@@ -200,6 +203,7 @@ NEAR = 1.5 * MM  # height above the table below which it descends slowly and sea
 IN_HOLE = 0.5 * MM  # depth below the table at which a peg is in its hole
 LANES = np.array([-1.1, 0.0, 1.1]) * MM  # places along y; no peg can pass between two of them without dropping
 LANE_ENDS = 3.7 * MM  # along x, beyond the largest offset
+PAST_LANES = 0.3 * MM  # overshoot along y from lane to lane; a clamp beyond the last lane starts again
 PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
 SNAP_FORCE = 12.0  # largest force while it snaps in [N]
 GENTLE_SNAP_FORCE = 8.5  # the same for a force limit of 10 N
@@ -223,6 +227,8 @@ def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> 
         velocity = np.array([*(LANE_GAIN * (np.array([-LANE_ENDS, LANES[0]]) - position[:2])), -SPEED])
         if position[2] < ON_TABLE + 3 * NEAR and np.hypot(position[0] + LANE_ENDS, position[1] - LANES[0]) > 0.5 * MM:
             velocity[2] = 0.0  # no descent before it is at the start
+    elif position[2] > ON_TABLE - IN_HOLE and command[1] > LANES[-1] + 0.5 * PAST_LANES:
+        velocity = np.array([0.0, 0.0, SPEED])  # lift, and begin at the first lane again
     elif position[2] > ON_TABLE - IN_HOLE:
         velocity = np.array([*_lane_velocity(command[:2]), HEIGHT_GAIN * (force[2] - PRESS)])
     else:
@@ -237,7 +243,8 @@ def _lane_velocity(xy: np.ndarray) -> np.ndarray:
     forward = 1.0 if lane % 2 == 0 else -1.0
     if forward * xy[0] < LANE_ENDS - 0.1 * MM:
         return np.array([forward * SEARCH_SPEED, LANE_GAIN * (LANES[lane] - xy[1])])
-    return np.array([0.0, SEARCH_SPEED])
+    # Slower towards the next lane: with a delayed force it would otherwise pass the lane.
+    return np.array([0.0, LANE_GAIN * (LANES[min(lane + 1, len(LANES) - 1)] + PAST_LANES - xy[1])])
 
 
 def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:

@@ -101,6 +101,12 @@ def test_search_alternates_the_direction_of_lanes():
     assert scripted_search(seen_clamp(LANE_ENDS / MM, LANES[0] / MM))[1] > 0.0
 
 
+def test_search_that_missed_all_lanes_lifts_and_starts_again():
+    lifts = scripted_search(seen_clamp(LANE_ENDS / MM, LANES[-1] / MM + 0.4))
+    np.testing.assert_allclose(lifts, [0.0, 0.0, 1.0])
+    assert scripted_search(seen_clamp(LANE_ENDS / MM - 0.5, LANES[-1] / MM))[0] > 0.0
+
+
 def test_search_presses_lightly_and_yields_in_a_hole():
     assert scripted_search(seen_clamp(fz=8.0))[2] > 0.0 > scripted_search(seen_clamp(fz=1.0))[2]
     np.testing.assert_array_less(0.0, scripted_search(seen_clamp(z_mm=8.0, fx=2.0, fy=1.0))[:2])
