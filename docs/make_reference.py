@@ -303,9 +303,9 @@ def command() -> str:
     import typer
 
     from guiderail.tools.cli.app import expand_choices
-    from guiderail.tools.cli.main import app
+    from guiderail.tools.cli.main import load_commands
 
-    group: Any = typer.main.get_command(app)
+    group: Any = typer.main.get_command(load_commands())
     commands: dict[str, Any] = {}
     for name, one in group.commands.items():
         commands |= {f"{name} {part}": sub for part, sub in one.commands.items()} if hasattr(one, "commands") else {}

@@ -70,11 +70,11 @@ def test_reference_has_every_command_task_and_template_kind(reference):
 
     from guiderail.diagrams.tasks.registry import TASKS
     from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
-    from guiderail.tools.cli.main import app
+    from guiderail.tools.cli.main import load_commands
     from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
     commands = {}
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in typer.main.get_command(load_commands()).commands.items():
         parts = getattr(command, "commands", None)
         commands |= {name: command} if parts is None else {f"{name} {part}": one for part, one in parts.items()}
     for name, command in commands.items():

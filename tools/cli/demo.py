@@ -14,7 +14,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import Paths, rollout
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Paths, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume
@@ -22,7 +22,6 @@ from guiderail.tools.visualization.curves import draw_passage
 from guiderail.tools.visualization.style import color, new_figure, save_figure
 
 HELD_OUT = 10  # number of held-out episodes
-SEED = 1_000_000  # seed of the first of them
 PRESET = "tqc_cheap_correlated"
 MARK = ".demo"  # file that marks the folder of a demo: no other folder is removed
 
@@ -102,7 +101,9 @@ def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     env = make_environment(config.task, config.environment)
     env.reset(seed=config.seed)
     tables = [
-        pd.DataFrame([rollout(env, act, Paths(env), index=i, seed=SEED + i, held_out=True) for i in range(HELD_OUT)])
+        pd.DataFrame(
+            [rollout(env, act, Paths(env), index=i, seed=HELD_OUT_SEED + i, held_out=True) for i in range(HELD_OUT)]
+        )
         for act in (zero_policy(env), Policy.load(out))
     ]
     env.close()

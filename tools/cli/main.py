@@ -16,8 +16,23 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app
 from guiderail.tools.cli.output import print_message
 
-for _module in ("train", "evaluate", "visualize", "study", "hardware", "dataset", "listing"):
-    import_module(f"guiderail.tools.cli.{_module}")  # registers its commands
+COMMANDS = {
+    "train": ("train", "demo"),
+    "evaluate": ("evaluate", "robustness", "certify"),
+    "visualize": ("visualize", "report"),
+    "study": ("study",),
+    "hardware": ("deploy", "teleoperate", "sim-driver", "safety-monitor"),
+    "dataset": ("dataset", "template", "create-task"),
+    "listing": ("list",),
+}
+"""Names of the commands that each module of this package registers."""
+
+
+def load_commands(name: str = "") -> typer.Typer:
+    """Return the application after importing the module of a command, or all modules if no command has that name."""
+    for module in [module for module, names in COMMANDS.items() if name in names] or COMMANDS:
+        import_module(f"guiderail.tools.cli.{module}")
+    return app
 
 
 def _print_version(requested: bool) -> None:
@@ -48,7 +63,7 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     _show_messages()
     try:
-        code = app(args=arguments, prog_name="guiderail", standalone_mode=False)
+        code = load_commands(*arguments[:1])(args=arguments, prog_name="guiderail", standalone_mode=False)
     except InputError as error:
         print_message(str(error))
         code = 2

@@ -7,7 +7,7 @@ import typer
 
 import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.tools.cli.main import app, main
+from guiderail.tools.cli.main import COMMANDS, load_commands, main
 from guiderail.tools.cli.output import to_json
 from guiderail.tools.environments import as_value
 from guiderail.tools.learning.run_folder import RunFolder
@@ -197,7 +197,7 @@ def test_evaluate_refuses_a_damaged_policy(capsys, trained):
 
 def commands():
     """Return the words of every command, those of groups included."""
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in typer.main.get_command(load_commands()).commands.items():
         yield from ((name, part) for part in command.commands) if hasattr(command, "commands") else [(name,)]
 
 
@@ -215,7 +215,15 @@ def test_help_has_a_valid_example_and_starts_nothing(command, capsys, tmp_path, 
 
 
 def test_number_of_commands_stays_small():
-    assert len(typer.main.get_command(app).commands) == 16
+    assert len(typer.main.get_command(load_commands()).commands) == 16
+
+
+def test_every_command_is_listed_with_its_module():
+    listed = {name: module for module, names in COMMANDS.items() for name in names}
+    for name, command in typer.main.get_command(load_commands()).commands.items():
+        callbacks = [part.callback for part in getattr(command, "commands", {"": command}).values()]
+        assert {callback.__module__ for callback in callbacks} == {f"guiderail.tools.cli.{listed.pop(name)}"}
+    assert not listed
 
 
 def test_help_lists_the_choices(capsys):

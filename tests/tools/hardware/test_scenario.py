@@ -53,7 +53,7 @@ def test_shipped_scenario_has_a_simulated_driver():
     [
         ("station: both\n", "hardware or simulation"),
         ("{}\n", "exactly one robot"),
-        ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "takes torques"),
+        ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "must accept them"),
         (DRIVER, "does not define"),
         ("directives: 3\n", "is no scenario"),
         ("{{", "is no scenario"),
