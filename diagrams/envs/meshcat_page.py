@@ -26,7 +26,7 @@ END_TIMEOUT = 5.0  # of the gateway [s]
 
 
 class MeshcatPage(Meshcat):
-    """Meshcat whose page is served to those who know its address; everything else is as in its base class.
+    """Meshcat with its page at a secret address; everything else is as in the base class.
 
     The page and its websocket are at a path with a random token. A connection is refused without the token, or with an
     origin other than this page's. Messages of browsers are parsed here: Meshcat receives only inputs of controls that
