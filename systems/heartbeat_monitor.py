@@ -62,7 +62,7 @@ class HeartbeatMonitor(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    get_heartbeats_input_port = input_getter("heartbeats", "newest `Heartbeat` of each sender; other objects are none")
+    get_heartbeats_input_port = input_getter("heartbeats", "newest `Heartbeat` of each sender; other types are ignored")
     get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
     get_fault_output_port = output_getter("fault", "combined fault, (1,), a code of `Fault`")
 

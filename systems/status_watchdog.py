@@ -67,7 +67,7 @@ class StatusWatchdog(LeafSystem):
         self._plant, self._dynamics, self._num_joints = plant, JointDynamics(plant), plant.num_positions()
         n = self._num_joints
         if len(limits.velocity) != n:
-            raise InputError(f"an arm of {n} joints has not {len(limits.velocity)} velocity limits")
+            raise InputError(f"an arm of {n} joints needs as many velocity limits, not {len(limits.velocity)}")
         self._status_port = self.DeclareAbstractInputPort("status", Value[object]())
         self._torque_port = self.DeclareVectorInputPort("torque", n)
         self._clock_port = self.DeclareVectorInputPort("clock", 1)

@@ -94,7 +94,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     key = _key(declared, exported)
     built = _IDLE[key].pop() if _IDLE[key] else _build(declared, exported)
     # The sources that a reset sets are part of the diagram, so the new task adopts those of the task that built it.
-    # What is hidden for a run belongs to the new task alone.
+    # The hidden values of a run belong to the new task alone.
     assert built.diagram.declaration is not None
     declared.episode_constants = built.diagram.declaration.episode_constants
     randomize = make_randomize(declared, built.station, built.guidance)

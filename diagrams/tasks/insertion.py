@@ -85,7 +85,7 @@ EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
 class InsertionReset(ResetOptions):
     """Options of a reset of an insertion task."""
 
-    new_run: bool = Field(False, description="sample again what is hidden for a run")
+    new_run: bool = Field(False, description="sample the hidden values of a run again")
     offset: Numbers | None = Field(
         None,
         min_length=2,
@@ -108,7 +108,7 @@ class InsertionTask(Task):
         workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
         fixture: Name of the fixture's body.
         simulated_rewards: Rewards that need more of that signal than a robot can measure.
-        offsets: Sampler of the offsets; it holds what is hidden for a run.
+        offsets: Sampler of the offsets; it stores the hidden values of a run.
     """
 
     Reset: ClassVar[type[ResetOptions]] = InsertionReset
@@ -122,7 +122,7 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
-        On hardware it is what `observable_success` computes from the robot's own pose, if the task defines that. A
+        On hardware `observable_success` computes it from the robot's own pose, if the task defines it. A
         sampled force limit is a signal as well, `force_limit`, and the station's bound.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)

@@ -178,7 +178,7 @@ class Task(ABC):
         """Return the terms of the observation `config.observation`, or the camera of an image."""
 
     def privileged_terms(self) -> Sequence[ObservationTerm]:
-        """Return the terms that only a privileged critic observes, such as what is hidden; none by default.
+        """Return the terms that only a privileged critic observes, such as hidden values; none by default.
 
         Training uses them in simulation. The policy never does. Besides the signals of other terms there is
         `exact_wrench`, the wrench without errors of sensors.

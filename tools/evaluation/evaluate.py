@@ -159,7 +159,7 @@ def evaluate_once(
     Args:
         folder: Folder of the files.
         name: Name of the policy, in the file and as the default label of the progress.
-        config: Configuration of the run, for its task and what is hidden in it.
+        config: Configuration of the run, for its task and its hidden values.
         make_policy: Makes the policy for the environment.
         environment: Options of the environment.
         about: Anything else that the rows depend on.
@@ -222,7 +222,7 @@ def evaluate(
         processes: Largest number of processes; None for the number of cores. The results do not depend on it, see
             `evaluate_policies` for policies with a memory.
         trust_policy: Read a policy's file that can execute code: a zip of Stable-Baselines3 or TorchScript.
-        resample_offsets: Whether what is hidden and constant in a run is sampled again in every episode.
+        resample_offsets: True if values that are hidden and constant in a run are sampled again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved: "commanded", which a primitive should learn under impedance control because the
             contact force is in their difference from the measured ones, or "measured".
@@ -272,7 +272,7 @@ def evaluate(
     evaluation_env = make_environment(config.task, where) if config is not None else cast(gymnasium.Env, env)
     try:
         if config is not None:
-            evaluation_env.reset(seed=config.seed)  # samples what is hidden and constant in the run
+            evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         stored = _stored_baselines(subject, others, where, how)
         skipped = [
             name for name, make in others.items() if name not in stored and not is_compatible(make, evaluation_env)

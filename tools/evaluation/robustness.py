@@ -42,7 +42,7 @@ class Axis:
         values: Values, among them the default one if it is a number.
         default: Value of an environment with default options.
         change: Function from an environment's options and a value to the options that change.
-        resamples: Whether what is hidden in a run is sampled again in every episode, because it is what changes.
+        resamples: True if the hidden values of a run are sampled again in every episode, because the axis changes them.
     """
 
     name: str
@@ -130,7 +130,7 @@ class Point:
         axis: Axis.
         value: Value on it.
         environment: Options of the environment there.
-        trained: Value that the policy was trained with; None if it is none of the axis, such as a whole range.
+        trained: Value that the policy was trained with; None if it is not on the axis, as for a range.
         options: Options of every reset.
     """
 

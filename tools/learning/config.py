@@ -74,7 +74,7 @@ class OffPolicyConfig(LearnerConfig):
     ez_greedy_longest: Positive = 8  # maximum number of actions that an extended action lasts
     ez_greedy_until: NonNegative = 0  # consecutive greedy successes that end extended actions; 0 for never
     greedy_episode_fraction: Fraction = 0.0  # fraction of the episodes, evenly spread, that do not explore
-    privileged_critic: bool = False  # critics also observe what is hidden and the exact wrench; the policy never does
+    privileged_critic: bool = False  # critics also observe hidden values and the exact wrench; the policy never does
     layer_norm: bool = False  # normalize hidden layers before their activation
     selection_window: NonNegative = 0  # greedy successes before and after an actor that select it; 0 for the last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average

@@ -41,7 +41,7 @@ def run_training(
 
     A run that was killed and resumed gives bit for bit the result of an undisturbed one: a checkpoint is taken at the
     end of an episode and holds every number and every random generator that the rest depends on. The step log is
-    written before it; what is beyond the checkpoint is written again.
+    written before it; rows after the checkpoint are written again.
 
     Args:
         folder: Folder of the run; with `resume`, that of the run to continue.
@@ -86,7 +86,7 @@ def run_training(
         raise InputError(
             f"the replay buffer does not fit into memory ({error}): give a smaller --set buffer_size=..."
         ) from error
-    env.reset(seed=config.seed)  # samples what is hidden and constant in the run
+    env.reset(seed=config.seed)  # samples the hidden values of the run
     if not resume:
         folder.refuse_existing()
     is_new_folder = not folder.path.exists()

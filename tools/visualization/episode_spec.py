@@ -25,7 +25,7 @@ class EpisodeSpec:
         policy: Makes the policy for an environment.
         acting: Label of the policy.
         title: Text next to task and guidance in a heading.
-        run_seed: Seed of the run, which decides what is hidden and constant in it.
+        run_seed: Seed of the run, from which its hidden values are sampled.
         seed: Seed of the episode.
         run: Folder of the run, or None.
     """

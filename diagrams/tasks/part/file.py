@@ -284,7 +284,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
     file = validate_options(PartTaskFile, data, str(path))
     for name in file.files:
         if not _FILE_NAME.fullmatch(name) or ".." in name.split("/"):
-            raise InputError(f"{path} names {brief(name)}, which is no plain path inside {folder}: rename the file")
+            raise InputError(f"{path} names {brief(name)}, which is not a plain path inside {folder}: rename the file")
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or create the task again")
     return file

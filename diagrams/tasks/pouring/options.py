@@ -21,7 +21,7 @@ SPARSE_INPUT_SPEED = 1.7  # a sparse reward is only found if random inputs somet
 
 
 def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
-    """The pouring template for this scene's vessels; `input_speed` times as fast as it is meant."""
+    """Pouring template for this scene's vessels, with all speeds multiplied by `input_speed`."""
     return _load("pouring", config, input_speed)
 
 

@@ -1,4 +1,4 @@
-"""Privileged critic: critics observe what is hidden, the actor and the saved policy do not."""
+"""Privileged critic: critics observe hidden values, the actor and the saved policy do not."""
 
 import gymnasium
 import numpy as np
@@ -184,7 +184,7 @@ def test_rollout_passes_what_is_hidden_to_callbacks_only():
 
 
 def test_pipelined_learner_restores_a_pending_episode():
-    """The pending episode of a checkpoint holds what is hidden, too."""
+    """The pending episode of a checkpoint contains the hidden values, too."""
 
     def pipelined():
         config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"train_freq": 1, "gradient_steps": 1})
