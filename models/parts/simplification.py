@@ -1,6 +1,6 @@
-"""Fewer triangles: decimation with measured deviation, and removal of what cannot touch the other part.
+"""Fewer triangles: decimation with measured deviation, and removal of regions that cannot touch the other part.
 
-Solids are those of `manifold3d`, in millimeters, and so are the lengths here.
+Solids are those of `manifold3d`; all lengths are in millimeters.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _SLIVER = 1e-4  # volume below which a cropped piece is a rounding error [mm³]
 def simplify(solid: Any, tolerance: float, start: float = 1.0) -> tuple[Any, float]:
     """Return a solid with fewer triangles, and its measured deviation [mm].
 
-    The bound of `manifold3d` is not one for thin parts, so that the deviation is measured, and a smaller bound is tried
-    where it is exceeded.
+    `manifold3d` may exceed its bound for thin parts. The deviation is therefore measured, and a smaller bound is tried
+    if it is too large.
 
     Args:
         solid: Solid.
@@ -55,10 +55,10 @@ def as_hull_if_near(solid: Any, tolerance: float) -> tuple[Any, float]:
 
 
 def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plug: bool) -> Any:
-    """Return what of a part can come within `margin` of the other while the plug moves down along z.
+    """Return the region of a part that can come within `margin` of the other while the plug moves down along z.
 
-    A slab of the plug above z0 only meets what of the socket is above z0, and a slab of the socket below z1 only what
-    of the plug is below z1. Each slab keeps the other part's shadow, widened by the margin.
+    A slab of the plug above z0 meets only the region of the socket above z0. A slab of the socket below z1 meets only
+    the region of the plug below z1. Each slab keeps the projection of that region along z, widened by the margin.
 
     Args:
         part: Solid to crop.

@@ -16,7 +16,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 
 
 def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.ndarray:
-    """Compute the RMS over the motion of each output's displacement (O,) by a constant raw action of one in it.
+    """Compute the displacement of each output by a constant raw action of one in it, RMS over the motion, (O,).
 
     Args:
         primitive: Primitive in its loop.

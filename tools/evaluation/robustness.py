@@ -246,7 +246,7 @@ class _Actor:
         name: Name in the table.
         make_policy: Makes the policy for an environment.
         config: Configuration of the run.
-        environment: Options of the environment, with those that differ throughout.
+        environment: Options of the environment at every point, those that the call changes included.
         about: Digest of a learned policy.
     """
 

@@ -34,7 +34,7 @@ from guiderail.tools.datasets.paths import check_new
 from guiderail.tools.teleop.teleoperator import MeshcatPanel, Slider, page_address, set_camera
 
 PATH = "/guiderail/force"
-# Of the gauge, relative to the distance of the camera from its target: to the sides, down, length, thickness.
+# Position (sideways, down), length and thickness of the gauge, relative to the distance of camera and target.
 SIDE_OFFSET, DOWN_OFFSET, LENGTH, THICKNESS = 0.3, 0.05, 0.3, 0.012
 WARNING_SHARE = 0.7  # share of the limit above which the gauge is red
 BLUE, RED, GRAY = (0.1, 0.5, 0.9, 1.0), (0.9, 0.15, 0.1, 1.0), (0.35, 0.35, 0.35, 0.25)
@@ -145,7 +145,7 @@ class _Snapshot:
 
 @dataclass
 class _Recording:
-    """Demonstration that is being recorded, with its rests shortened, in which the operator looks and thinks.
+    """Demonstration that is being recorded; rests, in which the operator looks and thinks, are shortened.
 
     Attributes:
         commands: Commanded poses of the recorded control steps.

@@ -107,9 +107,9 @@ class SimulatedIiwa(Diagram):
 class LockstepClock:
     """Advance a hardware station in lockstep with a simulated driver: one step per new status.
 
-    Before each step the newest used status is acknowledged. `serve_in_lockstep` waits for this acknowledgement and for
-    no other: a second one of the same status, which was sent again in the meantime, has no effect. The robot therefore
-    stands still while this program computes, and the result of a run does not depend on either side's speed.
+    Before each step the newest used status is acknowledged. `serve_in_lockstep` waits for this acknowledgement; if a
+    status was sent twice, the second acknowledgement has no effect. The robot therefore stands still while this program
+    computes, and the result of a run does not depend on either side's speed.
     """
 
     def __init__(self, driver: LcmDriver, command_timeout: float, period: float | None = None):
@@ -168,8 +168,8 @@ def serve_in_lockstep(
 ) -> float:
     """Simulate an arm for another process, and wait after each step until its status is acknowledged.
 
-    Neither side outruns the other, however slow the machine is. An acknowledgement is a `LockstepClock`'s of this very
-    status; before the first one, a command counts too. The arm has a bus of its own, so that no message arrives within
+    Neither side outruns the other, however slow the machine is. A `LockstepClock` acknowledges each status; before its
+    first acknowledgement, a command counts as one. The arm has a bus of its own, so that no message arrives within
     a step: commands sent until then count for the next step, independently of timing.
 
     Args:

@@ -1,13 +1,13 @@
 """Five demonstrations of searching for a jack at an uncertain position, inserting and locking the plug.
 
-The demonstrator circles around the expected position of the jack with a light push, each of the five times a fifth of a
-turn further, and then inserts the plug. At every time of the search the five lie evenly on a circle: their mean is its
+The demonstrator circles around the expected position of the jack with a light push, and then inserts the plug. The five
+circles begin a fifth of a turn apart. At every time of the search the five lie evenly on a circle: their mean is its
 center, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
 the same effect in every direction of the whole search.
 
-There are two sets. The push of "search" is light. That of "firm_search", recorded on an arm, is four times as large:
-the torque of the rim, by which a policy feels on which side of it the plug stands, is then as large as the errors of an
-arm's joint torques, and not a quarter of them.
+There are two sets. The push of "search" is light. That of "firm_search", recorded on an arm, is four times as large.
+The torque of the rim shows on which side of it the plug stands: with the firm push it is as large as the errors of an
+arm's joint torques, with the light push a quarter of them.
 
 `python -m research.generate connector-search-demonstrations` and `connector-firm-search-demonstrations` record them
 again.

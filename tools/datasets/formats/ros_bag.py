@@ -140,7 +140,7 @@ def _read_bag(
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
     """Return positions (N, J) in the order of the first message's names; the order may differ in every message.
 
-    Messages of other joints are refused and not left out, because the first message decides by chance.
+    Messages of other joints are refused instead of skipped, because the topic's first message is arbitrary.
     """
     expected = list(messages[0].name)
     rows = []
