@@ -3,8 +3,8 @@
 Written from Universal Robots' "Real-Time Data Exchange Guide" and "Dashboard Server" manual, and from the commands of
 the client's program for the controller. Of that program it emulates force mode, tool center, payload, zeroing of the
 force sensor and watchdog. In force mode the tool moves with a speed in proportion to the missing force; a horizontal
-plane is in its way. It shows that messages arrive and have the meaning and signs that the documentation describes, not how a
-robot moves.
+plane is in its way. It shows that messages arrive and have the meaning and signs that the documentation describes, not
+how a robot moves.
 """
 
 from __future__ import annotations

@@ -83,7 +83,8 @@ HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
 """Options of difficulty="hard": a low force limit, of which snapping in takes six newtons, and little time.
 
 The force is bounded below the limit, so that an untrained policy does not end by force but may search for as long as an
-episode takes: random actions find the holes in 10 of 14 episodes of 10 s and in 4 of 14 of 6 s, a scripted search in all.
+episode takes: random actions find the holes in 10 of 14 episodes of 10 s and in 4 of 14 of 6 s, a scripted search in
+all.
 """
 
 
