@@ -51,7 +51,7 @@ class EnergyTank(LeafSystem):
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
-        damping: Damping (6,) of each coordinate that dissipates at least [N s/m, Nm s/rad], not negative.
+        damping: Smallest damping (6,) of each coordinate [N s/m, Nm s/rad], not negative.
         bound: Bound of the wrench.
         capacity: Initial and largest content [J], positive.
         period: Sampling period [s], positive.

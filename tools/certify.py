@@ -73,7 +73,7 @@ def certify_skill(
     signing_key = _read_key(key)
     if out is None:
         if not Path(subject).is_dir():
-            raise InputError("say where the certificate of a task goes with --out")
+            raise InputError("name the folder of a task's certificate with --out")
         out = Path(subject) / "certificate"
     loop, primitive = skill.loop, skill.loop.primitive
     budget = None
@@ -115,7 +115,7 @@ def verify_certificate(
     start_within: float | None = None,
     key: Path | None = None,
 ) -> dict[str, Any]:
-    """Check a certificate and compare all that it takes as given with a skill.
+    """Check a certificate, and compare its assumptions with a skill.
 
     The checker proves that the bounds follow from the primitive, the constraints, the impedance and the budget in the
     files. Here these are computed again from the skill, and the search for the budget is repeated.
@@ -179,7 +179,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
     guidance = str(options["guidance"])
     if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
         raise InputError(
-            f"guidance={guidance!r} follows no law that is certified: it takes {' or '.join(GUIDANCE)}, with a "
+            f"guidance={guidance!r} cannot be certified: use {' or '.join(GUIDANCE)}, with a "
             "history of commands and of one length (neither adaptive_history nor history_source=measured)"
         )
     loop = _make_loop(task, options, start_within)
@@ -193,7 +193,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
 
 
 def _search_budget(loop: CertifiedLoop) -> AttackResult:
-    """Return what the corrections of a loop with a history need, as far as a search of `SEARCH_STEPS` steps finds."""
+    """Return the budget that corrections of a loop with a history need, by a search of `SEARCH_STEPS` steps."""
     every_step = np.ones(loop.primitive.num_steps, bool)
     return Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
 

@@ -189,7 +189,7 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
     long (a movement primitive with a history: 78 s instead of 1 s), and sums would depend on their number.
 
     Raises:
-        InputError: If the task or an argument is unknown, or options do not go together.
+        InputError: If the task or an argument is unknown, or options are incompatible.
     """
     threadpool_limits(1)
     arguments = check_environment(task, arguments)

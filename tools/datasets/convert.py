@@ -64,13 +64,15 @@ def import_recording(
         raise InputError(f"{source} is not a LeRobot dataset, a bag, an .mcap or .csv file, or a folder of them")
     given = [name for name, value in csv_options.items() if value is not None]
     if given and kind != "CSV files":
-        raise InputError(f"{kind} state what --{given[0].replace('_', '-')} would: leave it out")
+        raise InputError(f"{kind} state this themselves: leave --{given[0].replace('_', '-')} out")
     demonstrations = Demonstrations(recorded.times, recorded.outputs, recorded.names)
     if rate is not None:
         demonstrations = _at_rate(demonstrations, rate)
     numbers = sum(len(t) + y.size for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True))
     if numbers > MAX_NUMBERS:
-        raise InputError(f"{source} holds {numbers} numbers, and a file {MAX_NUMBERS}: give --rate to resample them")
+        raise InputError(
+            f"{source} holds {numbers} numbers, and a file at most {MAX_NUMBERS}: give --rate to resample them"
+        )
     demonstrations.save(out)
     return (
         {"out": str(out), "from": kind}

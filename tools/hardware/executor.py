@@ -82,7 +82,7 @@ class SkillExecutor:
     def __init__(self, task: InsertionTask, skill: SkillDiagram, clock: Clock, is_stop_requested: Callable[[], bool]):
         """Connect to the robot.
 
-        The skill has a `HardwareStation`, and the clock is its. `is_stop_requested` is called in every control step.
+        The skill has a `HardwareStation`, which advances by `clock`. `is_stop_requested` is called in every control step.
 
         Raises:
             InputError: If no robot answers.
@@ -274,7 +274,7 @@ def deploy(
     """Execute the policy of a run on a robot.
 
     The recording is written to `out`, by default `hardware` in the run folder. With `assume_yes` the pre-flight checks
-    are not to be confirmed.
+    need no confirmation.
 
     Returns:
         The exit code: 0 if the skill was executed to its end, 1 if it was stopped.

@@ -47,7 +47,7 @@ def robot_session(
     """Wait for the robot, and have the pre-flight checks confirmed.
 
     In front of a simulated driver a reset samples the offsets of the parts as in simulation. With `assume_yes` the
-    checks are not to be confirmed, and with a simulated driver neither is a resumption after a stop.
+    checks need no confirmation; in front of a simulated driver, resuming after a stop needs none either.
 
     Raises:
         InputError: If the task cannot be done on hardware, or a check fails or is not confirmed.

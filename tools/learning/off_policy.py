@@ -307,7 +307,7 @@ class OffPolicyLearner(Learner):
         """Return a uniform action that lasts for several transitions; None while there is none.
 
         The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves states in
-        which a policy has settled, such as above all contact, and tells the value of moving on in one direction.
+        which a policy has settled, such as free space, and shows the value of continuing in one direction.
         """
         if self._extended_steps == 0:
             is_over = 0 < self.config.ez_greedy_until <= self._greedy_successes
