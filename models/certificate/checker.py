@@ -1,10 +1,10 @@
 """Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0: yes, 1: no, 2: no such files.
 
-It bounds all sequences of actions, W h being what the history h implies of the window and C the kernel given h:
+It bounds all sequences of actions. W h is the window's mean given the history h, and C the kernel given h:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
-must leave room for it (docs/concepts/robustness.md has the argument). The files hold nothing that is not checked, or
+must leave room for it (docs/concepts/robustness.md has the argument). All content of the files is checked, or
 compared with the skill by `guiderail certify SKILL --verify FOLDER`: what the certificate is about, the primitive, the
 impedance and the budget. The digest detects accidents only, as anyone can compute it; a signature needs the key.
 """

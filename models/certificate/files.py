@@ -121,9 +121,9 @@ def compare_subject(
     limits: np.ndarray | None,
     about: Mapping[str, Any],
 ) -> str | None:
-    """Return the name of the first thing in which a certificate differs from the skill it should be about, or None.
+    """Return the name of the first difference between a certificate and a skill, or None.
 
-    Compared is all that a checker takes as given, except for the budget: the description of the skill, its kernel,
+    All assumptions of the checker are compared, except for the budget: the description of the skill, its kernel,
     period, impedance, primitive, gains, start and constraints.
 
     Args:

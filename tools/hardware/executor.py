@@ -82,7 +82,7 @@ class SkillExecutor:
     def __init__(self, task: InsertionTask, skill: SkillDiagram, clock: Clock, is_stop_requested: Callable[[], bool]):
         """Connect to the robot.
 
-        The skill has a `HardwareStation`, which advances by `clock`. `is_stop_requested` is called in every control step.
+        The skill has a `HardwareStation`, which advances by `clock`. Each control step calls `is_stop_requested`.
 
         Raises:
             InputError: If no robot answers.
