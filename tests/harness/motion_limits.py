@@ -1,0 +1,134 @@
+"""Adversarial commands against the limits of velocity, acceleration and jerk of `PoseMotionLimiter`.
+
+The reached values are finite differences of the emitted poses, which do not depend on the trajectory generator: a
+difference of order n divided by the n-th power of the period is an average of the n-th derivative, and cannot exceed
+its largest value. The exit code is 1 if a limit is exceeded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from scipy.spatial.transform import Rotation
+
+from guiderail.diagrams.hardware.rtde import UR_MOTION_LIMITS
+from guiderail.models.control.motion_limits import FRANKA_LIMITS, MotionLimits
+from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
+
+START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])
+CHUNK = 5000  # commands between two checks
+TOLERANCE = 1e-6  # relative, of the finite differences
+Policy = Callable[[np.random.Generator], Iterator[np.ndarray]]
+
+
+def jumps(rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Jump at random instants by random amounts from micrometers to meters."""
+    desired = START
+    while True:
+        if rng.random() < 0.1:
+            desired = START + rng.uniform(-1, 1, 6) * rng.choice([1e-6, 1e-4, 1e-2, 0.3, 2.0])
+        yield desired
+
+
+def white(rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Command another pose in every period."""
+    scale = 0.3
+    while True:
+        if rng.random() < 0.002:
+            scale = rng.choice([1e-5, 1e-3, 0.05, 0.3, 1.5])
+        yield START + scale * rng.standard_normal(6)
+
+
+def reversals(rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Alternate between two far corners with a period of motion that is swept over all of them."""
+    while True:
+        half, corner = int(rng.integers(1, 200)), rng.choice([-1.0, 1.0], 6) * [0.5, 0.5, 0.5, 1.0, 0.5, 1.0]
+        for k in range(10 * half):
+            yield START + (corner if k // half % 2 else -corner)
+
+
+def invalid(rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Mix jumps with values that are not finite, huge angles and half turns."""
+    for desired in jumps(rng):
+        if rng.random() < 0.3:
+            desired = desired.copy()
+            values = [np.nan, np.inf, -np.inf, 1e300, np.pi, -np.pi, 1e6]
+            desired[rng.integers(6)] += rng.choice(values)
+            if abs(desired[0]) > 1e3 or abs(desired[1]) > 1e3 or abs(desired[2]) > 1e3:
+                desired[:3] = np.nan  # a finite position that far away would be approached, and is not what is tested
+        yield desired
+
+
+def oscillations(rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Follow sinusoids of all frequencies up to half the command rate."""
+    while True:
+        frequency, phase = rng.uniform(0.01, np.pi, 6), rng.uniform(0, 2 * np.pi, 6)
+        amplitude = rng.choice([1e-4, 1e-2, 0.2]) * rng.uniform(0, 1, 6)
+        for k in range(int(rng.integers(50, 2000))):
+            yield START + amplitude * np.sin(frequency * k + phase)
+
+
+POLICIES: dict[str, Policy] = {one.__name__: one for one in (jumps, white, reversals, invalid, oscillations)}
+LIMITS = {"franka": FRANKA_LIMITS, "a fifth of franka": FRANKA_LIMITS.scaled(0.2), "ur": UR_MOTION_LIMITS}
+
+
+def reached(poses: np.ndarray, period: float) -> np.ndarray:
+    """Return the largest norms of velocity, acceleration and jerk, (2, 3), linear and angular, of poses (N, 6)."""
+    turns = Rotation.from_euler("xyz", poses[:, [5, 4, 3]])
+    rates = (np.diff(poses[:, :3], axis=0) / period, (turns[1:] * turns[:-1].inv()).as_rotvec() / period)
+    return np.array(
+        [[np.linalg.norm(np.diff(rate, n, axis=0), axis=1).max() / period**n for n in range(3)] for rate in rates]
+    )
+
+
+def attack(policy: Policy, limits: MotionLimits, period: float, commands: int, seed: int) -> np.ndarray:
+    """Return the largest shares of the limits that were reached, (2, 3)."""
+    system = PoseMotionLimiter(limits, period=period)
+    context = system.CreateDefaultContext()
+    desired_port = system.get_desired_pose_input_port()
+    desired_port.FixValue(context, START)
+    system.get_pose_input_port().FixValue(context, START)
+    system.get_blend_factor_input_port().FixValue(context, [1.0])
+    simulator = Simulator(system, context)
+    simulator.Initialize()
+    output, source = system.get_limited_pose_output_port(), policy(np.random.default_rng(seed))
+    bounds, worst, poses = np.array([limits.linear, limits.angular]), np.zeros((2, 3)), [START] * 4
+    for k in range(1, commands + 1):
+        desired_port.FixValue(context, next(source))
+        poses.append(output.Eval(context).copy())
+        simulator.AdvanceTo(k * period)
+        if k % CHUNK == 0 or k == commands:
+            worst = np.maximum(worst, reached(np.array(poses), period) / bounds)
+            poses = poses[-4:]
+    return worst
+
+
+def main() -> int:
+    """Run all policies against all limits."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--commands", type=int, default=1_000_000, help="number of commands in all")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    runs = [(p, name, h) for h in (0.005, 0.001) for name in LIMITS for p in POLICIES]
+    number, total, breaches, start = arguments.commands // len(runs) + 1, 0, 0, time.monotonic()
+    for seed, (policy, name, period) in enumerate(runs, arguments.seed):
+        shares = attack(POLICIES[policy], LIMITS[name], period, number, seed)
+        is_within = bool((shares <= 1.0 + TOLERANCE).all())
+        total, breaches = total + number, breaches + (not is_within)
+        largest = " ".join(f"{share:7.4f}" for share in shares.ravel())
+        print(
+            f"{'ok  ' if is_within else 'FAIL'} {policy:<13}{name:<19}{1e3 * period:2.0f} ms  shares of the limits "
+            f"{largest}  {total} commands, {time.monotonic() - start:.0f} s",
+            flush=True,
+        )
+    print(f"{total} commands, {breaches} runs with a breach")
+    return int(breaches > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,74 @@
+"""Server of an environment for programs in another Python environment."""
+
+import io
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+import guiderail  # noqa: F401 (registers the environments)
+from guiderail.models.common.errors import InputError
+from guiderail.tools.env_server import EnvServer, open_environment, serve
+
+OPTIONS = {"guidance": "kgrl", "action_repeat": 20}
+
+
+@pytest.fixture(scope="module")
+def server():
+    return EnvServer(open_environment("NarrowPassage", OPTIONS))
+
+
+def test_answers_are_those_of_the_environment(server):
+    env = gymnasium.make("guiderail/NarrowPassage-v0", **OPTIONS)
+    observation, _ = env.reset(seed=3)
+    assert server.answer({"reset": 3})["observation"] == observation.tolist()
+    for _ in range(3):
+        observation, *_ = env.step(np.full(2, 0.5))
+        answer = server.answer({"action": [0.5, 0.5]})
+        assert answer["observation"] == observation.tolist()
+    assert answer["pose"] == env.unwrapped.trace.measured[-1].tolist()
+    assert not answer["is_done"]
+
+
+def test_end_of_the_episode_is_reported(server):
+    answer = server.answer({"reset": 0})
+    while not answer["is_done"]:
+        answer = server.answer({"action": [0.0, 0.0]})
+    assert answer["termination"]
+    assert "reset" in server.answer({"action": [0.0, 0.0]})["error"]
+    assert not server.answer({"reset": None})["is_done"]
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"action": [float("nan"), 0.0]},
+        {"action": [0.0]},
+        {"action": "up"},
+        {"reset": -1},
+        {"reset": True},
+        {},
+        [],
+        {"x": 1},
+    ],
+)
+def test_wrong_requests_are_refused_and_nothing_moves(server, request_):
+    before = server.answer({"reset": 0})
+    assert "error" in server.answer(request_)
+    assert server._state() == before
+
+
+def test_lines_are_answered_until_the_input_ends(server):
+    answers = io.StringIO()
+    serve(server, io.StringIO('{"reset": 1}\nnonsense\n'), answers)
+    first, second, third = map(json.loads, answers.getvalue().splitlines())
+    assert first["action_size"] == 2
+    assert first["period"] == pytest.approx(server._env.time_step)
+    assert "observation" in second
+    assert "one line of JSON" in third["error"]
+
+
+def test_real_robot_is_refused():
+    with pytest.raises(InputError, match="real robot"):
+        open_environment("BncConnector", {"station": "hardware"})

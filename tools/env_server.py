@@ -1,0 +1,127 @@
+"""Server of a simulated environment for programs in another Python environment: one line of JSON per message.
+
+Started by `python -m guiderail.tools.env_server TASK_OR_RUN [OPTIONS]`; OPTIONS is a JSON object of environment
+options. It reads requests from standard input and answers on standard output, and ends when its input ends. Requests
+are `{"reset": SEED}`, with null to continue the random stream, and `{"action": [...]}`. The first line and every answer
+has `observation`, `pose`, `wrench`, `is_done`, `is_success` and `termination`; the first line also has `action_size`
+and `period` [s]. A refused request is answered with `error`, and nothing moves.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import IO, Any
+
+import gymnasium
+import numpy as np
+
+from guiderail.diagrams.envs.env import DiagramEnv
+from guiderail.diagrams.envs.make import make_env
+from guiderail.models.common.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder, as_arguments
+
+MAX_LINE = 100_000  # longest request [characters]
+
+
+def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
+    """Return the environment of a run's folder or of a task, with changed options.
+
+    Raises:
+        InputError: If there is no such task, or an option is invalid.
+    """
+    if (Path(name) / "config.yaml").is_file():
+        config = RunFolder(name).config()
+        name, options = config.task, config.environment | options
+    return make_env(name, **as_arguments(options))
+
+
+class EnvServer:
+    """Answers requests for one environment.
+
+    Args:
+        env: The environment.
+    """
+
+    def __init__(self, env: DiagramEnv):
+        self._env = env
+        self._station = env.task.diagram.GetSubsystemByName("station")
+        self._is_done, self._info = False, {"is_success": False, "termination": ""}
+        self._observation = env.reset()[0]
+
+    def describe(self) -> dict[str, Any]:
+        """Return the first line."""
+        action_space = self._env.action_space
+        return {"action_size": action_space.shape[0], "period": self._env.time_step} | self._state()
+
+    def answer(self, request: Any) -> dict[str, Any]:
+        """Return the answer to a request."""
+        try:
+            if not isinstance(request, dict) or len(request) != 1 or next(iter(request)) not in ("reset", "action"):
+                raise InputError('a request is {"reset": SEED} or {"action": [...]}')
+            if "reset" in request:
+                self._reset(request["reset"])
+            else:
+                self._step(request["action"])
+        except (InputError, gymnasium.error.ResetNeeded) as error:
+            return {"error": str(error)}
+        return self._state()
+
+    def _reset(self, seed: Any) -> None:
+        if seed is not None and (type(seed) is not int or not 0 <= seed < 2**31):
+            raise InputError("a seed is a whole number from 0 to 2147483647, or null")
+        self._observation, info = self._env.reset(seed=seed)
+        self._info, self._is_done = info, False
+
+    def _step(self, action: Any) -> None:
+        self._observation, _, terminated, truncated, self._info = self._env.step(action)
+        self._is_done = terminated or truncated
+
+    def _state(self) -> dict[str, Any]:
+        context = self._station.GetMyContextFromRoot(self._env.simulator.get_context())
+        return {
+            "observation": np.asarray(self._observation, float).tolist(),
+            **{name: self._station.GetOutputPort(name).Eval(context).tolist() for name in ("pose", "wrench")},
+            "is_done": self._is_done,
+            "is_success": bool(self._info["is_success"]),
+            "termination": str(self._info["termination"]),
+        }
+
+
+def serve(server: EnvServer, requests: IO[str], answers: IO[str]) -> None:
+    """Answer requests until the input ends."""
+    print(json.dumps(server.describe()), file=answers, flush=True)
+    while line := requests.readline(MAX_LINE):
+        try:
+            answer = server.answer(json.loads(line))
+        except (ValueError, RecursionError):
+            answer = {"error": f"a request is one line of JSON, of at most {MAX_LINE} characters"}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+def main(arguments: list[str]) -> int:
+    """Serve the environment that the arguments name."""
+    # Messages of libraries on standard output would be taken for answers.
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    try:
+        if not 1 <= len(arguments) <= 2:
+            raise InputError("name a task or the folder of a run, and options as a JSON object")
+        try:
+            options = json.loads(arguments[1]) if len(arguments) == 2 else {}
+        except ValueError:
+            options = None
+        if not isinstance(options, dict):
+            raise InputError("options are a JSON object of names and values")
+        server = EnvServer(open_environment(arguments[0], options))
+    except InputError as error:
+        print(json.dumps({"error": str(error)}), file=answers, flush=True)
+        return 2
+    serve(server, sys.stdin, answers)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
