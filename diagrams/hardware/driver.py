@@ -30,6 +30,15 @@ TORQUE_TOLERANCE_SHARE = 0.02  # error of a joint's torque by friction, gravity 
 CommandCallback = Callable[[np.ndarray], None]
 
 
+@dataclass(frozen=True)
+class Check:
+    """Result of one pre-flight check."""
+
+    name: str
+    description: str
+    passed: bool = True
+
+
 class Driver(ABC):
     """Connection to the program that drives a robot with joint torque control.
 
@@ -100,6 +109,10 @@ class Driver(ABC):
         Raises:
             InputError: If the error persists.
         """
+
+    def check_setup(self) -> list[Check]:
+        """Check the configuration of the robot before the first motion; nothing is sent."""
+        return []
 
     def check_usable(self) -> None:  # noqa: B027 (optional hook)
         """Raise `InputError` if the connection cannot receive in this environment."""

@@ -20,7 +20,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.spatial.transform import Rotation
 
-from guiderail.diagrams.hardware.driver import PoseDriver, RobotImpedance, register_driver
+from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_limits import MotionLimits
@@ -160,6 +160,22 @@ class RtdeDriver(PoseDriver):
             return "its program has ended"
         return ""
 
+    def check_setup(self) -> list[Check]:
+        """Check state, kinematics and program of the robot."""
+        distance = self._kinematic_distance()
+        speed, acceleration, jerk = self.motion_limits.linear
+        return [
+            Check("state", self.error or "normal, its program is running", not self.error),
+            Check(
+                "kinematics",
+                f"the robot's tool center is {1e3 * distance:.1f} mm from the model's",
+                distance <= MAX_POSE_DIFFERENCE,
+            ),
+            Check("force sensor", "zeroed: the tool must have been free"),
+            Check("motion", f"commands up to {speed:.2f} m/s, {acceleration:.1f} m/s² and {jerk:.0f} m/s³"),
+            Check("untested", "this driver has never moved a robot: start with half the force, and a hand on the stop"),
+        ]
+
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
         """Command the wrench of the impedance towards a pose of the tool center in the robot's base frame."""
         del time
@@ -237,14 +253,18 @@ class RtdeDriver(PoseDriver):
         Raises:
             InputError: If they differ by more than the calibration of a robot.
         """
-        actual = X_ControllerBase.inverse() @ _to_transform(self._receiver.getActualTCPPose())
-        assert self._status is not None
-        distance = np.linalg.norm(actual.translation() - self._calc_pose(self._status.positions).translation())
+        distance = self._kinematic_distance()
         if distance > MAX_POSE_DIFFERENCE:
             raise InputError(
                 f"the tool center of the robot at {self.url} is {1e3 * distance:.0f} mm from that of the {self.name}'s "
                 "model: it is another robot, or another tool is active"
             )
+
+    def _kinematic_distance(self) -> float:
+        """Return the distance of the robot's tool center from the model's [m]."""
+        actual = X_ControllerBase.inverse() @ _to_transform(self._receiver.getActualTCPPose())
+        assert self._status is not None
+        return float(np.linalg.norm(actual.translation() - self._calc_pose(self._status.positions).translation()))
 
     def _calc_pose(self, positions: np.ndarray) -> RigidTransform:
         self._plant.SetPositions(self._context, positions)

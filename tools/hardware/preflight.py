@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.hardware.clock import Clock
+from guiderail.diagrams.hardware.driver import Check
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
@@ -20,15 +20,6 @@ MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # from the start pose, for an unattended ap
 MAX_JOINT_SPEED = 0.05  # of an arm at rest [rad/s]
 MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
 NUM_STATUSES = 20  # statuses that are received before the checks
-
-
-@dataclass(frozen=True)
-class Check:
-    """Result of one pre-flight check."""
-
-    name: str
-    description: str
-    passed: bool = True
 
 
 class PreflightChecks:
@@ -140,6 +131,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
             f"at most {list(limits.torque)} Nm sent; the full force takes {torque_share:.0%} of the nearest limit",
         ),
         Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
+        *driver.check_setup(),
     ]
 
 

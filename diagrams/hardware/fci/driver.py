@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import importlib
 import logging
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.hardware.driver import PoseDriver, RobotImpedance, register_driver
+from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
@@ -26,6 +27,9 @@ MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interf
 POSTURE_STIFFNESS = 5.0  # stiffness of the nullspace's posture [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold as a multiple of the bounded force
+MAX_TOOL_ERROR = 1e-4  # of the tool center that the robot reports [m]
+MAX_MASS_ERROR = 0.05  # of the payload that the robot reports [kg]
+REALTIME_FILE = Path("/sys/kernel/realtime")  # of a kernel with real-time priorities
 TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # of external joint torques [Nm]; libfranka's examples
 
 
@@ -105,6 +109,39 @@ class FciDriver(PoseDriver):
     def error(self) -> str:
         """Reason of a reflex of the robot, empty if there is none."""
         return str(self._robot.state.current_errors) if self._robot.has_errors else ""
+
+    def check_setup(self) -> list[Check]:
+        """Check mode, tool, payload and thresholds of the robot, and this machine's kernel."""
+        impedance, state = self._impedance, self._robot.state
+        if impedance is None:
+            raise InputError("the driver fci is used before it is configured")
+        mode = str(state.robot_mode).rpartition(".")[2]
+        tool = np.array(state.F_T_EE.matrix) - impedance.X_FlangeTool.GetAsMatrix4()
+        error = float(np.abs(tool).max())
+        mass = float(state.m_ee) + float(state.m_load)
+        speed, acceleration, jerk = self.motion_limits.linear
+        is_realtime = REALTIME_FILE.is_file() and REALTIME_FILE.read_text().strip() == "1"
+        return [
+            Check("mode", f"{mode}; it must be Idle: unlock the joints and activate FCI in Desk", mode == "Idle"),
+            Check("tool center", f"as configured, within {error:.1e} m", error <= MAX_TOOL_ERROR),
+            Check(
+                "mass",
+                f"the robot carries {mass:.2f} kg, the model {impedance.mass:.2f} kg; in Desk the end effector is none",
+                abs(mass - impedance.mass) <= MAX_MASS_ERROR,
+            ),
+            Check(
+                "reflex",
+                f"at {FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3])):.0f} N of external force, and "
+                f"{list(TORQUE_THRESHOLD)} Nm of external torques",
+            ),
+            Check("motion", f"commands up to {speed:.2f} m/s, {acceleration:.1f} m/s² and {jerk:.0f} m/s³"),
+            Check(
+                "kernel",
+                "with real-time priorities"
+                if is_realtime
+                else "without real-time priorities: late packets are likely, and the robot stops after 20 of them",
+            ),
+        ]
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
         """Make the impedance follow a pose of the tool center in the robot's base frame."""

@@ -48,7 +48,8 @@ class RehearsalRobot(FrankaMujocoRobot):
     def state(self) -> Any:
         """State message, with the external torque of the arm on its surroundings."""
         state = super().state
-        return state.replace(tau_ext_hat_filtered=tuple(-self._external))
+        # The tool replaces the hand, whose mass the simulator reports.
+        return state.replace(tau_ext_hat_filtered=tuple(-self._external), m_ee=0.0)
 
 
 class RehearsalSimulator(MujocoSimulator):

@@ -7,6 +7,7 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.hardware.fci import driver as fci
 from guiderail.diagrams.hardware.fci.driver import FORCE_THRESHOLD_SHARE, FciDriver
 from guiderail.diagrams.hardware.pose_control import make_robot_impedance
 from guiderail.diagrams.hardware.station import HardwareStation
@@ -40,7 +41,7 @@ class Robot:
     def __init__(self, positions):
         self.calls, self.errors, self.is_connected = [], "", True
         self.positions, self.external, self.time = positions, np.zeros(7), 0.0
-        self.can_recover = True
+        self.can_recover, self.mode, self.tool, self.mass = True, "RobotMode.Idle", np.eye(4), 0.0
 
     @property
     def has_errors(self):
@@ -58,12 +59,24 @@ class Robot:
             time=SimpleNamespace(to_sec=lambda time=self.time: time),
             current_errors=self.errors,
             F_T_NE=Affine(RigidTransform([0.0, 0.0, 0.1]).GetAsMatrix4()),
+            F_T_EE=Affine(self.tool),
+            m_ee=0.0,
+            m_load=self.mass,
+            robot_mode=self.mode,
         )
 
     def recover_from_errors(self):
         if self.can_recover:
             self.errors = ""
         return self.can_recover
+
+    def set_ee(self, matrix):
+        self.calls.append(("set_ee", (matrix,), {}))
+        self.tool = (RigidTransform([0.0, 0.0, 0.1]) @ RigidTransform(np.reshape(matrix, (4, 4), "F"))).GetAsMatrix4()
+
+    def set_load(self, mass, center, inertia):
+        self.calls.append(("set_load", (mass, center, inertia), {}))
+        self.mass = mass
 
     def __getattr__(self, name):
         return lambda *args, **options: self.calls.append((name, args, options))
@@ -181,6 +194,31 @@ def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
     assert calls["set_collision_behavior"][1][0] == pytest.approx(
         FORCE_THRESHOLD_SHARE * impedance.max_wrench[:3].max()
     )
+
+
+def failed(driver):
+    return [check.name for check in driver.check_setup() if not check.passed]
+
+
+def test_configured_robot_passes_the_checks(driver):
+    assert failed(driver) == []
+    assert {"reflex", "motion", "kernel"} < {check.name for check in driver.check_setup()}
+
+
+@pytest.mark.parametrize(
+    ("attribute", "good", "bad", "name"),
+    [
+        ("mode", "RobotMode.Idle", "RobotMode.Guiding", "mode"),
+        ("mode", "RobotMode.Idle", "RobotMode.UserStopped", "mode"),
+        ("mass", 0.9 * fci.MAX_MASS_ERROR, 1.1 * fci.MAX_MASS_ERROR, "mass"),
+        ("tool", 0.9 * fci.MAX_TOOL_ERROR, 1.1 * fci.MAX_TOOL_ERROR, "tool center"),
+    ],
+)
+def test_other_setup_fails_its_check(driver, robot, attribute, good, bad, name):
+    before = getattr(robot, attribute)
+    for value, expected in ((good, []), (bad, [name])):
+        setattr(robot, attribute, value if attribute == "mode" else before + value)
+        assert failed(driver) == expected
 
 
 def test_spring_error_is_bounded_by_the_wrench(driver, robot):

@@ -72,11 +72,11 @@ class Rehearsal:
 
 
 def rehearse(rate: float) -> list[str]:
-    """Run the rehearsal; return what failed."""
+    """Run the rehearsal; return the names of failed checks."""
     failures = []
 
     def check(name: str, passed: bool, description: str) -> None:
-        print(f"{'ok  ' if passed else 'FAIL'} {name:<10} {description}", flush=True)
+        print(f"{'ok  ' if passed else 'FAIL'} {name:<12} {description}", flush=True)
         if not passed:
             failures.append(name)
 
@@ -87,6 +87,8 @@ def rehearse(rate: float) -> list[str]:
     )
     with subprocess_tied_to_parent(code) as robot:
         run.start()
+        for one in run.station.driver.check_setup():
+            check(one.name, one.passed, one.description)
         run.advance(1.2)
         check("take over", run["arm_state"][0] == ArmState.RUNNING, run.describe())
         run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))
