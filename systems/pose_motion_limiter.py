@@ -2,13 +2,20 @@
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
-from ruckig import InputParameter, Result, Ruckig, Trajectory
+from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_limits import MotionLimits
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
+# Where axes cannot be synchronized, for numerical reasons (about one of 10,000 adversarial commands), each has a
+# trajectory of its own; where there is none either, the motion is braked to rest.
+FALLBACKS = (
+    (ControlInterface.Position, Synchronization.Time),
+    (ControlInterface.Position, Synchronization.No),
+    (ControlInterface.Velocity, Synchronization.No),
+)
 POSE_AXES = [5, 4, 3]  # indices of Rx, Ry, Rz in a pose, in the order of SciPy's extrinsic angles "xyz"
 
 
@@ -91,11 +98,7 @@ class PoseMotionLimiter(LeafSystem):
         wanted.current_position, wanted.current_velocity, wanted.current_acceleration = state[:18].reshape(3, 6)
         wanted.target_position = state[18:24]
         wanted.max_velocity, wanted.max_acceleration, wanted.max_jerk = self._limits
-        trajectory = Trajectory(6)
-        # An instance that this system stored would be reported as leaked when the interpreter exits.
-        if Ruckig(6).calculate(wanted, trajectory) not in (Result.Working, Result.Finished):
-            raise InputError(f"no trajectory from {state[:18]} to {state[18:24]} is within the limits of the motion")
-        state[:18] = np.concatenate(trajectory.at_time(self._period)[:3])
+        state[:18] = np.concatenate(_plan(wanted).at_time(self._period)[:3])
         return state
 
     def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
@@ -108,6 +111,23 @@ class PoseMotionLimiter(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._next_state.Eval(context))
+
+
+def _plan(wanted: InputParameter) -> Trajectory:
+    """Return a trajectory to the target, or to rest if there is none.
+
+    Raises:
+        InputError: If there is no trajectory to rest either.
+    """
+    for wanted.control_interface, wanted.synchronization in FALLBACKS:
+        trajectory = Trajectory(6)
+        try:
+            # An instance that a system stored would be reported as leaked when the interpreter exits.
+            if Ruckig(6).calculate(wanted, trajectory) in (Result.Working, Result.Finished):
+                return trajectory
+        except RuckigError:
+            continue
+    raise InputError(f"no trajectory from {wanted.current_position} is within the limits of the motion")
 
 
 def _at_rest(pose: np.ndarray) -> np.ndarray:

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
+from ruckig import ControlInterface, Ruckig, RuckigError, Synchronization
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
+from guiderail.systems import pose_motion_limiter
 from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
 
 PERIOD = 0.005
@@ -94,6 +96,40 @@ def test_last_valid_command_is_followed_when_one_is_invalid(invalid):
     loop.run(5)
     loop.set(invalid)
     assert_close(loop.run(200)[-1], valid, 1e-9)
+
+
+# Found by `make motions`: the library cannot synchronize the axes.
+UNSYNCHRONIZED = (
+    [0.4617475861184548, -0.02562967106966967, 0.4267346873541157, -0.06869591579492204, -0.01050064361349193]
+    + [-0.05043545623064285, -0.6400539533795001, -0.4637025342474212, -0.4437238746331603, -0.2864389150115287]
+    + [-0.3163092866745019, -0.1879337329288214, 6.52696859147865, 7.505553499465135, 7.505553499465135]
+    + [12.62953713852306, -12.62953713852306, 12.62953713852306, 0.2595146508075081, 0.125421340006484]
+    + [0.2945301210973416, 0.2061487170500096, -0.1879694357494099, 0.243618726883553, 0.0, 0.0, 0.0, 1.0]
+)
+
+
+@pytest.mark.parametrize("fails", [(), (Synchronization.Time, Synchronization.No)])
+def test_motion_continues_when_axes_cannot_be_synchronized(fails, monkeypatch):
+    class Solver(Ruckig):
+        def calculate(self, wanted, trajectory):
+            if wanted.control_interface == ControlInterface.Position and wanted.synchronization in fails:
+                raise RuckigError("failed")
+            return super().calculate(wanted, trajectory)
+
+    monkeypatch.setattr(pose_motion_limiter, "Ruckig", Solver)
+    loop = Loop(FRANKA_LIMITS)
+    loop.context.get_mutable_discrete_state_vector().SetFromVector(UNSYNCHRONIZED)
+    target = np.array(UNSYNCHRONIZED)
+    turn = Rotation.from_rotvec(target[21:24]).as_euler("xyz")
+    desired = np.concatenate([target[18:21], turn[::-1]])
+    loop.set(desired)
+    poses = loop.run(400)
+    reached = np.array(derivatives(poses))
+    assert (reached <= np.array([FRANKA_LIMITS.linear, FRANKA_LIMITS.angular]) * (1 + 1e-9)).all()
+    if fails:
+        assert_close(poses[-1], poses[-2], 1e-12)  # at rest
+    else:
+        assert_close(poses[-1], desired, 1e-9)
 
 
 def test_orientation_stays_continuous_across_half_a_turn_of_an_angle():
