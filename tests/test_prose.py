@@ -20,7 +20,6 @@ CHECKED = (
     "diagrams/",
     "docs/",
     "examples/",
-    "integrations/",
     "models/",
     "research/",
     "src/",
