@@ -5,13 +5,14 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, pose_difference
 from guiderail.models.control.energy_tank import admissible_share, spring_energy
 from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
-_REVERSED = [0, 1, 2, 5, 4, 3]  # order of a pose's coordinates in a wrench, and the reverse
+_WRENCH_ORDER = [0, 1, 2, 5, 4, 3]  # coordinates of a wrench among those of a pose
 
 
 class _Admitted(NamedTuple):
@@ -114,9 +115,9 @@ class EnergyTank(LeafSystem):
             context.get_discrete_state(state).value()
             for state in (self._last_reference, self._last_limits, self._last_pose, self._content)
         )
-        if not np.isfinite(desired).all():
+        if not is_finite(desired):
             desired = reference
-        requested = self._requested_bound(context).axes[_REVERSED]
+        requested = self._requested_bound(context).in_pose_order.axes
         limits, K = np.minimum(last_limits, requested), self._stiffness
         moved = pose_difference(pose, last_pose)
         dissipated = float(self._damping @ moved**2) / self._period
@@ -134,11 +135,14 @@ class EnergyTank(LeafSystem):
 
     def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
         desired = self._desired_pose_port.Eval(context)
-        output.SetFromVector(self._admitted.Eval(context).reference if np.isfinite(desired).all() else desired)
+        output.SetFromVector(self._admitted.Eval(context).reference if is_finite(desired) else desired)
 
     def _calc_admitted_wrench(self, context: Context, output: BasicVector) -> None:
         bound = self._requested_bound(context)
-        output.SetFromVector([*self._admitted.Eval(context).limits[_REVERSED], bound.force, bound.torque])
+        numbers = np.empty(MAX_WRENCH_SIZE)
+        numbers[:POSE_SIZE] = self._admitted.Eval(context).limits[_WRENCH_ORDER]
+        numbers[POSE_SIZE:] = bound.force, bound.torque
+        output.SetFromVector(numbers)
 
     def _calc_energy(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._content).value())
@@ -146,7 +150,7 @@ class EnergyTank(LeafSystem):
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)
         discrete_state.set_value(self._last_reference, pose)
-        discrete_state.set_value(self._last_limits, self._requested_bound(context).axes[_REVERSED])
+        discrete_state.set_value(self._last_limits, self._requested_bound(context).in_pose_order.axes)
         discrete_state.set_value(self._last_pose, pose)
         discrete_state.set_value(self._content, [self._capacity])
 

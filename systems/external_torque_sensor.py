@@ -3,13 +3,20 @@
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.common.value import AbstractValue, Value
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.sensor_disturbance import DRIFT_TIME
-from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
+from guiderail.systems.support.declarations import (
+    check_period,
+    declare_cache,
+    declare_plant_context,
+    input_getter,
+    output_getter,
+)
 
 FRICTION_SPEED = 0.01  # joint speed at which friction has 76 % of its magnitude [rad/s]
 
@@ -91,8 +98,14 @@ class ExternalTorqueSensor(LeafSystem):
         self._contact_torque_port = self.DeclareVectorInputPort("contact_torque", n)
         state, parameters = self._state_port.ticket(), self.all_parameters_ticket()
         self._model = declare_plant_context(self, plant, self._set_positions, prerequisites_of_calc={state})
-        self._actual = declare_plant_context(
-            self, plant, self._set_actual_bodies, prerequisites_of_calc={state, parameters}
+        self._bodies_set = declare_cache(self, "actual_bodies", self._actual_bodies, prerequisites_of_calc={parameters})
+        # In a list with the bodies that the context has: they change at a reset, the positions at every step.
+        self._actual = self.DeclareCacheEntry(
+            description="actual_arm",
+            value_producer=ValueProducer(
+                allocate=lambda: Value([plant.CreateDefaultContext(), None]), calc=self._calc_actual
+            ),
+            prerequisites_of_calc={state, self._bodies_set.ticket()},
         )
         self._external_torque_port = self.DeclareVectorOutputPort(
             "external_torque",
@@ -139,15 +152,23 @@ class ExternalTorqueSensor(LeafSystem):
         n = self._plant.num_positions()
         self._plant.SetPositions(plant_context, self._state_port.Eval(context)[:n])
 
-    def _set_actual_bodies(self, context: Context, plant_context: Context) -> None:
-        self._set_positions(context, plant_context)
+    def _actual_bodies(self, context: Context) -> list[tuple[float, np.ndarray]]:
+        """Return actual mass [kg] and center of mass (3,) [m] of each body."""
         masses = context.get_numeric_parameter(self._mass).value()
         centers = context.get_numeric_parameter(self._center).value().reshape(-1, 3)
-        for body, nominal, own, mass, center in zip(
-            self._bodies, self._nominal, self._centers, masses, centers, strict=True
-        ):
-            body.SetMass(plant_context, max(nominal + mass, 0.0))
-            body.SetCenterOfMassInBodyFrame(plant_context, own + center)
+        return [
+            (max(nominal + mass, 0.0), own + center)
+            for nominal, own, mass, center in zip(self._nominal, self._centers, masses, centers, strict=True)
+        ]
+
+    def _calc_actual(self, context: Context, value: AbstractValue) -> None:
+        arm, actual = value.get_mutable_value(), self._bodies_set.Eval(context)
+        self._set_positions(context, arm[0])
+        if arm[1] is not actual:
+            for body, (mass, center) in zip(self._bodies, actual, strict=True):
+                body.SetMass(arm[0], mass)
+                body.SetCenterOfMassInBodyFrame(arm[0], center)
+            arm[1] = actual
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         n = len(self._noise)
@@ -167,9 +188,8 @@ class ExternalTorqueSensor(LeafSystem):
     def _calc_external_torque(self, context: Context, output: BasicVector) -> None:
         n = len(self._noise)
         contact, velocities = self._contact_torque_port.Eval(context), self._state_port.Eval(context)[n:]
-        gravity, actual = (
-            self._plant.CalcGravityGeneralizedForces(entry.Eval(context)) for entry in (self._model, self._actual)
-        )
+        gravity = self._plant.CalcGravityGeneralizedForces(self._model.Eval(context))
+        actual = self._plant.CalcGravityGeneralizedForces(self._actual.Eval(context)[0])
         gain, offset, friction = (
             context.get_numeric_parameter(index).value() for index in (self._gain, self._offset, self._friction)
         )

@@ -5,6 +5,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
 
@@ -59,7 +60,8 @@ class JointTorqueWrench(LeafSystem):
         if not 0.0 <= time_constant < np.inf or not damping >= 0.0:
             raise InputError("a wrench estimate's time constant and damping must not be negative")
         num_joints = plant.num_positions()
-        self._plant, self._target, self._tool_center, self._damping = plant, target, tool_center, damping
+        self._plant, self._target, self._tool_center = plant, target, tool_center
+        self._damping = damping * np.eye(6)
         self._decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
         self._external_torque_port = self.DeclareVectorInputPort("external_torque", num_joints)
@@ -81,7 +83,7 @@ class JointTorqueWrench(LeafSystem):
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         external_torque = self._external_torque_port.Eval(context)
         # NaN would remain in the filter for ever.
-        if not np.isfinite([*self._positions_port.Eval(context), *external_torque]).all():
+        if not is_finite(self._positions_port.Eval(context)) or not is_finite(external_torque):
             return EventStatus.DidNothing()
         J = self._plant.CalcJacobianSpatialVelocity(
             self._plant_context.Eval(context),
@@ -92,7 +94,7 @@ class JointTorqueWrench(LeafSystem):
             self._target,
         )
         # [torque, force], as the Jacobian's rows are [rotational, translational]
-        F = np.linalg.solve(J @ J.T + self._damping * np.eye(6), J @ external_torque)
+        F = np.linalg.solve(J @ J.T + self._damping, J @ external_torque)
         newest = np.concatenate([F[3:], F[:3]])
         if context.get_discrete_state(self._has_sample).value()[0]:
             last = context.get_discrete_state(self._state).value()

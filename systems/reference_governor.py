@@ -8,9 +8,6 @@ from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound, governed_error
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
-# Order of the coordinates of a pose, [x y z Rz Ry Rx], in those of a wrench, and the reverse.
-_REVERSED = [0, 1, 2, 5, 4, 3]
-
 
 class ReferenceGovernor(LeafSystem):
     """Move a desired pose towards the measured one, so that the force of a spring and damper stays inside a bound.
@@ -79,7 +76,6 @@ class ReferenceGovernor(LeafSystem):
         if self._max_wrench_port.HasValue(context):
             bound = bound.lowered_to(self._max_wrench_port.Eval(context))
         pose, velocity = state[:POSE_SIZE], state[POSE_SIZE:]
-        in_pose_order = WrenchBound(bound.axes[_REVERSED], bound.force, bound.torque, bound.contact_stiffness)
         error = governed_error(
             self._stiffness,
             self._damping,
@@ -87,6 +83,6 @@ class ReferenceGovernor(LeafSystem):
             velocity,
             self._mass,
             self._step,
-            in_pose_order,
+            bound.in_pose_order,
         )
         output.SetFromVector(pose + error)

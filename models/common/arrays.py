@@ -1,5 +1,6 @@
 """Conversion to arrays of numbers, and the cross product of two vectors."""
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -12,6 +13,11 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Compute a × b of two vectors (3,), many times faster than `numpy.cross`, which is made for arrays of vectors."""
     (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
+
+
+def is_finite(values: np.ndarray) -> bool:
+    """Return True if a few numbers (n,) are all finite; several times faster than `np.isfinite(values).all()`."""
+    return all(map(math.isfinite, values.tolist()))
 
 
 _EXACT = 2**53  # a double represents smaller whole numbers exactly

@@ -1,5 +1,7 @@
 """Poses as six coordinates [x y z Rz Ry Rx], in which the thesis records and commands."""
 
+import math
+
 import numpy as np
 
 from guiderail.models.common.transforms import RigidTransform, rpy_angles, rpy_rotation
@@ -23,9 +25,9 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
 
 def pose_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return `first` minus `second`, two poses (6,), each angle in [−π, π)."""
-    difference = first - second
-    difference[3:] = (difference[3:] + np.pi) % (2.0 * np.pi) - np.pi
-    return difference
+    # Angles in plain Python: NumPy is slower for three numbers, and this runs at every step of a plant.
+    difference = (first - second).tolist()
+    return np.array(difference[:3] + [(angle + math.pi) % (2.0 * math.pi) - math.pi for angle in difference[3:]])
 
 
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:

@@ -15,8 +15,13 @@ def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) 
         limits: F (n,) [N, Nm], not negative.
         error: e (n,) [m, rad].
     """
-    clipped = np.minimum(np.abs(error), limits / stiffness)
-    return float((stiffness * clipped * (np.abs(error) - 0.5 * clipped)).sum())
+    # A few numbers: NumPy's overhead exceeds the computation, and this runs several times at every step of a plant.
+    energy = 0.0
+    for K, F, e in zip(stiffness.tolist(), limits.tolist(), error.tolist(), strict=True):
+        distance = abs(e)
+        clipped = min(distance, F / K)
+        energy += K * clipped * (distance - 0.5 * clipped)
+    return energy
 
 
 def admissible_share(

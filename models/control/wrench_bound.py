@@ -6,10 +6,13 @@ Vectors of six are [translational, rotational], in the axes of the bound. See `d
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError
+
+_POSE_ORDER = [0, 1, 2, 5, 4, 3]  # coordinates [x y z Rz Ry Rx] of a pose among those of a wrench
 
 MAX_WRENCH_SIZE = 8
 """Numbers of a bound as a signal: six along and about the axes, and the norms of force and torque."""
@@ -45,13 +48,25 @@ class WrenchBound:
         """The bound as a signal, (8,): `axes`, `force` and `torque`."""
         return np.array([*self.axes, self.force, self.torque])
 
+    @cached_property
+    def in_pose_order(self) -> WrenchBound:
+        """The bound with its axes in the order of a pose, [x y z Rz Ry Rx]."""
+        return replace(self, axes=self.axes[_POSE_ORDER])
+
     def lowered_to(self, max_wrench: np.ndarray) -> WrenchBound:
         """Return the smaller one of this bound and another, (8,), in each number; a negative or NaN number counts as 0.
 
         A bound that arrives at run time can therefore only lower the one that a robot was configured with.
         """
-        lowest = np.minimum(self.numbers, np.where(max_wrench > 0.0, max_wrench, 0.0))
-        return replace(self, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))
+        return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=16)  # several systems ask for the same bound at every step of a plant
+def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
+    requested = np.frombuffer(max_wrench)
+    lowest = np.minimum(bound.numbers, np.where(requested > 0.0, requested, 0.0))
+    lowest.setflags(write=False)
+    return replace(bound, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))
 
 
 def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: float) -> np.ndarray:

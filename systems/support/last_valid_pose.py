@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, DiscreteValues, InputPort, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period
 
@@ -37,7 +38,7 @@ class CommandValidity:
 
     def is_valid(self, context: Context, time: float) -> bool:
         """Return True if the present command is valid at `time` [s]; `context` is the system's."""
-        if not np.isfinite(self._desired_pose.Eval(context)).all():
+        if not is_finite(self._desired_pose.Eval(context)):
             return False
         if not self._command_time.HasValue(context):
             return True
