@@ -27,6 +27,13 @@ def train(
         list[str] | None,
         option("Setting of the learner, such as batch_size=128; repeatable.", "--set", metavar="name=value"),
     ] = None,
+    num_envs: Annotated[
+        int | None,
+        option(
+            "Episodes that are simulated at once in processes of their own, while this one learns; the result depends "
+            "on the number.  [default: 0, simulate and learn in turn]"
+        ),
+    ] = None,
     env: cli.Env = None,
     action_repeat: Annotated[int | None, option("Control steps per action.")] = None,
     reward: Annotated[
@@ -92,6 +99,8 @@ def train(
         driver=driver,
     )
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
+    if num_envs is not None:
+        settings["num_envs"] = str(num_envs)
     if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.datasets.validate import leaves_demonstrations
 
@@ -102,6 +111,8 @@ def train(
             raise InputError(
                 "training on hardware needs a task and a new folder: leave --resume and --human-in-the-loop out"
             )
+        if settings.get("num_envs", "0") != "0":
+            raise InputError("there is one robot: leave --num-envs out")
         from guiderail.tools.hardware.connection import RobotConnection
         from guiderail.tools.hardware.train import train_on_robot
 

@@ -8,6 +8,8 @@ import os
 import pickle
 import signal
 import sys
+import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
@@ -16,6 +18,7 @@ from typing import Any, TypeVar
 from guiderail.models.common.errors import InputError
 
 Result = TypeVar("Result")
+_PARENT_CHECKS = 0.2  # period of a fork's checks that its parent is alive [s]
 
 
 def num_cores() -> int:
@@ -36,11 +39,87 @@ def check_processes(processes: int | None) -> int:
     return processes
 
 
-def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> Iterator[Result]:
-    """Yield `compute(0)`, …, `compute(count - 1)` in this order, computed in forks of this process.
+def can_fork() -> bool:
+    """Return True if this system has forks and this process may have children."""
+    return "fork" in multiprocessing.get_all_start_methods() and not multiprocessing.current_process().daemon
 
-    A fork starts with the state of this process, and changes of its state are lost: results must not depend on the
-    order of the calls. They are computed in this process if one process is enough, or if the system cannot fork.
+
+class Forks:
+    """Forks of this process, each of which computes one result at a time.
+
+    A fork starts with the state of this process, and changes of its state are lost in this one. It exits when this
+    process ends, even if this process is killed.
+    """
+
+    def __init__(self, compute: Callable[[Any], Any], processes: int):
+        """Start the processes.
+
+        Args:
+            compute: Returns a result for an argument; both can be pickled.
+            processes: Number of processes.
+        """
+        context = multiprocessing.get_context("fork")
+        self._idle: list[Connection] = []
+        self._busy: list[Connection] = []
+        self._workers = []
+        for _ in range(processes):
+            here, there = context.Pipe()
+            self._idle.append(here)
+            arguments = (compute, there, list(self._idle), os.getpid())
+            self._workers.append(context.Process(target=_serve, args=arguments, daemon=True))
+            self._workers[-1].start()
+            there.close()
+
+    @property
+    def has_idle(self) -> bool:
+        """True if a process waits for an argument."""
+        return bool(self._idle)
+
+    def submit(self, argument: Any) -> None:
+        """Let an idle process compute a result; see `has_idle`."""
+        connection = self._idle.pop(0)
+        try:
+            connection.send(argument)
+        except (BrokenPipeError, ConnectionError):
+            raise _killed_error() from None
+        self._busy.append(connection)
+
+    def collect(self, timeout: float | None = None) -> list[Any]:
+        """Return the results that are complete, at least one unless the timeout [s] passes.
+
+        Raises:
+            KilledError: If a process was killed. An exception of `compute` is raised as it is.
+        """
+        results = []
+        for connection in wait(self._busy, timeout):
+            assert isinstance(connection, Connection)
+            try:
+                result, error, text = pickle.loads(connection.recv_bytes())
+            except (EOFError, ConnectionError):
+                raise _killed_error() from None
+            if error is not None:
+                error.add_note(text)
+                raise error
+            self._busy.remove(connection)
+            self._idle.append(connection)
+            results.append(result)
+        return results
+
+    def close(self) -> None:
+        """End the processes."""
+        for worker in self._workers:
+            worker.terminate()
+        for worker in self._workers:
+            worker.join()
+        for connection in (*self._idle, *self._busy):
+            connection.close()
+
+
+def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> Iterator[Result]:
+    """Yield `compute(0)`, …, `compute(count - 1)` in this order, computed in `Forks` of this process.
+
+    Results must not depend on the order of the calls. They are computed in this process if one process is enough, or if
+    the system cannot fork.
 
     Args:
         compute: Returns a result that can be pickled.
@@ -48,77 +127,64 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
         processes: Largest number of processes.
 
     Raises:
-        RuntimeError: If a process is killed. An exception of `compute` is raised as it is.
+        KilledError: If a process is killed. An exception of `compute` is raised as it is.
     """
     processes = min(processes, count)
-    can_fork = "fork" in multiprocessing.get_all_start_methods() and not multiprocessing.current_process().daemon
-    if processes < 2 or not can_fork:
+    if processes < 2 or not can_fork():
         yield from map(compute, range(count))
         return
-    context = multiprocessing.get_context("fork")
-    connections: list[Connection] = []
-    workers = []
-    results: dict[int, Any] = {}
+    forks = Forks(lambda index: (index, compute(index)), processes)
+    results: dict[int, Result] = {}
     assigned, given = 0, 0
     try:
-        for _ in range(processes):
-            here, there = context.Pipe()
-            connections.append(here)
-            workers.append(context.Process(target=_serve, args=(compute, there, connections), daemon=True))
-            workers[-1].start()
-            there.close()
-            here.send(assigned)
-            assigned += 1
         while given < count:
-            for connection in wait(connections):
-                assert isinstance(connection, Connection)
-                index, result = _receive(connection)
-                results[index] = result
-                if assigned < count:
-                    connection.send(assigned)
-                    assigned += 1
+            while forks.has_idle and assigned < count:
+                forks.submit(assigned)
+                assigned += 1
+            results |= dict(forks.collect())
             while given in results:
                 yield results.pop(given)
                 given += 1
     finally:
-        for worker in workers:
-            worker.terminate()
-        for worker, connection in zip(workers, connections, strict=False):
-            worker.join()
-            connection.close()
+        forks.close()
 
 
-def _receive(connection: Connection) -> tuple[int, Any]:
-    try:
-        index, result, error, text = pickle.loads(connection.recv_bytes())
-    except (EOFError, ConnectionError):
-        raise RuntimeError("a process that evaluated episodes was killed: give a smaller --processes") from None
-    if error is not None:
-        error.add_note(text)
-        raise error
-    return index, result
+class KilledError(RuntimeError):
+    """Error for a fork that was killed."""
 
 
-def _serve(compute: Callable[[int], Any], connection: Connection, others: Sequence[Connection]) -> None:
-    """Answer each index with its result until the other end is closed."""
+def _killed_error() -> KilledError:
+    return KilledError("a process that simulated episodes was killed: give fewer processes, or more memory")
+
+
+def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequence[Connection], parent: int) -> None:
+    """Answer each argument with its result until the other end is closed."""
     for one in others:
         one.close()  # ends of the parent, which would keep this process alive after it
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its processes
+    # Locks of files that the parent holds are held by its forks, too.
+    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     gc.freeze()  # a collection would visit, and so copy, everything that the parent has built
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)  # threads of the parent do not exist here
     while True:
         try:
-            index = connection.recv()
+            argument = connection.recv()
         except EOFError:
             return
         try:
-            answer = pickle.dumps((index, compute(index), None, ""))
+            answer = pickle.dumps((compute(argument), None, ""))
         except Exception as error:
             text = traceback.format_exc()
             try:
-                answer = pickle.dumps((index, None, error, text))
+                answer = pickle.dumps((None, error, text))
                 pickle.loads(answer)
             except Exception:
-                answer = pickle.dumps((index, None, RuntimeError(f"{type(error).__name__}: {error}"), text))
+                answer = pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}"), text))
         connection.send_bytes(answer)
+
+
+def _exit_with_parent(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_PARENT_CHECKS)
+    os._exit(1)

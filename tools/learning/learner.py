@@ -60,12 +60,16 @@ class LearnerConfig:
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
         pipelined: Learn in a second process while the next episode is simulated, with weights that are one episode
             older. Deterministic as well.
+        num_envs: Number N of processes that simulate episodes while this one learns. Episode k is acted with the
+            weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
+            learn in turn.
     """
 
     algorithm: str
     demonstration_episodes: NonNegative = 0
     symmetry: bool | Literal["near"] = False
     pipelined: bool = False
+    num_envs: Annotated[NonNegative, Field(le=1024)] = 0
 
 
 class Learner(Callback, ABC):

@@ -160,6 +160,8 @@ class OffPolicyLearner(Learner):
         transitions: Number of transitions so far.
         episodes: Number of episodes so far.
         random: Generator of exploration.
+        is_greedy: True in an episode that does not explore.
+        greedy_successes: Number of consecutive successes in greedy episodes.
     """
 
     Config = OffPolicyConfig
@@ -227,9 +229,9 @@ class OffPolicyLearner(Learner):
         self.averaged = copy.deepcopy(self.model.actor) if config.actor_ema else None
         self.selection = CheckpointSelection(config.selection_window) if config.selection_window else None
         self.episodes = 0
-        self._is_greedy = False  # this episode does not explore
+        self.is_greedy = False
         self._has_transition = False  # this episode has a transition in the replay buffer
-        self._greedy_successes = 0  # consecutive
+        self.greedy_successes = 0
         self._constant_action: np.ndarray | None = None  # the action of a constant episode
         self._extended_action: np.ndarray | None = None
         self._extended_steps = 0  # actions for which the extended action still lasts
@@ -250,10 +252,17 @@ class OffPolicyLearner(Learner):
         own = self.episodes - self.config.demonstration_episodes  # a demonstrator acts in the episodes before
         self._constant_action = self._uniform() if 0 < own <= self.config.constant_episodes else None
         is_due = int(self.episodes * fraction) > int((self.episodes - 1) * fraction)
-        self._is_greedy = is_due and own > 0 and self._constant_action is None and self.is_learning()
+        self.is_greedy = is_due and own > 0 and self._constant_action is None and self.is_learning()
         self._extended_steps = 0
-        if self.selection is not None and self._is_greedy:
-            self.selection.begin(self.actor(), self._greedy_successes)
+        if self.selection is not None and self.is_greedy:
+            self.selection.begin(self.actor(), self.greedy_successes)
+
+    def start_recorded(self, is_greedy: bool, actor: torch.nn.Module) -> None:
+        """Start an episode that was acted elsewhere, by `actor`, and is learned from now."""
+        self.episodes += 1
+        self._has_transition, self.is_greedy = False, is_greedy
+        if self.selection is not None and is_greedy:
+            self.selection.begin(actor, self.greedy_successes)
 
     def on_step(self, transition: Transition) -> None:
         """Store a transition and train if it is due.
@@ -274,15 +283,15 @@ class OffPolicyLearner(Learner):
         """End an episode; one with interventions of a supervisor does not count for the checkpoint selection."""
         if row.get("interventions"):
             self.exclude_episode()
-        elif self._is_greedy:
-            self._greedy_successes = self._greedy_successes + 1 if row["success"] else 0
+        elif self.is_greedy:
+            self.greedy_successes = self.greedy_successes + 1 if row["success"] else 0
             if self.selection is not None:
                 self.selection.finish(bool(row["success"]))
         return {}
 
     def exclude_episode(self) -> None:
         """End an episode that does not count for the checkpoint selection, as if it had not been greedy."""
-        if self._is_greedy and self.selection is not None:
+        if self.is_greedy and self.selection is not None:
             self.selection.exclude()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -293,7 +302,7 @@ class OffPolicyLearner(Learner):
             return self._uniform()
         if self._num_privileged:  # the actor ignores these entries
             observation = np.concatenate([observation, np.zeros(self._num_privileged, observation.dtype)])
-        if not self._is_greedy:
+        if not self.is_greedy:
             extended = self._temporally_extended()
             return self.explore(observation) if extended is None else extended
         with torch.no_grad():
@@ -310,7 +319,7 @@ class OffPolicyLearner(Learner):
         which a policy has settled, such as free space, and shows the value of continuing in one direction.
         """
         if self._extended_steps == 0:
-            is_over = 0 < self.config.ez_greedy_until <= self._greedy_successes
+            is_over = 0 < self.config.ez_greedy_until <= self.greedy_successes
             if is_over or not self.config.ez_greedy or self.random.random() >= self.config.ez_greedy:
                 return None
             self._extended_steps = int(self.random.integers(1, self.config.ez_greedy_longest + 1))
@@ -423,7 +432,7 @@ class OffPolicyLearner(Learner):
         return arrays | generators, states | {
             "transitions": self.transitions,
             "episodes": self.episodes,
-            "greedy_successes": self._greedy_successes,
+            "greedy_successes": self.greedy_successes,
             "selection": selection,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
@@ -445,7 +454,7 @@ class OffPolicyLearner(Learner):
         if self.config.demonstration_fraction:
             buffer.num_demonstrated = values["demonstrated"]
         self.transitions, self.model._n_updates = values["transitions"], values["updates"]
-        self.episodes, self._greedy_successes = values["episodes"], values["greedy_successes"]
+        self.episodes, self.greedy_successes = values["episodes"], values["greedy_successes"]
         if self.selection is not None:
             actors = {key.removeprefix("selection/"): v for key, v in tensors.items() if key.startswith("selection/")}
             self.selection.restore(actors, values["selection"])

@@ -8,7 +8,6 @@ import signal
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -23,10 +22,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.evaluation.step_log import write_step_log
+from guiderail.tools.learning.actors import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
-
-Weights = dict[str, dict[str, np.ndarray]]
 
 
 class PipelinedLearner(Learner):
@@ -108,16 +106,8 @@ class PipelinedLearner(Learner):
         self._acting.on_episode_start()
 
     def on_step(self, transition: Transition) -> None:
-        """Keep a transition until the end of the episode, when it is known whether the episode is learned from.
-
-        If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
-        """
-        if "simulation_failure" in transition.info:
-            if self._transitions:
-                self._transitions[-1] = replace(self._transitions[-1], truncated=True)
-            return
-        self._transitions.append(replace(transition, info={}))
-        self._acting.transitions += 1
+        """Keep a transition until the end of the episode, when it is known whether the episode is learned from."""
+        self._acting.transitions += record_transition(self._transitions, transition)
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """End an episode; an excluded episode does not advance the exploration state."""
@@ -221,8 +211,7 @@ class PipelinedLearner(Learner):
 
     def _receive_weights(self) -> None:
         weights, self._metrics = self._receive()
-        for name, module in _modules(self._acting).items():
-            module.load_state_dict({key: torch.from_numpy(value) for key, value in weights[name].items()})
+        load_weights(self._acting, weights)
         self.known += 1
 
 
@@ -243,18 +232,6 @@ class SpacesOnlyEnv(gymnasium.Env):
 
 def _process_ended_error() -> InputError:
     return InputError("the training process has ended: resume from the last checkpoint, if there is one")
-
-
-def _modules(learner: OffPolicyLearner) -> dict[str, Any]:
-    modules = {"actor": learner.model.actor}
-    return modules if learner.averaged is None else modules | {"averaged": learner.averaged}
-
-
-def _weights(learner: OffPolicyLearner) -> Weights:
-    return {
-        name: {key: value.detach().numpy().copy() for key, value in module.state_dict().items()}
-        for name, module in _modules(learner).items()
-    }
 
 
 def _serve(
@@ -301,7 +278,7 @@ def _learn(
             learner.on_step(transition)
     except InputError as error:
         return error
-    return _weights(learner), learner.metrics()
+    return copy_weights(learner), learner.metrics()
 
 
 def _restore(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> str | None:

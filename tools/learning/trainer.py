@@ -12,6 +12,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.actors import ParallelLearner
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
 from guiderail.tools.learning.learner import LEARNERS, Learner, LearningLog, divergence_error, learner_arguments
@@ -63,6 +64,11 @@ def run_training(
             the package of a log format is missing; or for an error in an episode: if it is the first one, a folder that
             did not exist before is removed.
     """
+    if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
+        raise InputError(
+            "parallel actors have no supervisor and are pipelined already: leave num_envs, or pipelined and "
+            "--human-in-the-loop, out"
+        )
     if config.human_in_the_loop and supervisor is None:
         raise InputError("this run has a supervisor: give --human-in-the-loop")
     if config.learner.demonstration_episodes and demonstrator is None:
@@ -95,13 +101,15 @@ def run_training(
         if sb3_callbacks is not None:
             from guiderail.tools.learning.sb3_callbacks import Sb3Callbacks
 
-            if config.learner.pipelined:
-                raise InputError("callbacks need the model in this process: leave the setting pipelined out")
+            if config.learner.pipelined or config.learner.num_envs:
+                raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
             callbacks = Sb3Callbacks(sb3_callbacks, learner)
         with folder.locked():
             if config.learner.pipelined:
                 child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
                 learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
+            elif config.learner.num_envs:
+                learner = _parallel(folder, config, env, learner, demonstrator)
             learner.records_metrics = bool(log)
             if not resume:
                 folder.create(config)
@@ -121,6 +129,17 @@ def run_training(
         learning_log.close()
         learner.close()
         env.close()
+
+
+def _parallel(
+    folder: RunFolder, config: RunConfig, env: gymnasium.Env, learner: Learner, demonstrator: Demonstrator | None
+) -> ParallelLearner:
+    demonstrations = config.learner.demonstration_episodes
+    return ParallelLearner(
+        learner, env, num_envs=config.learner.num_envs, seed=config.seed, num_episodes=config.episodes,
+        demonstrator=(demonstrator(env), demonstrations) if demonstrator is not None and demonstrations else None,
+        callbacks=(StepLog(env, folder.steps),) if config.step_log else (),
+    )  # fmt: skip
 
 
 def _train(
@@ -157,7 +176,9 @@ def _train(
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
         act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner.act
-        if supervised is None:
+        if isinstance(learner, ParallelLearner):
+            row = learner.episode(episode)
+        elif supervised is None:
             row = rollout(env, act, learner, *callbacks, index=episode)
         else:
             row = supervised.rollout(act, learner, *callbacks, index=episode)

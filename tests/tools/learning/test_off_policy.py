@@ -347,9 +347,9 @@ def test_episode_with_interventions_is_not_selected(config):
     learn_from_random_transitions(learner, 2)
     for interventions, row in ((0, 1), (2, 1), (0, 2)):
         learner.on_episode_start()
-        assert learner._is_greedy
+        assert learner.is_greedy
         learner.on_episode_end({"success": 1, "interventions": interventions})
-        assert learner._greedy_successes == row
+        assert learner.greedy_successes == row
     assert len(learner.selection._open) == 2
 
 

@@ -1,0 +1,98 @@
+"""Parallel actors, which simulate episodes in forks of the learning process."""
+
+import os
+import signal
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.learning.actors import ParallelLearner
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.trainer import run_training
+from oracles.same_runs import differences
+
+
+@pytest.fixture
+def parallel_config(bead_config):
+    """Return the configuration of a run of 8 episodes with greedy and constant ones, for a number of actors."""
+
+    def config(num_envs, **settings):
+        more = {"greedy_episode_fraction": 0.5, "selection_window": 2, "num_envs": num_envs, **settings}
+        return replace(bead_config, learner=replace(bead_config.learner, **more))
+
+    return config
+
+
+def rows(folder):
+    return pd.DataFrame(folder.episodes()).drop(columns="wall_time")
+
+
+class Stop(Exception):
+    pass
+
+
+def stop(row):
+    if row["episode"] == 4:
+        raise Stop
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_run_with_actors_resumes_bit_for_bit(num_envs, parallel_config, tmp_path):
+    """The stopped run has episodes in simulation that nothing was learned from; they are simulated again."""
+    config = parallel_config(num_envs)
+    whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
+    run_training(whole, config)
+    with pytest.raises(Stop):
+        run_training(stopped, config, report=stop)
+    run_training(stopped, config, resume=True)
+    assert differences(whole.path, stopped.path) == []
+
+
+def test_actors_act_with_weights_of_a_fixed_age(parallel_config, tmp_path):
+    folders = {number: RunFolder(tmp_path / str(number)) for number in (1, 2)}
+    for number, folder in folders.items():
+        # Learning starts within the first episode, and constant episodes are independent of the weights.
+        run_training(folder, parallel_config(number, learning_starts=1, constant_episodes=0))
+    one, two = (rows(folder) for folder in folders.values())
+    pd.testing.assert_frame_equal(one[:2], two[:2])  # acted before anything was learned
+    assert not one[2:3].equals(two[2:3])  # acted with what was learned from episode 0 with one actor only
+
+
+def test_demonstrator_acts_in_actors(parallel_config, tmp_path):
+    config = parallel_config(2, demonstration_episodes=2)
+    found = run_training(
+        RunFolder(tmp_path / "run"), config, demonstrator=lambda env: lambda seen: env.action_space.low
+    )
+    assert [row["is_demonstration"] for row in found] == [1, 1, 0, 0, 0, 0, 0, 0]
+
+
+def test_killed_actor_ends_the_run_with_one_sentence(parallel_config, tmp_path, monkeypatch):
+    monkeypatch.setattr(ParallelLearner, "_simulate", lambda self, assignment: os.kill(os.getpid(), signal.SIGKILL))
+    with pytest.raises(InputError, match="an actor was killed: resume"):
+        run_training(RunFolder(tmp_path / "run"), parallel_config(2))
+
+
+def test_error_of_an_actor_is_raised_here(parallel_config, tmp_path, monkeypatch):
+    def refuse(self, assignment):
+        raise InputError("it is refused")
+
+    monkeypatch.setattr(ParallelLearner, "_simulate", refuse)
+    with pytest.raises(InputError, match="it is refused"):
+        run_training(RunFolder(tmp_path / "run"), parallel_config(2))
+    assert not (tmp_path / "run").exists()
+
+
+def test_diverged_run_with_actors_is_reported(parallel_config, tmp_path):
+    with pytest.raises(InputError, match="learning diverged"):
+        run_training(RunFolder(tmp_path / "run"), parallel_config(2, learning_rate=1e30, constant_episodes=0))
+
+
+def test_actors_are_refused_when_they_cannot_be(parallel_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    with pytest.raises(InputError, match="pipelined already"):
+        run_training(folder, parallel_config(2, pipelined=True))
+    with pytest.raises(InputError, match="callbacks need model and episodes"):
+        run_training(folder, parallel_config(2), sb3_callbacks=[])
+    assert not folder.path.exists()

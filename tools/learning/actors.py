@@ -1,0 +1,262 @@
+"""Parallel actors: episodes are simulated in forks of this process while it learns."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3.common.utils import set_random_seed
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, rollout
+from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.off_policy import OffPolicyLearner
+
+Weights = dict[str, dict[str, np.ndarray]]
+
+
+class Snapshot(NamedTuple):
+    """What an actor needs of a learner.
+
+    Attributes:
+        weights: Parameters by module and name.
+        transitions: Number of transitions that the learner has learned from.
+        greedy_successes: Number of consecutive successes in greedy episodes.
+    """
+
+    weights: Weights
+    transitions: int
+    greedy_successes: int
+
+
+class SimulatedEpisode(NamedTuple):
+    """Episode of an actor.
+
+    Attributes:
+        number: Number of the episode.
+        row: Its row in the table of the run.
+        transitions: Its transitions.
+        is_greedy: True if it did not explore.
+    """
+
+    number: int
+    row: dict[str, Any]
+    transitions: list[Transition]
+    is_greedy: bool
+
+
+class ParallelLearner(Learner):
+    """Learner whose episodes are simulated by N actors, forks of this process, while it learns in this one.
+
+    Episode k is acted with the weights learned from the episodes before k − N, in their order; its random numbers
+    depend on the seed and k alone. The result of a run therefore depends on N but not on the timing of the processes,
+    and the conditions of episode k do not depend on N. N = 1 simulates an episode while it learns from the one before.
+    """
+
+    def __init__(
+        self,
+        learner: Learner,
+        env: gymnasium.Env,
+        *,
+        num_envs: int,
+        seed: int,
+        num_episodes: int,
+        demonstrator: tuple[PolicyFn, int] | None = None,
+        callbacks: tuple[Callback, ...] = (),
+    ):
+        """Construct the learner; the actors start with the first episode.
+
+        Args:
+            learner: Learner, which learns in this process.
+            env: Environment, already reset once: what is constant in the run is sampled.
+            num_envs: Number N of actors.
+            seed: Seed of the run.
+            num_episodes: Number of episodes of the run.
+            demonstrator: Policy that acts in the first episodes instead, and their number.
+            callbacks: Callbacks of the episodes, in the actor's process.
+
+        Raises:
+            InputError: If the learner is not an `OffPolicyLearner`, or the system cannot fork.
+        """
+        if not isinstance(learner, OffPolicyLearner):
+            raise InputError("only an off-policy learner has parallel actors: choose sac or tqc, or --num-envs 0")
+        if not can_fork():
+            raise InputError("parallel actors are forks, which this process cannot have: leave num_envs out")
+        self._learner, self._env, self._num_envs, self._seed = learner, env, num_envs, seed
+        self._num_episodes, self._demonstrator, self._callbacks = num_episodes, demonstrator, callbacks
+        self._forks: Forks | None = None
+        self._learned = self._assigned = 0  # numbers of episodes
+        self._simulated: dict[int, SimulatedEpisode] = {}
+        self._snapshots = {0: _snapshot(learner)}  # by the number of episodes learned from
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action (A,) of the learner."""
+        return self._learner.act(observation)
+
+    def episode(self, index: int) -> dict[str, Any]:
+        """Learn from episode `index`, the next one, and return its row."""
+        try:
+            return self._learn(index)
+        except KilledError:
+            raise InputError("an actor was killed: resume the run, which continues from its last checkpoint") from None
+
+    def _learn(self, index: int) -> dict[str, Any]:
+        if self._forks is None:
+            self._forks = Forks(self._simulate, min(self._num_envs, self._num_episodes - index))
+        while index not in self._simulated:
+            self._exchange(None)
+        learner, episode = self._learner, self._simulated.pop(index)
+        weights, actor = self._snapshots[self._required(index)].weights, copy.deepcopy(learner.actor())
+        _load_module(actor, weights.get("averaged", weights["actor"]))
+        learner.start_recorded(episode.is_greedy, actor)
+        for transition in episode.transitions:
+            learner.on_step(transition)
+            self._exchange(0.0)  # an actor must not wait for the end of the training
+        row = {**episode.row, **learner.on_episode_end(episode.row)}
+        self._learned += 1
+        self._snapshots[self._learned] = _snapshot(learner)
+        for old in [number for number in self._snapshots if number < self._required(self._learned)]:
+            del self._snapshots[old]
+        self._exchange(0.0)
+        return row
+
+    def _required(self, index: int) -> int:
+        """Return the number of episodes that the weights of an episode are learned from."""
+        return max(0, index - self._num_envs)
+
+    def _exchange(self, timeout: float | None) -> None:
+        """Assign episodes to idle actors, and collect simulated ones; at most `timeout` [s], or until there is one."""
+        assert self._forks is not None
+        while self._forks.has_idle and self._assigned < self._num_episodes:
+            if (required := self._required(self._assigned)) > self._learned:
+                break
+            self._forks.submit((self._assigned, self._snapshots[required]))
+            self._assigned += 1
+        for episode in self._forks.collect(timeout):
+            self._simulated[episode.number] = episode
+
+    def _simulate(self, assignment: tuple[int, Snapshot]) -> SimulatedEpisode:
+        """Run an episode, in a fork."""
+        (index, snapshot), learner = assignment, self._learner
+        conditions, exploration, process = np.random.SeedSequence([self._seed, index]).spawn(3)
+        self._env.unwrapped.np_random = np.random.default_rng(conditions)
+        learner.random = np.random.default_rng(exploration)
+        set_random_seed(int(process.generate_state(1)[0]))  # of the process, which Stable-Baselines3 samples from
+        load_weights(learner, snapshot.weights)
+        learner.episodes, learner.transitions = index, snapshot.transitions
+        learner.greedy_successes, learner.selection = snapshot.greedy_successes, None
+        act: PolicyFn = learner.act
+        if self._demonstrator is not None and index < self._demonstrator[1]:
+            act = self._demonstrator[0]
+        recorder = _EpisodeRecorder(learner)
+        row = rollout(self._env, act, recorder, *self._callbacks, index=index)
+        return SimulatedEpisode(index, row, recorder.transitions, learner.is_greedy)
+
+    def close(self) -> None:
+        """End the actors."""
+        if self._forks is not None:
+            self._forks.close()
+
+    def metrics(self) -> Mapping[str, float]:
+        """Return what the learner recorded since the last call."""
+        self._learner.records_metrics = self.records_metrics
+        return self._learner.metrics()
+
+    def policy(self, description: Mapping[str, Any]) -> Policy:
+        """Return the policy of the learner; `description` holds further entries of its description."""
+        return self._learner.policy(description)
+
+    def has_diverged(self) -> bool:
+        """Return True if a parameter of the learner is NaN or infinite."""
+        return self._learner.has_diverged()
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return the state of the learner, and the snapshots that the next episodes are acted with."""
+        arrays, values = self._learner.state()
+        stored = {f"learner/{name}": array for name, array in arrays.items()}
+        for number, module, name, array in self._snapshot_arrays():
+            stored[f"snapshot/{number}/{module}/{name}"] = array
+        snapshots = {str(number): [one.transitions, one.greedy_successes] for number, one in self._snapshots.items()}
+        return stored, {"learner": values, "learned": self._learned, "snapshots": snapshots}
+
+    def _snapshot_arrays(self) -> Iterator[tuple[int, str, str, np.ndarray]]:
+        for number, snapshot in self._snapshots.items():
+            for module, weights in snapshot.weights.items():
+                for name, array in weights.items():
+                    yield number, module, name, array
+
+    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Set the state to what `state` returned; episodes that were simulated ahead are simulated again."""
+        parts: dict[str, dict[str, np.ndarray]] = {"learner": {}, "snapshot": {}}
+        for name, array in arrays.items():
+            part, _, rest = name.partition("/")
+            parts[part][rest] = array
+        self._learner.restore(parts["learner"], values["learner"])
+        weights: dict[int, Weights] = {}
+        for name, array in parts["snapshot"].items():
+            number, module, rest = name.split("/", 2)
+            weights.setdefault(int(number), {}).setdefault(module, {})[rest] = array
+        self._snapshots = {number: Snapshot(weights[number], *values["snapshots"][str(number)]) for number in weights}
+        self._learned = self._assigned = values["learned"]
+
+
+class _EpisodeRecorder(Callback):
+    """Record of an episode's transitions, which starts the episode of the acting learner."""
+
+    def __init__(self, learner: OffPolicyLearner):
+        self._learner = learner
+        self.transitions: list[Transition] = []
+
+    def on_episode_start(self) -> None:
+        self._learner.on_episode_start()
+
+    def on_step(self, transition: Transition) -> None:
+        record_transition(self.transitions, transition)
+
+
+def record_transition(transitions: list[Transition], transition: Transition) -> bool:
+    """Append a transition that is learned from later; return False if there is nothing to learn from it.
+
+    If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
+    """
+    if "simulation_failure" in transition.info:
+        if transitions:
+            transitions[-1] = replace(transitions[-1], truncated=True)
+        return False
+    transitions.append(replace(transition, info={}))
+    return True
+
+
+def _modules(learner: OffPolicyLearner) -> dict[str, Any]:
+    modules = {"actor": learner.model.actor}
+    return modules if learner.averaged is None else modules | {"averaged": learner.averaged}
+
+
+def copy_weights(learner: OffPolicyLearner) -> Weights:
+    """Return a copy of the weights that a learner acts with."""
+    return {
+        name: {key: value.detach().numpy().copy() for key, value in module.state_dict().items()}
+        for name, module in _modules(learner).items()
+    }
+
+
+def load_weights(learner: OffPolicyLearner, weights: Weights) -> None:
+    """Set the weights that a learner acts with."""
+    for name, module in _modules(learner).items():
+        _load_module(module, weights[name])
+
+
+def _load_module(module: torch.nn.Module, weights: Mapping[str, np.ndarray]) -> None:
+    shapes = {key: value.shape for key, value in module.state_dict().items()}  # files have no array without axes
+    module.load_state_dict({key: torch.from_numpy(value).reshape(shapes[key]) for key, value in weights.items()})
+
+
+def _snapshot(learner: OffPolicyLearner) -> Snapshot:
+    return Snapshot(copy_weights(learner), learner.transitions, learner.greedy_successes)
