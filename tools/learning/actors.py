@@ -23,7 +23,7 @@ Weights = dict[str, dict[str, np.ndarray]]
 
 
 class Snapshot(NamedTuple):
-    """What an actor needs of a learner.
+    """State of a learner that an actor needs.
 
     Attributes:
         weights: Parameters by module and name.

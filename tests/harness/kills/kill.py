@@ -42,7 +42,7 @@ SMALL = [
 ]
 RUNS = {
     "NarrowPassage": ["--guidance", "kgrl", "--preset", "tqc_fast", "--episodes", "12", *SMALL],
-    "GridClamp": ["--episodes", "6", *SMALL],
+    "GridClamp": ["--episodes", "6", "--num-envs", "2", *SMALL],  # parallel actors
     "Pouring": ["--episodes", "8", *SMALL],
 }
 KILLS_OF_A_RUN = 7
