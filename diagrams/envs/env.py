@@ -116,7 +116,7 @@ class DiagramEnv(DrakeGymEnv):
         view = None if render_mode != "human" or task.query is None else View(task.query)
         self.task = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
-        # The parent class writes into `metadata`: an instance of our own keeps that from all other environments.
+        # The parent class writes into `metadata`: a copy keeps this from all other environments.
         self.metadata = {
             "render_modes": ["human", "rgb_array"],
             "render_fps": round(1 / (action_repeat * task.control_period)),

@@ -61,7 +61,7 @@ def make_guidance(task: Task, station: Station) -> Diagram:
 def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledge:
     """Return the prior knowledge that an environment's guidance is built from, such as its primitive or template.
 
-    The arguments are those of `make_env`, and so are the errors.
+    The arguments and errors are those of `make_env`.
     """
     declared = _config(task, options).make_task()
     return build_prior_knowledge(declared, make_station(declared))
@@ -79,7 +79,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
         options: Options of the environment, if `task` is not a configuration; `guiderail list TASK` lists them.
 
     Raises:
-        InputError: If a name is unknown, a value is out of range, or options do not go together.
+        InputError: If a name is unknown, a value is out of range, or options are incompatible.
     """
     check_render_mode(render_mode)
     config = _config(task, options)

@@ -44,7 +44,7 @@ def check_rate(rate: float) -> None:
         InputError: If it is not positive, or above 1.
     """
     if not 0.0 < rate <= 1.0:
-        raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {rate:g}")
+        raise InputError(f"the rate of a simulated robot's clock is positive and at most 1, not {rate:g}")
 
 
 class IntervalHistogram:

@@ -134,7 +134,7 @@ class Driver(ABC):
         raise InputError(f"the driver {self.name} transports no heartbeat of a safety monitor")
 
     def __str__(self) -> str:
-        """Return where the robot is listened to, for messages."""
+        """Return the address at which the robot is reached, for messages."""
         return self.url or self.name
 
 

@@ -123,7 +123,7 @@ class Task(ABC):
     pushable: ClassVar[bool] = True
 
     def __init__(self, config: EnvConfig):
-        """Construct the task; a subclass may refuse options that do not go together.
+        """Construct the task; a subclass may refuse incompatible options.
 
         Args:
             config: Configuration of the environment.

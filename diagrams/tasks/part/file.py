@@ -36,7 +36,7 @@ HARD: dict[str, Any] = {
     "observation": "center_of_pressure",
     "action_repeat": 5,
 }
-"""Options of difficulty="hard": the socket is farther off than a chamfer catches, in every episode elsewhere."""
+"""Options of difficulty="hard": the socket is farther off than a chamfer catches, and elsewhere in every episode."""
 
 AUTOMATE: dict[str, Any] = {
     "fixture_offset": "per_episode",

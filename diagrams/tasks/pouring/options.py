@@ -114,7 +114,7 @@ class PouringOptions(Options):
         )
 
     def check(self) -> None:
-        """Refuse options that do not go together.
+        """Refuse incompatible options.
 
         Raises:
             InputError: If the least error is larger than the largest one, more balls are needed than there are, or the
