@@ -114,7 +114,7 @@ def test_wall_clock_scales_time_by_the_rate():
     assert slow.clocks[1] - slow.clocks[0] >= 1.5 * STATUS_PERIOD
     assert slow.clocks[0] == pytest.approx(0.25 * fast.clocks[0], rel=0.01)
     for rate in (0.0, 1.1, np.nan):
-        with pytest.raises(InputError, match="rate up to 1 of the wall's"):
+        with pytest.raises(InputError, match="positive and at most 1"):
             WallClock(Statuses(DrakeLcm("memq://")), rate=rate)
 
 
