@@ -68,7 +68,7 @@ def test_it_is_small_enough_to_be_worth_it():
     assert sum(len(path.read_text().splitlines()) for path in files) <= LINES
 
 
-def test_no_file_of_guiderail_knows_it():
+def test_no_file_of_guiderail_names_it():
     root = Path(__file__).parents[2]
     for folder in ("models", "systems", "diagrams", "tools", "src"):
         assert not [path for path in (root / folder).rglob("*.py") if "peglab" in path.read_text()]

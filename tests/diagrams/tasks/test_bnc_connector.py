@@ -73,7 +73,7 @@ def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
     assert evaluate_policy(skgrl, zero_policy(skgrl), episodes=1, options=NEW_RUN)["success"].sum() == 0
 
 
-def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
+def test_torque_search_finds_a_hidden_jack(skgrl):
     rows = evaluate_policy(skgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
     assert rows["success"].sum() == 1
     assert rows["max_commanded_violation"].max() <= 1e-9

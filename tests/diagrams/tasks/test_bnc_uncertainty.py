@@ -48,6 +48,6 @@ def test_the_plug_in_the_tool_is_tilted():
     assert tilt == pytest.approx(np.linalg.norm(info["grasp_offset"][2:]), rel=1e-3)
 
 
-def test_a_rule_that_feels_the_torque_locks_a_tilted_plug_too():
+def test_torque_search_locks_a_tilted_plug():
     env = make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode", grasp_angle=1.0)
     assert evaluate_policy(env, scripted_torque_search, episodes=2, options={"new_run": True})["success"].sum() == 2

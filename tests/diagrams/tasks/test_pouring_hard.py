@@ -87,7 +87,7 @@ def test_recomputed_commands_are_inside_the_constraints(env):
         assert template.violation(state, desired, frames) <= 1e-9
 
 
-def test_the_error_is_drawn_anew_in_its_ring_and_seen(env):
+def test_mug_error_is_resampled_in_its_ring_and_observed(env):
     errors = []
     for held_out in (False, True) * 4:
         observation, drawn = env.reset(options={"held_out": held_out})

@@ -52,7 +52,7 @@ def test_success_interval_is_that_of_wilson(successes, number):
     np.testing.assert_allclose(list(found.values()), [middle - half, middle + half], atol=1e-12)
 
 
-def test_summary_knows_the_statistics_of_the_task():
+def test_summary_has_the_statistics_of_the_task():
     rows = episodes("1" * 7, reward_obstacle_cost=[-9.0, *6 * [-0.5]])
     assert summary(rows, ["avoids_obstacle_from"], task="NarrowPassage") == {"avoids_obstacle_from": 2}
     with pytest.raises(InputError, match="no statistic 'avoids_obstacle_from'"):

@@ -69,7 +69,7 @@ def test_every_command_satisfies_the_constraints_for_any_actions(guidance, seed)
     assert np.abs(local[:, 1] + 0.13).min() < 1e-6  # the last policy reaches the bound
 
 
-def test_residual_leaves_the_constraints_and_says_so():
+def test_residual_leaves_the_constraints_and_reports_it():
     infos = episode(guided("residual", action_scale=5.0), lambda k: np.array([0.0, 1.0, 0.0]))
     assert max(info["constraint_violation"] for info in infos[1:]) > 0.02
 

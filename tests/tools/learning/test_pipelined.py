@@ -47,7 +47,7 @@ def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
         student.finish()
 
 
-def test_pipelined_learner_knows_episodes_two_later(forkserver):
+def test_pipelined_learner_learns_episodes_two_later(forkserver):
     student, acting = made(excluded=("stopped",))
     before = acting.actor().state_dict()["mu.weight"].clone()
     rng, last = np.random.default_rng(0), {"success": False}
