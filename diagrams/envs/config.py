@@ -37,6 +37,7 @@ class EnvConfig:
         observation: Name of the observation.
         difficulty: Name of the difficulty.
         action_repeat: Control steps per action.
+        control_period: Time between commands [s]; None: that of the task's station.
         parts: All other options by the part that they configure: "task", "station", "primitive", "template",
             "guidance" and "disturbances".
     """
@@ -48,6 +49,7 @@ class EnvConfig:
     observation: str
     difficulty: str
     action_repeat: int
+    control_period: float | None
     parts: Mapping[str, Options] = field(hash=False)
 
     @classmethod

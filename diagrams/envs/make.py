@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 from collections import defaultdict
 from collections.abc import Callable, Hashable
@@ -47,10 +48,20 @@ def make_station(task: Task) -> Station:
         raise InputError(
             f"workcell() of {task.name} returns nothing: let it return what station={kind.name!r} works on"
         )
-    build, disturbances = partial(kind.build, workcell, **config.part("station")), config.parts["disturbances"]
-    if not isinstance(disturbances, Disturbances):
-        return build()
-    return disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
+    arguments = config.part("station")
+    if config.control_period is not None and "control_period" in inspect.signature(kind.build).parameters:
+        arguments["control_period"] = task.control_period
+    build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
+    if isinstance(disturbances, Disturbances):
+        station = disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
+    else:
+        station = build()
+    if config.control_period is not None and station.nominal_period != task.control_period:
+        raise InputError(
+            f"station={kind.name!r} has a control period of {station.nominal_period:g} s: leave control_period out, or "
+            "give the station's builder that parameter"
+        )
+    return station
 
 
 def make_guidance(task: Task, station: Station) -> Diagram:

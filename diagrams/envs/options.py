@@ -52,6 +52,9 @@ class CommonOptions(Options):
     observation: str = Field("", description="observation of the policy")
     difficulty: str = Field(STANDARD, description="one of the difficulties that the task declares")
     action_repeat: Integer = Field(1, ge=1, description="control steps per action")
+    control_period: Number | None = Field(
+        None, ge=0.005, le=0.5, description="time between commands [s]; default: that of the task's station"
+    )
 
 
 class PrimitiveOptions(Options):

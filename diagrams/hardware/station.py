@@ -19,13 +19,15 @@ from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_ra
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.impedance_control import add_controller, add_energy_tank
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     Impedance,
     Station,
+    command_timeout,
     export_station_ports,
+    tare_steps,
     to_wrench_order,
+    whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
@@ -103,6 +105,7 @@ class HardwareStation(Station):
         limits: SafetyLimits | None = None,
         status_limits: StatusLimits | None = None,
         tare: bool = False,
+        control_period: float = CONTROL_PERIOD,
     ):
         """Construct the station.
 
@@ -122,10 +125,11 @@ class HardwareStation(Station):
                 driver's hold-off.
             tare: Subtract the wrench that is measured after the start, when the tool must be free, from the output
                 `wrench`. The limits of safety use the wrench without it.
+            control_period: Time between commands of a skill [s], a whole multiple of `period`.
 
         Raises:
-            InputError: If the robot has no driver, the address is unusable, or the settling time is shorter than the
-                driver's hold-off.
+            InputError: If the robot has no driver, the address is unusable, the settling time is shorter than the
+                driver's hold-off, or the control period is no multiple of the driver's.
         """
         super().__init__()
         robot = find_robot(robot)
@@ -133,6 +137,8 @@ class HardwareStation(Station):
             driver = find_driver(driver or robot)(robot_url)
         self.driver = driver
         self.period = period = driver.period if period is None else period
+        self.control_period = control_period
+        whole_multiple(control_period, period)
         self.controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         plant = self.controller_plant.plant
         self.limits = limits or safety_limits(plant, driver)
@@ -169,7 +175,7 @@ class HardwareStation(Station):
                 time_constant=self._wrench_time_constant,
             ),
         )
-        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period))
+        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period, command_timeout(self.control_period)))
         rate_limiter = builder.AddNamedSystem("rate_limiter", make_rate_limiter(self.driver, period))
         controller, impedance_monitor = add_controller(builder, model, self.impedance, period, compensate_gravity=False)
         tank = add_energy_tank(builder, self.impedance, period, controller.get_pose_output_port())
@@ -227,8 +233,7 @@ class HardwareStation(Station):
             builder.Connect(limiter.get_safe_torque_output_port(), status.get_torque_input_port())
         measured_wrench = wrench.get_wrench_output_port()
         if self._tare:
-            skipped, averaged = (max(round(n * CONTROL_PERIOD / period), 1) for n in (TARE_SKIPPED, TARE_AVERAGED))
-            tare = builder.AddNamedSystem("tare", WrenchTare(period, skipped, averaged))
+            tare = builder.AddNamedSystem("tare", WrenchTare(period, *tare_steps(period)))
             builder.Connect(measured_wrench, tare.get_measured_wrench_input_port())
             measured_wrench = tare.get_tared_wrench_output_port()
         export_station_ports(
@@ -338,6 +343,7 @@ class HardwareStation(Station):
             limits=self.limits,
             status_limits=self.status_limits,
             tare=self._tare,
+            control_period=self.control_period,
         )
 
     def estimate_force(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:

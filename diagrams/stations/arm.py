@@ -25,6 +25,7 @@ from guiderail.diagrams.stations.station import (
     Station,
     add_workcell_plant,
     export_simulation_ports,
+    whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
@@ -210,6 +211,7 @@ class ArmStation(Station):
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
         joint_torque: JointTorqueAccuracy | None = None,
+        control_period: float = CONTROL_PERIOD,
     ):
         """Construct the station.
 
@@ -223,6 +225,10 @@ class ArmStation(Station):
             end_effector: The tool, or its name: see `end_effector_names()`.
             joint_torque: Errors of the joint torques from which the wrench is estimated; None for a sensor at the
                 wrist.
+            control_period: Time between commands [s], a whole multiple of the time step.
+
+        Raises:
+            InputError: If the control period is no multiple of the time step.
         """
         super().__init__()
         self.estimates_wrench, self._joint_torque = joint_torque is not None, joint_torque
@@ -230,6 +236,8 @@ class ArmStation(Station):
         end_effector = find_end_effector(end_effector)
         if time_step is None:
             time_step = PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD
+        self.control_period = control_period
+        whole_multiple(control_period, time_step)
         self._controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)
@@ -248,7 +256,7 @@ class ArmStation(Station):
             builder,
             self._controller_plant,
             impedance,
-            CONTROL_PERIOD,
+            control_period,
             state=plant.get_state_output_port(arm.model),
             wrench=wrench,
         )

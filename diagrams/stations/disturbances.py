@@ -13,14 +13,14 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, ConstantVectorSource
 
 from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
-from guiderail.diagrams.stations.sensing import SENSING, TARE_AVERAGED, TARE_SKIPPED, Sensing, SensorErrors
+from guiderail.diagrams.stations.sensing import SENSING, Sensing, SensorErrors
 from guiderail.diagrams.stations.station import (
-    CONTROL_PERIOD,
     OUTPUTS,
     PLANT_PERIOD,
     Impedance,
     Station,
     export_station_ports,
+    tare_steps,
 )
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
@@ -83,8 +83,8 @@ class Disturbances(Options):
     )
     lost_commands: Number = Field(0.0, ge=0, lt=1, description="probability that a command is lost")
     late_commands: Integer = Field(0, ge=0, le=50, description="delay of a command in control steps")
-    control_period: Number | None = Field(
-        None, gt=0, le=1, description="period of the controller [s]; the station's by default"
+    clock_factor: Number = Field(
+        1.0, gt=0, le=MAX_FACTOR, description="factor of the time between commands; the motion is slower by it"
     )
     stiffness_factor: Number = Field(1.0, gt=0, le=MAX_FACTOR, description="factor of the impedance's stiffness")
     payload: Number = Field(
@@ -175,7 +175,7 @@ class DisturbedStation(Station):
         if d.payload and not hasattr(station, "set_payload"):
             raise InputError("a payload hangs from an arm's tool: choose station=arm, or leave payload out")
         self.plant, self.scene_graph = station.plant, station.scene_graph
-        self.control_period, self.wraps_angles = _control_period_of(d), station.wraps_angles
+        self.control_period, self.wraps_angles = _disturbed_period(d, station), station.wraps_angles
         period = self.control_period
         builder = DiagramBuilder()
         self._inner = builder.AddNamedSystem("station", station)
@@ -242,7 +242,8 @@ class DisturbedStation(Station):
         self._delay = self._wrench if delay and not e.tare else None
         measured: OutputPort = self._wrench.get_disturbed_measurement_output_port()
         if e.tare:
-            tare = builder.AddNamedSystem("tare", WrenchTare(period, TARE_SKIPPED, TARE_AVERAGED))
+            steps = tare_steps(self._inner.control_period)
+            tare = builder.AddNamedSystem("tare", WrenchTare(period, *steps))
             builder.Connect(measured, tare.get_measured_wrench_input_port())
             measured = tare.get_tared_wrench_output_port()
             if delay:
@@ -376,12 +377,14 @@ def _sample_factor(rng: np.random.Generator, factors: tuple[float, ...]) -> floa
     return float(np.exp(rng.uniform(low, high)))
 
 
-def _control_period_of(d: Disturbances) -> float:
-    if d.control_period is None:
-        return CONTROL_PERIOD
-    steps = round(d.control_period / PLANT_PERIOD)
-    if steps < 1 or abs(steps * PLANT_PERIOD - d.control_period) > 1e-6:
+def _disturbed_period(d: Disturbances, station: Station) -> float:
+    if d.clock_factor == 1.0:
+        return station.control_period
+    period = d.clock_factor * station.control_period
+    steps = round(period / PLANT_PERIOD)
+    if steps < 1 or abs(steps * PLANT_PERIOD - period) > 1e-6:
         raise InputError(
-            f"control_period is a whole number of the plant's {PLANT_PERIOD:g} s, not {d.control_period} s"
+            f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole number of the "
+            f"plant's {PLANT_PERIOD:g} s"
         )
     return steps * PLANT_PERIOD

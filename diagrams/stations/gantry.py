@@ -33,6 +33,7 @@ from guiderail.diagrams.stations.station import (
     add_workcell_plant,
     check_pose,
     export_simulation_ports,
+    whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
@@ -93,23 +94,28 @@ class GantryStation(Station):
         time_step: float | None = None,
         wrench_time_constant: float = 0.01,
         impedance_control: ImpedanceControl = "joint",
+        control_period: float = CONTROL_PERIOD,
     ):
         """Construct the station.
 
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of the plant [s]; default: half a control period, a quarter for "cartesian".
+            time_step: Time step of the plant [s]; default: half of `CONTROL_PERIOD`, a quarter for "cartesian".
             wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             impedance_control: "joint" or "cartesian", see above.
+            control_period: Time between commands [s], a whole multiple of the time step.
 
         Raises:
-            InputError: If the time step is too long for a Cartesian controller with this impedance.
+            InputError: If the time step is too long for a Cartesian controller with this impedance, or the control
+                period is no multiple of it.
         """
         super().__init__()
         builder = DiagramBuilder()
         is_joint = impedance_control == "joint"
         time_step = time_step or (PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD)
+        self.control_period = control_period
+        whole_multiple(control_period, time_step)
         if not is_joint:
             _check_time_step(impedance, time_step)
         self.plant, self.scene_graph, self.gantry = add_workcell_plant(
@@ -130,6 +136,7 @@ class GantryStation(Station):
                 state=plant.get_state_output_port(gantry),
                 wrench=wrench,
                 impedance_wrench=plant.get_net_actuation_output_port(gantry),
+                control_period=control_period,
             )
             # The desired pose is the first half of the desired state; the desired velocity is zero.
             state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
@@ -140,7 +147,7 @@ class GantryStation(Station):
                 builder,
                 _controller_plant(workcell, impedance),
                 impedance,
-                CONTROL_PERIOD,
+                control_period,
                 state=plant.get_state_output_port(gantry),
                 wrench=wrench,
                 compensate_gravity=False,

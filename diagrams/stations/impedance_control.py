@@ -6,9 +6,9 @@ import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from guiderail.diagrams.stations.station import (
-    CONTROL_PERIOD,
     ControllerPlant,
     Impedance,
+    command_timeout,
     export_station_ports,
     to_wrench_order,
 )
@@ -47,6 +47,7 @@ def add_controller(
             ),
             period=period,
             compensate_gravity=compensate_gravity,
+            timeout=command_timeout(period),
         ),
     )
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(to_wrench_order(impedance.limits)))
@@ -115,6 +116,7 @@ def add_joint_impedance(
     state: OutputPort,
     wrench: OutputPort,
     impedance_wrench: OutputPort,
+    control_period: float,
 ) -> OutputPort:
     """Add watchdog, tank, governor and monitor of six joints with an impedance, and export the ports of a station.
 
@@ -128,11 +130,12 @@ def add_joint_impedance(
         state: Port of the joint positions and velocities, (12,).
         wrench: Port of the measured wrench, (6,).
         impedance_wrench: Port of the forces of the joints, (6,).
+        control_period: Time between commands [s].
 
     Returns:
         Port of the desired positions, (6,).
     """
-    watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
+    watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(control_period, command_timeout(control_period)))
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
     governor = None
     tank = add_energy_tank(builder, impedance, time_step, pose)

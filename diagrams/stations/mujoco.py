@@ -15,7 +15,15 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, damping
 from guiderail.diagrams.stations.impedance_control import add_joint_impedance
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import PLANT_PERIOD, ContactOptions, Impedance, Station, check_pose
+from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
+    PLANT_PERIOD,
+    ContactOptions,
+    Impedance,
+    Station,
+    check_pose,
+    whole_multiple,
+)
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE
@@ -195,21 +203,25 @@ class MujocoStation(Station):
         time_step: float | None = None,
         wrench_time_constant: float = 0.01,
         contact: MujocoContact = MujocoContact(),
+        control_period: float = CONTROL_PERIOD,
     ):
         """Construct the station.
 
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Period of inputs and outputs [s]; half a control period by default. The engine's is shorter.
+            time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine's is shorter.
             wrench_time_constant: Time constant of the wrench's low-pass filter [s].
             contact: Parameters of contact and integration.
+            control_period: Time between commands [s], a whole multiple of the time step.
 
         Raises:
-            InputError: If MuJoCo is not installed, or the workcell is not described by convex solids.
+            InputError: If MuJoCo is not installed, the workcell is not described by convex solids, or the control
+                period is no multiple of the time step.
         """
         super().__init__()
-        time_step = time_step or PLANT_PERIOD
+        time_step, self.control_period = time_step or PLANT_PERIOD, control_period
+        whole_multiple(control_period, time_step)
         if not isinstance(workcell, ConvexWorkcell):
             raise InputError(
                 f"station='mujoco' needs convex solids, which {type(workcell).__name__} does not provide: "
@@ -235,6 +247,7 @@ class MujocoStation(Station):
             state=gantry.get_state_output_port(),
             wrench=gantry.get_wrench_output_port(),
             impedance_wrench=gantry.get_impedance_wrench_output_port(),
+            control_period=control_period,
         )
         builder.Connect(desired_pose, gantry.get_desired_pose_input_port())
         builder.Connect(

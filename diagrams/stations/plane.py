@@ -1,6 +1,6 @@
 """Plane station: a point robot under position control among walls."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,13 @@ from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Mu
 
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import Station, check_pose, export_station_ports
+from guiderail.diagrams.stations.station import (
+    Station,
+    check_pose,
+    command_timeout,
+    export_station_ports,
+    whole_multiple,
+)
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
@@ -83,9 +89,20 @@ class PlaneStation(Station):
     terminations and rewards of a task.
     """
 
-    def __init__(self, world: PassageGeometry, config: PlaneConfig = PlaneConfig()):
-        """Construct the station from the geometry of walls, goal and obstacles."""
+    def __init__(
+        self, world: PassageGeometry, config: PlaneConfig = PlaneConfig(), control_period: float | None = None
+    ):
+        """Construct the station from the geometry of walls, goal and obstacles.
+
+        A `control_period` [s], a whole multiple of the plant's period, replaces that of the `config`.
+
+        Raises:
+            InputError: If it is no such multiple.
+        """
         super().__init__()
+        if control_period is not None:
+            exact = whole_multiple(control_period, config.plant_period)
+            config = replace(config, substeps=round(exact / config.plant_period))
         builder = DiagramBuilder()
         self.world, self.config = world, config
         self.control_period = config.control_period
@@ -108,7 +125,9 @@ class PlaneStation(Station):
         # F = clip(k (x_d - x), ±F_max), against the joints' viscous friction.
         one = np.eye(2)
         pose = builder.AddNamedSystem("pose", MatrixGain(D=np.eye(2, 4)))
-        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(config.control_period, pose_size=2))
+        watchdog = builder.AddNamedSystem(
+            "watchdog", CommandWatchdog(config.control_period, command_timeout(config.control_period), 2)
+        )
         poses = builder.AddNamedSystem("desired_and_measured_pose", Multiplexer([2, 2]))
         gain = builder.AddNamedSystem("position_gain", MatrixGain(D=config.position_gain * np.hstack([one, -one])))
         limit = np.full(2, config.max_force)

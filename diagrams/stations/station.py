@@ -46,6 +46,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 
 from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.envs.task_diagram import round_period
+from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.poses import POSE_SIZE
@@ -64,6 +65,8 @@ CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
 MAX_HALVINGS = 7
+TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
+COMMAND_TIMEOUT = 0.1  # age above which a command with a time stamp is stale, or two control periods if longer [s]
 
 # Limits of the force along x, y and z in relation to a limit of its norm: the box lies inside the ball.
 FORCE_SHARES = (0.45, 0.45, 0.75)
@@ -128,6 +131,29 @@ class Impedance:
         axes = to_wrench_order(limits.tolist())
         norms = (float(np.linalg.norm(axes[:3])), float(np.linalg.norm(axes[3:])))
         return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS))
+
+
+def whole_multiple(period: float, unit: float, name: str = "control_period") -> float:
+    """Return the exact multiple of `unit` [s] that a period [s] of a given name is.
+
+    Raises:
+        InputError: If it is none.
+    """
+    number = round(period / unit)
+    if number < 1 or abs(number * unit - period) > 1e-6:
+        raise InputError(f"{name} must be a whole multiple of {unit:g} s, not {period:g} s")
+    return number * unit
+
+
+def command_timeout(period: float) -> float:
+    """Return the age above which a command is stale [s], where commands come with `period` [s]."""
+    return max(COMMAND_TIMEOUT, 2.0 * period)
+
+
+def tare_steps(period: float) -> tuple[int, int]:
+    """Return the numbers of steps of `period` [s] before and during a tare."""
+    skipped, averaged = (max(round(n * CONTROL_PERIOD / period), 1) for n in (TARE_SKIPPED, TARE_AVERAGED))
+    return skipped, averaged
 
 
 class Station(Diagram):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.registry import stations_for
-from guiderail.diagrams.stations.station import Impedance, Station
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, TIME_UNIT, Impedance, Station, whole_multiple
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -68,6 +69,12 @@ class Threshold:
     above: float = 0.0
 
 
+@lru_cache(maxsize=32)
+def _on_clock(reference: ReferenceTrajectory, period: float, time_scale: float) -> ReferenceTrajectory:
+    is_on_clock = np.abs(np.diff(reference.times) - period).max() <= 1e-6 * period
+    return reference if is_on_clock and time_scale == 1.0 else reference.resampled(period, time_scale)
+
+
 class Task(ABC):
     """Declaration of a task: workcell, prior knowledge, observation, reward, terminations and reset.
 
@@ -96,8 +103,11 @@ class Task(ABC):
         isotropic_groups: Indices of outputs of one unit, group by group; residual learning moves all outputs of a group
             by the same amount. None: one group of all.
         pushable: True if `DiagramEnv.push` may displace the robot.
+        time_unit: A control period is a whole multiple of it [s].
+        default_control_period: Control period without the option `control_period` [s].
         config: Configuration of the environment.
         options: The task's own options, an instance of `Options`.
+        control_period: Control period [s].
         has_held_out_distribution: True if `reset` samples from a held-out distribution if `options.held_out` is true.
             Otherwise an evaluation repeats conditions of training, and reports so.
         episode_constants: Constants that `signals` adds to a diagram and a reset sets, by name. A later environment
@@ -121,6 +131,8 @@ class Task(ABC):
     has_held_out_distribution: ClassVar[bool] = False
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
+    time_unit: ClassVar[float] = TIME_UNIT
+    default_control_period: ClassVar[float] = CONTROL_PERIOD
 
     def __init__(self, config: EnvConfig):
         """Construct the task; a subclass may refuse incompatible options.
@@ -130,7 +142,20 @@ class Task(ABC):
         """
         self.config = config
         self.options = config.parts["task"]
+        given = config.control_period
+        self.control_period = self.default_control_period if given is None else whole_multiple(given, self.time_unit)
         self.episode_constants: dict[str, EpisodeConstant] = {}
+
+    def steps_of(self, nominal_steps: int) -> int:
+        """Return the control steps, at least one, that last as long as steps of the default control period."""
+        return max(round(nominal_steps * self.default_control_period / self.control_period), 1)
+
+    def on_clock(self, reference: ReferenceTrajectory, time_scale: float = 1.0) -> ReferenceTrajectory:
+        """Return a reference trajectory in steps of the control period, and `time_scale` times as long.
+
+        The trajectory itself is returned if it has such steps already.
+        """
+        return _on_clock(reference, self.control_period, time_scale)
 
     @abstractmethod
     def workcell(self) -> Any:

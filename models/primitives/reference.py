@@ -123,6 +123,32 @@ class ReferenceTrajectory:
         after = np.maximum(steps - last, 0) * (self.times[-1] - self.times[-2])
         return inside + before + after
 
+    def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
+        """Return this trajectory with another time between steps, and `time_scale` times as long.
+
+        Means and covariances are interpolated linearly. The number of steps times the period stays the duration.
+
+        Args:
+            period: Time between steps [s], positive.
+            time_scale: Factor of the duration, positive.
+
+        Raises:
+            InputError: If an argument is not positive, or fewer than two steps remain.
+        """
+        if not (0.0 < period < np.inf and 0.0 < time_scale < np.inf):
+            raise InputError(f"a period and a time scale must be positive, not {period} s and {time_scale}")
+        step = (self.times[-1] - self.times[0]) / (self.num_steps - 1)
+        number = round(self.num_steps * step * time_scale / period)
+        if number < 2:
+            raise InputError(f"a motion of {self.num_steps * step * time_scale:g} s has no two steps of {period:g} s")
+        clock = period * np.arange(number)
+        nodes, place = np.arange(self.num_steps), np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
+        columns = np.hstack([self.means, self.covariances.reshape(self.num_steps, -1)])
+        resampled = np.column_stack([np.interp(place, nodes, column) for column in columns.T])
+        outputs = self.num_outputs
+        covariances = resampled[:, outputs:].reshape(number, outputs, outputs)
+        return ReferenceTrajectory(self.times[0] + clock, resampled[:, :outputs], covariances)
+
     def _check_covariances(self) -> None:
         asymmetry = np.abs(self.covariances - self.covariances.transpose(0, 2, 1)).max(axis=(1, 2))
         size = np.abs(self.covariances).max(axis=(1, 2))

@@ -83,7 +83,8 @@ def _offsets(environment: Environment, value: float) -> dict[str, Any]:
 
 
 def _period(environment: Environment, value: float) -> dict[str, Any]:
-    return {"control_period": max(round(value * CONTROL_PERIOD / PLANT_PERIOD), 1) * PLANT_PERIOD}
+    period = environment["control_period"] or CONTROL_PERIOD
+    return {"clock_factor": max(round(value * period / PLANT_PERIOD), 1) * PLANT_PERIOD / period}
 
 
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0)

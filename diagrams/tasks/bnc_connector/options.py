@@ -126,6 +126,13 @@ class BncOptions(FixtureOffsetOptions, ForceOptions):
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )
 
+    time_scale: Number = Field(
+        1.0,
+        ge=0.5,
+        le=10,
+        description="factor of the demonstrations' duration; 5 with control_period=0.1 keeps their 400 steps",
+    )
+
     @field_validator("demonstrations")
     @classmethod
     def _is_shipped_or_a_file(cls, value: str) -> str:

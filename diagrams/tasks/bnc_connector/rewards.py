@@ -8,10 +8,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, HALF_TURN_OF_WRENCH
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.reward_system import RewardTerm
@@ -26,13 +24,16 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
 def observation_terms(
     observation: str,
-    num_steps: int = NUM_STEPS,
+    duration: float,
     center: np.ndarray = POSE_CENTER,
     scale: np.ndarray = POSE_SCALE,
     wrench_scale: np.ndarray = WRENCH_SCALE,
 ) -> tuple[ObservationTerm, ...]:
-    """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
-    half = 0.5 * num_steps * CONTROL_PERIOD
+    """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
+
+    The `duration` is that of an episode [s].
+    """
+    half = 0.5 * duration
     state = (
         ObservationTerm("time", half, half),
         ObservationTerm("pose", center, scale),

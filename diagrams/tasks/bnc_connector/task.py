@@ -50,7 +50,7 @@ COMPONENTS = 16
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
-LOCKED_STEPS = 3  # consecutive control steps that count as locked
+LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
 
 
 @cache
@@ -137,7 +137,10 @@ class BncConnector(DemonstratedInsertion):
         )
         self.collision = Threshold("contact_force", o.largest_force_limit)
         self._workcell = o.workcell()
-        self.num_steps = NUM_STEPS if o.demonstrations in DEMONSTRATIONS else self.reference().num_steps
+        # Fitting the shipped demonstrations takes seconds, and their duration is known.
+        is_shipped, period = o.demonstrations in DEMONSTRATIONS, self.control_period
+        duration = NUM_STEPS * CONTROL_PERIOD * o.time_scale
+        self.num_steps = round(duration / period) if is_shipped else self.reference().num_steps
 
     def workcell(self) -> BncWorkcell:
         """Return the jack in the world and the plug in the tool."""
@@ -145,7 +148,7 @@ class BncConnector(DemonstratedInsertion):
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the chosen demonstrations."""
-        return reference_trajectory(self.options.demonstrations)
+        return self.on_clock(reference_trajectory(self.options.demonstrations), self.options.time_scale)
 
     def constraints(self) -> LinearConstraints:
         """Return |x|, |y| ≤ `bound`: 2 mm in equation 4.26."""
@@ -162,7 +165,9 @@ class BncConnector(DemonstratedInsertion):
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
-        return *observation_terms(self.config.observation, self.num_steps), *self.force_limit_terms()
+        return *observation_terms(
+            self.config.observation, self.num_steps * self.control_period
+        ), *self.force_limit_terms()
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
@@ -170,7 +175,10 @@ class BncConnector(DemonstratedInsertion):
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success when locked, and collision above the force limit."""
-        return [TerminationTerm("success", {"plug": 6}, self._workcell.locks, steps=LOCKED_STEPS), self.force_limit()]
+        return [
+            TerminationTerm("success", {"plug": 6}, self._workcell.locks, steps=self.steps_of(LOCKED_STEPS)),
+            self.force_limit(),
+        ]
 
     def symmetry(self) -> Symmetry:
         """Return half a turn about the jack's axis."""

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Number, Numbers
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
+from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions, InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
@@ -279,7 +279,7 @@ class GridClamp(InsertionTask):
         self.offsets = GridClampUncertainty(self.options.fixture_offset)
         self.collision = Threshold("contact_force", self.options.largest_force_limit)
         # The default is 100 actions at 10 Hz; the thesis's episodes take 140 on average.
-        self.num_steps = round(self.options.seconds / CONTROL_PERIOD)
+        self.num_steps = round(self.options.seconds / self.control_period)
         self._workcell = self.options.workcell()
 
     def workcell(self) -> GridClampWorkcell:
@@ -317,7 +317,9 @@ class GridClamp(InsertionTask):
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success when seated, and collision above the force limit."""
-        seated = TerminationTerm("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
+        seated = TerminationTerm(
+            "success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=self.steps_of(SEATED_STEPS)
+        )
         return [seated, self.force_limit()]
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:

@@ -17,7 +17,7 @@ from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
-from guiderail.diagrams.stations.plane import PlaneStation
+from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
@@ -218,7 +218,7 @@ class NarrowPassage(Task):
     observations = ("state", "image")
     defaults = {"guidance": "skgrl", "action_repeat": 5}
     difficulties = {STANDARD: {}, "hard": HARD}
-    num_steps = demonstrations.NUM_STEPS
+    time_unit, default_control_period = PlaneConfig.plant_period, PlaneConfig().control_period
     clip = 1.0
     statistics = (
         Metric(
@@ -232,6 +232,7 @@ class NarrowPassage(Task):
     def __init__(self, config: EnvConfig):
         super().__init__(config)
         self._geometry = self.options.workcell()
+        self.num_steps = round(demonstrations.NUM_STEPS * self.default_control_period / self.control_period)
 
     def workcell(self) -> PassageGeometry:
         """Return the walls, the restricted zone, the obstacle and the goal."""
@@ -246,7 +247,7 @@ class NarrowPassage(Task):
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the nine demonstrations."""
-        return reference_trajectory()
+        return self.on_clock(reference_trajectory())
 
     def constraints(self) -> LinearConstraints:
         """Return the constraint that the restricted zone is not entered."""

@@ -145,7 +145,7 @@ class PartInsertion(DemonstratedInsertion):
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the folder's demonstrations."""
         source = self.file.demonstrations
-        return reference_of_file(self.folder / source.file, source.components, source.floor)
+        return self.on_clock(reference_of_file(self.folder / source.file, source.components, source.floor))
 
     def constraints(self) -> LinearConstraints:
         """Return the folder's bounds, with those of x and y replaced by the option `bound`."""
@@ -173,7 +173,9 @@ class PartInsertion(DemonstratedInsertion):
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
-        terms = observation_terms(self.config.observation, self.num_steps, center, scale, WRENCH_SCALE)
+        terms = observation_terms(
+            self.config.observation, self.num_steps * self.control_period, center, scale, WRENCH_SCALE
+        )
         return *terms, *self.force_limit_terms()
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
@@ -182,7 +184,9 @@ class PartInsertion(DemonstratedInsertion):
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success at the target, and collision above the force limit."""
-        seated = TerminationTerm("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
+        seated = TerminationTerm(
+            "success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.steps_of(self.file.tolerance.steps)
+        )
         return [seated, self.force_limit()]
 
     def symmetry(self) -> Symmetry | None:

@@ -168,6 +168,7 @@ class Pouring(Task):
     num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis
     clip = 10.0
     collision = Threshold("touched")
+    time_unit, default_control_period = PouringConfig.plant_period, PouringConfig().control_period
     pushable = False  # the balls in the thermos would not move along
 
     def __init__(self, config: EnvConfig):
@@ -177,8 +178,9 @@ class Pouring(Task):
             mug=make_mug(self.options.mug_inner_diameter, self.options.mug_depth, self.options.ball),
             ball=self.options.ball,
             num_balls=self.options.balls,
+            substeps=round(self.control_period / PouringConfig.plant_period),
         )
-        self.num_steps = round(self.options.time_limit / self._scene_config.control_period)
+        self.num_steps = round(self.options.time_limit / self.control_period)
         speed = self._input_speed()
         self._template = make_template(self._scene_config, speed)
         if self.options.aim:

@@ -41,7 +41,7 @@ def test_motion_of_another_period_is_refused(period):
 
 
 def test_a_clock_that_is_disturbed_is_no_other_demonstration():
-    env = make_env("BncConnector", control_period=0.01)
+    env = make_env("BncConnector", clock_factor=0.5)
     assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
 
 

@@ -79,7 +79,7 @@ def test_smaller_stiffness_leads_to_a_smaller_force(plain):
 
 
 def test_control_period_is_that_of_the_disturbed_clock():
-    env, _, _ = descended(1, control_period=3 * PLANT_PERIOD)
+    env, _, _ = descended(1, clock_factor=1.5)
     assert env.task.control_period == pytest.approx(3 * PLANT_PERIOD)
     assert env.task.control_period != CONTROL_PERIOD
 
@@ -121,7 +121,7 @@ def test_payload_lowers_the_tool_of_an_arm():
     ("options", "message"),
     [
         ({"payload": 0.5}, "station=arm"),
-        ({"control_period": 0.0123}, "whole number"),
+        ({"clock_factor": 0.6}, "whole number"),
         ({"friction_factor": (2.0, 1.0)}, "smaller one first"),
         ({"wrench_bias": (-1.0, 0.0)}, "none negative"),
         ({"lost_commands": 1.0}, "less than 1"),

@@ -1,0 +1,108 @@
+"""The option `control_period`: clock of guidance, station and task, and the refusals of other periods."""
+
+import numpy as np
+import pytest
+
+from guiderail import make_env
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_prior_knowledge, make_skill
+from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
+    PLANT_PERIOD,
+    command_timeout,
+    tare_steps,
+    whole_multiple,
+)
+from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import ReferenceTrajectory
+
+
+def task_of(name, **options):
+    return EnvConfig.resolve(name, options).make_task()
+
+
+@pytest.mark.parametrize("name", ["NarrowPassage", "BncConnector", "GridClamp", "Pouring"])
+def test_episode_lasts_as_long_when_the_period_is_longer(name):
+    usual, slow = task_of(name), task_of(name, control_period=0.1)
+    assert slow.control_period == pytest.approx(0.1, rel=1e-9)
+    assert slow.num_steps * slow.control_period == pytest.approx(usual.num_steps * usual.control_period, rel=1e-6)
+
+
+def test_default_reference_is_the_shipped_one():
+    assert task_of("BncConnector").reference() is reference_trajectory("insert")
+    assert task_of("BncConnector", control_period=0.02).reference() is reference_trajectory("insert")
+
+
+def test_same_number_of_steps_when_the_motion_is_slower_too():
+    shipped, task = reference_trajectory("insert"), task_of("BncConnector", control_period=0.1, time_scale=5.0)
+    assert task.num_steps == task.reference().num_steps == shipped.num_steps
+    np.testing.assert_allclose(task.reference().means, shipped.means, atol=1e-12)
+    np.testing.assert_allclose(np.diff(task.reference().times), 0.1, rtol=1e-9)
+
+
+def test_commands_change_once_a_control_period():
+    env = make_env("NarrowPassage", guidance="skgrl", control_period=0.1, action_repeat=1)
+    env.reset(seed=0)
+    for number in range(3):
+        env.step(np.array([1.0, -1.0]))
+        assert env.simulator.get_context().get_time() == (number + 1) * env.task.control_period
+    primitive = make_prior_knowledge("NarrowPassage", control_period=0.1).demonstrations
+    np.testing.assert_allclose(np.diff(primitive.reference.times), primitive.control_period, rtol=1e-9)
+    assert primitive.control_period == env.task.control_period == 50 * env.task.declaration.time_unit
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "message"),
+    [
+        ("BncConnector", {"control_period": 0.0123}, "whole multiple of 0.005 s"),
+        ("NarrowPassage", {"control_period": 0.011}, "whole multiple of 0.002 s"),
+        ("BncConnector", {"control_period": 0.004}, "at least 0.005"),
+        ("BncConnector", {"control_period": 0.6}, "at most 0.5"),
+        ("BncConnector", {"control_period": 0.015, "station": "gantry"}, "whole multiple of 0.01 s"),
+        ("BncConnector", {"control_period": 0.015, "station": "arm"}, "whole multiple of 0.01 s"),
+    ],
+)
+def test_other_periods_are_refused(task, options, message):
+    with pytest.raises(InputError, match=message):
+        make_env(task, **options)
+
+
+def test_period_that_the_plant_divides_is_accepted():
+    assert make_env("GridClamp", control_period=3 * PLANT_PERIOD).task.control_period == 3 * PLANT_PERIOD
+
+
+def test_period_of_a_robot_is_a_multiple_of_its_drivers():
+    skill = make_skill("GridClamp", lambda seen: seen, station="hardware", robot_url="memq://", control_period=0.1)
+    station = skill.diagram.GetSubsystemByName("station")
+    assert skill.control_period == station.control_period == 20 * station.period
+    assert station.clone(task_of("GridClamp").workcell()).control_period == station.control_period
+    with pytest.raises(InputError, match=r"whole multiple of 0\.005 s"):
+        whole_multiple(0.0125, station.period)
+
+
+def test_reference_of_another_clock_is_refused():
+    class Deaf(task_of("NarrowPassage").__class__):
+        def on_clock(self, reference, time_scale=1.0):
+            return reference
+
+    from guiderail.diagrams.envs.assemble import build_prior_knowledge
+    from guiderail.diagrams.envs.make import make_station
+
+    task = Deaf(EnvConfig.resolve("NarrowPassage", {"control_period": 0.1}))
+    with pytest.raises(InputError, match="another speed than was demonstrated"):
+        build_prior_knowledge(task, make_station(task))
+
+
+def test_timeout_and_tare_follow_the_period():
+    assert (command_timeout(0.02), command_timeout(0.05), command_timeout(0.1)) == (0.1, 0.1, 0.2)
+    assert tare_steps(CONTROL_PERIOD) == (3, 5)
+    assert tare_steps(5 * CONTROL_PERIOD) == (1, 1)
+
+
+@pytest.mark.parametrize(("period", "time_scale"), [(0.0, 1.0), (np.nan, 1.0), (0.1, -1.0), (2.0, 1.0)])
+def test_resampling_raises_when_no_motion_remains(period, time_scale):
+    reference = ReferenceTrajectory(0.1 * np.arange(20), np.zeros((20, 1)), np.ones((20, 1, 1)))
+    assert reference.resampled(1.0).num_steps == 2
+    with pytest.raises(InputError):
+        reference.resampled(period, time_scale)
