@@ -102,15 +102,29 @@ class KmpGuidance(PrimitiveGuidance):
 class KgrlGuidance(PrimitiveGuidance):
     """KGRL: actions deviate where the demonstrations did, and every command satisfies the constraints."""
 
-    def __init__(self, prior: PriorKnowledge):
+    def __init__(self, prior: PriorKnowledge, *, constrained: bool = True):
+        """Construct the guidance; without `constrained` it is that of `residual_covariance`."""
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
         action, _ = self._export_inputs(builder, config)
-        primitive = config.primitive(history=False)
+        primitive = config.primitive(history=False, constrained=constrained)
         gains = config.null_space_gains(primitive)
         kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period))
         builder.Connect(action, kmp.get_null_space_action_input_port())
         self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+
+
+@register_guidance(
+    "residual_covariance",
+    needs=(("demonstrations",),),
+    label="residual RL scaled by covariance",
+    color="#e377c2",
+    demonstrates=True,
+    displaces=True,
+)
+def residual_covariance(prior: PriorKnowledge) -> KgrlGuidance:
+    """Build KGRL without constraints: a residual that is scaled by the covariance of the demonstrations."""
+    return KgrlGuidance(prior, constrained=False)
 
 
 @register_guidance(

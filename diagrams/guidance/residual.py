@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+from pydantic import Field
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, PassThrough, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
+from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, primitive_config_of
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.systems.command_filter import CommandFilter
 from guiderail.systems.residual import Residual
 from guiderail.systems.safety_filter import SafetyFilter
 
@@ -62,10 +71,13 @@ class ResidualDescent(Guidance):
 class ResidualGuidance(PrimitiveGuidance):
     """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t."""
 
-    def __init__(self, prior: PriorKnowledge, *, safe: bool = False):
+    def __init__(self, prior: PriorKnowledge, make_filter: Callable[[PrimitiveConfig, KeepOut], Any] | None = None):
         """Construct the guidance.
 
-        If `safe`, a filter behind the sum stops at walls to keep out of; ``fallback`` is then 1 if it did.
+        Args:
+            prior: Prior knowledge.
+            make_filter: Function from the demonstrations and the walls to keep out of to a `SafetyFilter` or a
+                `CommandFilter` behind the sum, if there is one; ``fallback`` is then 1 if it changed the command.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
@@ -75,9 +87,9 @@ class ResidualGuidance(PrimitiveGuidance):
         builder.Connect(kmp.get_command_output_port(), residual.get_reference_input_port())
         builder.Connect(action, residual.get_action_input_port())
         desired, fallback = residual.get_desired_pose_output_port(), kmp.get_fallback_output_port()
-        if safe:
+        if make_filter is not None:
             assert config.keep_out is not None
-            safety = builder.AddNamedSystem("safety_filter", SafetyFilter(config.keep_out, config.control_period))
+            safety = builder.AddNamedSystem("safety_filter", make_filter(config, config.keep_out))
             builder.Connect(desired, safety.get_desired_pose_input_port())
             builder.Connect(pose, safety.get_pose_input_port())
             desired, fallback = safety.get_safe_pose_output_port(), safety.get_intervention_output_port()
@@ -107,4 +119,58 @@ def residual(prior: PriorKnowledge) -> Diagram:
 )
 def safe_residual(prior: PriorKnowledge) -> Diagram:
     """Build residual learning that stops at walls."""
-    return ResidualGuidance(prior, safe=True)
+    return ResidualGuidance(prior, lambda config, keep_out: SafetyFilter(keep_out, config.control_period))
+
+
+class BarrierOptions(Options):
+    """Options of `residual_cbf`."""
+
+    barrier_decay: Number = Field(
+        0.2, gt=0, le=1, description="γ, largest fraction by which a command may approach a constraint per step"
+    )
+
+
+@register_guidance(
+    "residual_cbf",
+    needs=(("demonstrations", "keep_out"),),
+    label="residual RL, barrier function",
+    color="#bcbd22",
+    demonstrates=True,
+    displaces=True,
+    options=BarrierOptions,
+)
+def residual_cbf(prior: PriorKnowledge) -> Diagram:
+    """Build residual learning behind a control barrier function; see `BarrierFilter`."""
+    decay = prior.options["barrier_decay"]
+    return ResidualGuidance(
+        prior, lambda config, keep_out: CommandFilter(BarrierFilter(keep_out, decay), config.control_period)
+    )
+
+
+class TangentOptions(Options):
+    """Options of `residual_tangent`."""
+
+    slack_width: Number = Field(
+        0.5,
+        gt=0,
+        description="slack at which half of a motion towards a constraint remains, in displacements by an action of 1",
+    )
+
+
+@register_guidance(
+    "residual_tangent",
+    needs=(("demonstrations", "keep_out"),),
+    label="residual RL, tangent space",
+    color="#7f7f7f",
+    demonstrates=True,
+    displaces=True,
+    options=TangentOptions,
+)
+def residual_tangent(prior: PriorKnowledge) -> Diagram:
+    """Build residual learning in the tangent space of the constraints; see `TangentSpaceFilter`."""
+
+    def make_filter(config: PrimitiveConfig, keep_out: KeepOut) -> CommandFilter:
+        width = prior.options["slack_width"] * float(config.residual_gains().max())
+        return CommandFilter(TangentSpaceFilter(keep_out, width), config.control_period)
+
+    return ResidualGuidance(prior, make_filter)

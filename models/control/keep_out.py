@@ -67,6 +67,25 @@ class KeepOut:
             return position + max(reach - self._GAP / length, 0.0) * (target - position), True
         return target, was_in_box
 
+    def half_spaces(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return half spaces without the boxes that contain a position outside of them, with the margin.
+
+        They are the constraints, and of each box the face with the most clearance at the position.
+
+        Args:
+            position: Position (O,).
+
+        Returns:
+            G (F, O) with rows of unit norm, and c (F,), of G y ≥ c.
+        """
+        below, above = self._lower - position, position - self._upper
+        clearance = np.hstack([below, above])
+        face = np.argmax(clearance, axis=1)
+        rows = np.vstack([-np.eye(self.num_outputs), np.eye(self.num_outputs)])[face]
+        bounds = np.hstack([-self._lower, self._upper])[np.arange(len(face)), face] + self.margin
+        G, c = self._constraints.G, self._constraints.c
+        return np.vstack([G, rows]), np.append(c, bounds)
+
     def _project_to_constraints(self, desired: np.ndarray) -> np.ndarray:
         """Return the nearest point within the constraints."""
         G, c = self._constraints.G, self._constraints.c

@@ -25,6 +25,7 @@ from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
@@ -72,6 +73,7 @@ def built():
         systems.CartesianImpedanceController(plant, arm.target, arm.tool_center, gains, period=PERIOD),
         systems.CartesianPositionController(plant, arm.target, arm.tool_center, posture=np.zeros(7), period=PERIOD),
         systems.CommandDisturbance(2, PERIOD, loss_probability=0.5, delay=1),
+        systems.CommandFilter(BarrierFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0)), PERIOD),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.CenterOfPressure(0.5),

@@ -78,6 +78,7 @@ class OffPolicyConfig(LearnerConfig):
     layer_norm: bool = False  # normalize hidden layers before their activation
     selection_window: NonNegative = 0  # greedy successes before and after an actor that select it; 0 for the last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
+    base_motion_steps: NonNegative = 0  # transitions over which actions other than zero become certain; 0 for at once
     demonstration_fraction: Fraction = 0.0  # of each batch from the demonstration_episodes (RLPD: 0.5); 0 for no mixing
     dropout: Fraction = 0.0  # dropout probability of the critics, after which their layers are normalized (DroQ: 0.01)
 
@@ -140,6 +141,22 @@ class TrpoConfig(OnPolicyConfig):
     target_kl: Rate = 0.01  # largest Kullback-Leibler divergence of a training
 
 
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class BcConfig(LearnerConfig):
+    """Settings of behavior cloning (BC)."""
+
+    algorithm: str = "bc"
+    demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
+    learning_rate: Rate = 1e-3
+    gradient_steps: Positive = 5000  # of the one training, after the last demonstration
+    batch_size: BatchSize = 64  # transitions
+    net_arch: NetArch = (256, 256)  # units of the hidden layers
+
+    def __post_init__(self) -> None:
+        if not self.demonstration_episodes:
+            raise InputError("bc learns from demonstrations: give --set demonstration_episodes=... of at least 1")
+
+
 register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
 register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
 for _name, _module, _class, _config in (
@@ -147,6 +164,7 @@ for _name, _module, _class, _config in (
     ("crossq", "sb3_algorithms", "CrossQLearner", CrossQConfig),
     ("ppo", "on_policy", "PpoLearner", PpoConfig),
     ("trpo", "on_policy", "TrpoLearner", TrpoConfig),
+    ("bc", "cloning", "BcLearner", BcConfig),
 ):
     register_learner(_name, DeferredLearner(f"guiderail.tools.learning.{_module}", _class, _config))
 

@@ -298,6 +298,8 @@ class OffPolicyLearner(Learner):
         """Return the action: uniform before learning starts, then sampled, or the mean in a greedy episode."""
         if self._constant_action is not None:
             return self._constant_action
+        if self._follows_base_motion():
+            return np.zeros_like(self._uniform())
         if not self.is_learning():
             return self._uniform()
         if self._num_privileged:  # the actor ignores these entries
@@ -307,6 +309,14 @@ class OffPolicyLearner(Learner):
             return self.explore(observation) if extended is None else extended
         with torch.no_grad():
             return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
+
+    def _follows_base_motion(self) -> bool:
+        """Return True if this action is zero, the motion that a residual is added to (Policy Decorator).
+
+        The progressive exploration of Yuan et al. (2025): the policy acts with a probability that grows linearly.
+        """
+        steps = self.config.base_motion_steps
+        return not self._is_greedy and self.transitions < steps and self.random.random() * steps >= self.transitions
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
         """Return a sampled action; a subclass with a deterministic policy adds noise."""

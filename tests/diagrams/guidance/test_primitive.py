@@ -18,7 +18,7 @@ from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority
 
 PERIOD, STEPS = 0.02, 60
-PRIMITIVE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl")
+PRIMITIVE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl", "residual_covariance")
 START = np.array([0.0, 0.0])
 
 
@@ -197,9 +197,9 @@ def test_nothing_is_computed_between_control_steps(skill):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("magic", "there is no guidance 'magic': .*kgrl, kmp, none, residual, safe_residual, sct, skgrl"),
+        ("magic", "there is no guidance 'magic': .*kgrl, kmp, none, residual, .*safe_residual, sct, skgrl"),
         ("kgrll", "did you mean kgrl"),
-        ("sct", "'sct' needs a shared control template.*use kgrl, kmp, residual, safe_residual, skgrl"),
+        ("sct", "'sct' needs a shared control template.*use kgrl, kmp, residual, residual_cbf, .*skgrl"),
         ("none", "'none' needs .*kmp"),
     ],
 )
@@ -209,7 +209,9 @@ def test_impossible_guidance_is_refused_with_alternatives(skill, kind, message):
 
 
 def test_safe_residual_is_not_offered_without_walls(skill):
-    with pytest.raises(InputError, match=r"walls to keep out of, which BncConnector.*use kgrl, kmp, residual, skgrl"):
+    with pytest.raises(
+        InputError, match=r"walls to keep out of, .*BncConnector.*kmp, residual, residual_covariance, skgrl"
+    ):
         build("safe_residual", replace(skill, keep_out=None), "BncConnector")
     assert check_guidance("kmp", ("demonstrations",)).label == "demonstration alone"
 

@@ -29,7 +29,16 @@ def test_symmetry_is_absent_when_actions_do_not_displace(size, monkeypatch):
 
 def test_symmetry_holds_when_actions_displace_outputs():
     displacing = {name for name in GUIDANCE.names() if GUIDANCE.get(name).displaces}
-    assert displacing == {"kgrl", "skgrl", "residual", "safe_residual", "kmp"}
+    assert displacing == {
+        "kgrl",
+        "skgrl",
+        "residual",
+        "safe_residual",
+        "kmp",
+        "residual_covariance",
+        "residual_cbf",
+        "residual_tangent",
+    }
     env = make_env("BncConnector", guidance="kgrl")
     np.testing.assert_array_equal(env.task.symmetry.actions, [-np.eye(2)])
     assert len(env.task.near_symmetry.actions) > 1

@@ -1,0 +1,121 @@
+"""Filters of commanded positions that depend on the last command: a barrier function, and a tangent space.
+
+Both bound the change of a command from one control step to the next by constraints with rows of unit norm,
+h(y) = G y − c ≥ 0, which hold at the first command and then at every later one.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.primitives import UnsolvableError
+from guiderail.models.primitives.qp import solve_least_norm
+
+_TOLERANCE = 1e-9  # [unit of a position] by which a constraint may be violated by rounding
+
+
+class CommandLaw(Protocol):
+    """Law that maps the last command and a desired one to a safe one."""
+
+    num_outputs: int
+
+    def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the safe command (O,), and True if it had to be changed, for the last and the desired one, (O,)."""
+        ...
+
+
+class BarrierFilter:
+    """Discrete-time control barrier function on commands (Agrawal and Sreenath, 2017).
+
+    The safe command is the nearest to the desired one for which no barrier decreases by more than a fraction γ:
+
+        h(y_{k+1}) ≥ (1 − γ) h(y_k)
+
+    A box to keep out of has the barrier of the face with the most clearance at the last command (a nonsmooth barrier:
+    Glotfelter, Cortés and Egerstedt, 2017). With γ = 1 the filter is a projection.
+
+    Args:
+        keep_out: Boxes and constraints, with their margin.
+        decay: γ in (0, 1].
+
+    Raises:
+        InputError: If γ is out of range.
+
+    Attributes:
+        num_outputs: O.
+    """
+
+    def __init__(self, keep_out: KeepOut, decay: float = 0.2):
+        if not 0.0 < decay <= 1.0:
+            raise InputError(f"a barrier decays by a fraction in (0, 1] per step, not {decay}")
+        self._keep_out, self._decay = keep_out, decay
+        self.num_outputs = keep_out.num_outputs
+
+    def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the safe command (O,), and True if it is another than the desired one.
+
+        A last command outside the constraints is repeated where no allowed command is found.
+        """
+        G, c = self._keep_out.half_spaces(last)
+        bounds = c + (1.0 - self._decay) * (G @ last - c)
+        missing = bounds - G @ desired
+        if not missing.size or missing.max() <= _TOLERANCE:
+            return desired.copy(), False
+        try:
+            move, _ = solve_least_norm(G.copy(), missing, np.full(len(c), np.inf))
+        except UnsolvableError:
+            return last.copy(), True
+        return _last_allowed(last, desired + move, G, np.minimum(c, G @ last)), True
+
+
+class TangentSpaceFilter:
+    """Motion of commands in the tangent space of the constraint manifold (ATACOM; Liu et al., 2022 and 2024).
+
+    Each constraint has a slack s = G y − c, which changes by σ⁻¹ s per unit of its own velocity. A step v = desired −
+    last is projected to the null space of the Jacobian [−G, diag(s / σ)] of the constraints with their slacks:
+
+        y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
+
+    Far from a constraint this is the desired command; at a constraint it moves along it only. A step that would be
+    too long for the projection at its start ends at the constraint.
+
+    Args:
+        keep_out: Boxes and constraints, with their margin. A box has the face with the most clearance.
+        width: σ, slack at which half of a motion towards a constraint remains, positive [unit of a position].
+
+    Raises:
+        InputError: If σ is not positive.
+
+    Attributes:
+        num_outputs: O.
+    """
+
+    def __init__(self, keep_out: KeepOut, width: float):
+        if not 0.0 < width < np.inf:
+            raise InputError(f"the width of a slack must be positive, not {width}")
+        self._keep_out, self._width = keep_out, width
+        self.num_outputs = keep_out.num_outputs
+
+    def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the safe command (O,), and True if the step had to be shortened at a constraint.
+
+        Outside a constraint the error c − G y is corrected by the same pseudoinverse, as in the method's own law.
+        """
+        G, c = self._keep_out.half_spaces(last)
+        if not c.size:
+            return desired.copy(), False
+        slack, step = G @ last - c, desired - last
+        damped = G @ G.T + np.diag((np.maximum(slack, 0.0) / self._width) ** 2)
+        error = G @ step - np.maximum(-slack, 0.0)  # the step towards the constraints, and what is missing to them
+        goal = last + step - G.T @ np.linalg.lstsq(damped, error, rcond=None)[0]
+        is_inside = bool((G @ goal - c >= -_TOLERANCE).all())
+        return (goal, False) if is_inside else (_last_allowed(last, goal, G, np.minimum(c, G @ last)), True)
+
+
+def _last_allowed(last: np.ndarray, goal: np.ndarray, G: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return the last point on the line from `last` to `goal`, (O,), where G y ≥ c, which holds at `last`."""
+    slack, change = G @ last - c, G @ (goal - last)
+    share = np.min(np.divide(slack, -change, out=np.ones_like(slack), where=slack + change < 0.0), initial=1.0)
+    return np.asarray(last + max(share, 0.0) * (goal - last))

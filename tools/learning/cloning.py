@@ -1,0 +1,131 @@
+"""Behavior cloning: a policy that is regressed on the actions of a demonstrator, without reinforcement learning."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from torch.nn.utils import parameters_to_vector
+
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.config import BcConfig
+from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.off_policy import export_layers
+
+
+class BcLearner(Learner):
+    """Learner of behavior cloning (Pomerleau, 1988): mean squared error of the demonstrator's actions, by Adam.
+
+    It trains once, after the last demonstration, and acts by the trained policy from then on.
+
+    Attributes:
+        config: The settings.
+        network: Network of the policy.
+        episodes: Number of episodes so far.
+    """
+
+    Config = BcConfig
+
+    def __init__(
+        self,
+        config: BcConfig,
+        env: gymnasium.Env,
+        *,
+        action_repeat: int,
+        seed: int,
+        max_transitions: int,
+        symmetry: Symmetry | None = None,
+    ):
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used.
+
+        Raises:
+            InputError: If observations are images.
+        """
+        if len(env.observation_space.shape or ()) != 1:
+            raise InputError("bc takes no images: give another --observation, or the algorithm tqc")
+        self.config, self._space, self._seed = config, env.action_space, seed
+        self._symmetry = symmetry if config.symmetry else None
+        sizes = [*(env.observation_space.shape or ()), *config.net_arch, *(env.action_space.shape or ())]
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            linear = [torch.nn.Linear(into, out) for into, out in zip(sizes[:-1], sizes[1:], strict=True)]
+        layers = [layer for pair in zip(linear, [torch.nn.ReLU() for _ in linear], strict=True) for layer in pair]
+        self.network = torch.nn.Sequential(*layers[:-1])
+        self.episodes = 0
+        self._observations: list[np.ndarray] = []
+        self._actions: list[np.ndarray] = []
+        self._loss = np.nan
+
+    def on_episode_start(self) -> None:
+        """Count the episode."""
+        self.episodes += 1
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the policy's action, clipped to the action space."""
+        space: Any = self._space
+        with torch.no_grad():
+            action = self.network(torch.as_tensor(observation, dtype=torch.float32)).numpy()
+        return np.clip(action, space.low, space.high)
+
+    def on_step(self, transition: Transition) -> None:
+        """Store a transition of a demonstration, and its symmetric copies."""
+        if self.episodes > self.config.demonstration_episodes:
+            return
+        observation, action = np.float32(transition.observation), np.float32(transition.action)
+        self._observations.append(observation)
+        self._actions.append(action)
+        if self._symmetry is not None:
+            self._observations.extend(np.float32(self._symmetry.observations @ observation))
+            self._actions.extend(np.float32(self._symmetry.actions @ action))
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Train after the last demonstration."""
+        if self.episodes == self.config.demonstration_episodes and self._observations:
+            self._train()
+        return {}
+
+    def _train(self) -> None:
+        random = np.random.default_rng(self._seed)
+        observations, actions = (
+            torch.from_numpy(np.array(self._observations)),
+            torch.from_numpy(np.array(self._actions)),
+        )
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=self.config.learning_rate)
+        for _ in range(self.config.gradient_steps):
+            batch = random.integers(len(observations), size=self.config.batch_size)
+            loss = torch.nn.functional.mse_loss(self.network(observations[batch]), actions[batch])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        self._loss = float(loss)
+
+    def metrics(self) -> Mapping[str, float]:
+        """Return the loss of the last batch."""
+        return {"train/loss": self._loss} if np.isfinite(self._loss) else {}
+
+    def policy(self, description: Mapping[str, Any]) -> Policy:
+        """Return the cloned policy; `description` holds further entries of its description."""
+        return export_layers([*self.network], self._space, {"squash": "clip", **description})
+
+    def has_diverged(self) -> bool:
+        """Return True if a parameter is NaN or infinite."""
+        return not bool(torch.isfinite(parameters_to_vector(self.network.parameters())).all())
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
+        arrays = {f"network/{name}": value.numpy() for name, value in self.network.state_dict().items()}
+        if self._observations:
+            arrays |= {"observations": np.array(self._observations), "actions": np.array(self._actions)}
+        return arrays, {"episodes": self.episodes}
+
+    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Set the state to what `state` returned; raise KeyError or RuntimeError if it does not fit."""
+        names = self.network.state_dict()
+        self.network.load_state_dict({name: torch.from_numpy(np.array(arrays[f"network/{name}"])) for name in names})
+        self._observations = [*arrays.get("observations", ())]
+        self._actions = [*arrays.get("actions", ())]
+        self.episodes = values["episodes"]
