@@ -1,6 +1,7 @@
 """Behavior cloning: a policy that is regressed on the actions of a demonstrator, without reinforcement learning."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -52,7 +53,7 @@ class BcLearner(Learner):
         sizes = [*(env.observation_space.shape or ()), *config.net_arch, *(env.action_space.shape or ())]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            linear = [torch.nn.Linear(into, out) for into, out in zip(sizes[:-1], sizes[1:], strict=True)]
+            linear = [torch.nn.Linear(into, out) for into, out in pairwise(sizes)]
         layers = [layer for pair in zip(linear, [torch.nn.ReLU() for _ in linear], strict=True) for layer in pair]
         self.network = torch.nn.Sequential(*layers[:-1])
         self.episodes = 0

@@ -180,3 +180,56 @@ def test_configuration_of_a_run_holds_the_new_settings():
     values = config_values(resolve_preset(None, "td3"))
     assert values["exploration_noise"] == 0.1
     assert make_config("td3", {k: v for k, v in values.items() if k != "algorithm"}) == resolve_preset(None, "td3")
+
+
+def demonstrated(observation):
+    return np.array([0.5 * observation[0], -0.8 * observation[1] * observation[2]], np.float32)
+
+
+def clone(learner, episodes, rng, length=20):
+    for _ in range(episodes):
+        learner.on_episode_start()
+        for step in range(length):
+            seen, following = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
+            learner.on_step(Transition(seen, demonstrated(seen), 0.0, following, False, step == length - 1, {}))
+        learner.on_episode_end({"success": 1})
+
+
+def test_behavior_cloning_acts_as_the_demonstrator():
+    config = make_config("bc", {"demonstration_episodes": 4, "gradient_steps": 400, "net_arch": "32,32"})
+    learner = make(config)
+    rng = np.random.default_rng(0)
+    clone(learner, 3, rng)
+    arrays, values = learner.state()
+    clone(learner, 1, np.random.default_rng(5))
+    clone(learner, 1, rng)  # episodes of its own change nothing
+    seen = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
+    policy = learner.policy({"observation_shape": [3]})
+    errors = [policy(one) - demonstrated(one) for one in seen]
+    assert np.sqrt(np.mean(np.square(errors))) < 0.1
+    np.testing.assert_allclose(learner.act(seen[0]), policy(seen[0]), atol=1e-6)
+    assert learner.metrics()["train/loss"] < 0.02
+    again = make(config)
+    again.restore(arrays, values)
+    clone(again, 1, np.random.default_rng(5))
+    np.testing.assert_array_equal(again.act(seen[1]), learner.act(seen[1]))
+
+
+def test_behavior_cloning_refuses_no_demonstrations():
+    assert make_config("bc", {"demonstration_episodes": 1}).demonstration_episodes == 1
+    with pytest.raises(InputError, match="learns from demonstrations"):
+        make_config("bc", {"demonstration_episodes": 0})
+
+
+def test_actions_become_certain_over_the_base_motion_steps():
+    settings = {"net_arch": "8", "learning_starts": 10_000, "base_motion_steps": 2000}
+    learner = LEARNERS.get("sac")(
+        resolve_preset(None, "sac", settings), SpacesOnlyEnv(), action_repeat=1, seed=0, max_transitions=80
+    )
+    learner._constant_action = None
+    shares = []
+    for learner.transitions in (0, 1000, 2000):
+        shares.append(np.mean([learner.act(OBSERVATION).any() for _ in range(300)]))
+    assert shares[0] == 0.0
+    assert 0.4 < shares[1] < 0.6
+    assert shares[2] == 1.0
