@@ -91,10 +91,8 @@ class BcLearner(Learner):
 
     def _train(self) -> None:
         random = np.random.default_rng(self._seed)
-        observations, actions = (
-            torch.from_numpy(np.array(self._observations)),
-            torch.from_numpy(np.array(self._actions)),
-        )
+        observations = torch.from_numpy(np.array(self._observations))
+        actions = torch.from_numpy(np.array(self._actions))
         optimizer = torch.optim.Adam(self.network.parameters(), lr=self.config.learning_rate)
         for _ in range(self.config.gradient_steps):
             batch = random.integers(len(observations), size=self.config.batch_size)

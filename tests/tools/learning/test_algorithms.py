@@ -182,7 +182,7 @@ def test_configuration_of_a_run_holds_the_new_settings():
     assert make_config("td3", {k: v for k, v in values.items() if k != "algorithm"}) == resolve_preset(None, "td3")
 
 
-def demonstrated(observation):
+def demonstrator_action(observation):
     return np.array([0.5 * observation[0], -0.8 * observation[1] * observation[2]], np.float32)
 
 
@@ -191,7 +191,7 @@ def clone(learner, episodes, rng, length=20):
         learner.on_episode_start()
         for step in range(length):
             seen, following = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
-            learner.on_step(Transition(seen, demonstrated(seen), 0.0, following, False, step == length - 1, {}))
+            learner.on_step(Transition(seen, demonstrator_action(seen), 0.0, following, False, step == length - 1, {}))
         learner.on_episode_end({"success": 1})
 
 
@@ -205,7 +205,7 @@ def test_behavior_cloning_acts_as_the_demonstrator():
     clone(learner, 1, rng)  # episodes of its own change nothing
     seen = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
     policy = learner.policy({"observation_shape": [3]})
-    errors = [policy(one) - demonstrated(one) for one in seen]
+    errors = [policy(one) - demonstrator_action(one) for one in seen]
     assert np.sqrt(np.mean(np.square(errors))) < 0.1
     np.testing.assert_allclose(learner.act(seen[0]), policy(seen[0]), atol=1e-6)
     assert learner.metrics()["train/loss"] < 0.02
