@@ -7,13 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.experiments.declaration import load_study
+from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.tables import read_table
+from research.results.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+from research.studies import study_path
 
 COLUMNS = (
-    "method", "training episodes (seeds)", "held-out success [%], each seed of 100", "episodes to convergence",
+    "method", "training episodes (seeds)", "held-out success [%], each seed of 100", "IQM of the seeds [%] (95 %)",
+    "episodes to convergence",
     "max. commanded violation", "peak force held out (in training) [N]",
 )  # fmt: skip
 README_COLUMNS = (
@@ -22,6 +28,8 @@ README_COLUMNS = (
 )  # fmt: skip
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
+GUIDED = ("sct", "kgrl", "skgrl")
+MIN_SEEDS = 3  # of an interval over seeds
 NO_DEMONSTRATION = ("zero action", *BASELINES[1:])  # a template has no demonstration
 
 
@@ -212,7 +220,8 @@ def task_table(task: str, tables: Path) -> str:
     for section in SECTIONS.get(task, ()):
         rows = [(row.name, *_cells(seeds)) for row in section.rows if len(seeds := last_rows(tables, row))]
         if rows:
-            parts.append(f"### {section.title}\n\n{_markdown(COLUMNS, rows)}\n")
+            remarks = "".join(f"\n{line}\n" for line in (*improvements(section, tables), *knowledge(section, tables)))
+            parts.append(f"### {section.title}\n\n{_markdown(COLUMNS, rows)}\n{remarks}")
     return "\n".join(parts)
 
 
@@ -271,7 +280,7 @@ def _cells(seeds: pd.DataFrame) -> tuple[str, ...]:
     """Return the cells of a method's row after its name."""
     if not _is_trained(seeds):
         parts = [_safety(seeds, "")]
-        return "–", "; ".join(map(_interval, seeds.to_dict("records"))), "–", _violation(parts), _forces(parts)
+        return "–", "; ".join(map(_interval, seeds.to_dict("records"))), "–", "–", _violation(parts), _forces(parts)
     held_out = _is_evaluated(seeds)
     episodes = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"]))
     column = "success_rate" if held_out else "training_success_rate"
@@ -280,7 +289,73 @@ def _cells(seeds: pd.DataFrame) -> tuple[str, ...]:
     converged = _join(seeds["training_episodes_to_convergence"])
     parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]
     forces = _forces(parts) if held_out else f"({_forces(parts)})"
-    return f"{episodes} ({_span(seeds['seed'])})", success, converged, _violation(parts), forces
+    return f"{episodes} ({_span(seeds['seed'])})", success, _middle(seeds), converged, _violation(parts), forces
+
+
+def _scores(seeds: pd.DataFrame) -> list[np.ndarray] | None:
+    """Return the held-out success of the seeds; None for too few of them, or a method that does not learn."""
+    if not (len(seeds) >= MIN_SEEDS and _is_trained(seeds) and _is_evaluated(seeds)):
+        return None
+    return [seeds["success_rate"].to_numpy(dtype=float)]
+
+
+def _middle(seeds: pd.DataFrame) -> str:
+    """Return the interquartile mean of the seeds' held-out success [%] with its interval; a dash for too few seeds."""
+    scores = _scores(seeds)
+    if scores is None:
+        return "–"
+    low, high = bootstrap_interval(interquartile_mean, scores)
+    return f"{100 * interquartile_mean(scores):.3g} ({100 * low:.3g}–{100 * high:.3g})"
+
+
+def improvements(section: Section, tables: Path) -> list[str]:
+    """Return a sentence for each guided method: the probability that it is better than the best peer."""
+    scores = {row.name: found for row in section.rows if (found := _scores(last_rows(tables, row))) is not None}
+    peers = [row.name for row in section.rows if row.name in scores and not is_guided(row)]
+    if not peers:
+        return []
+    best = max(peers, key=lambda name: (float(interquartile_mean(scores[name])), -peers.index(name)))
+    lines = []
+    for name in (name for name in section.guided if name in scores):
+        pair = scores[name], scores[best]
+        low, high = bootstrap_interval(probability_of_improvement, *pair)
+        lines.append(
+            f"A seed of {name} succeeds more often than one of {best} with probability "
+            f"{probability_of_improvement(*pair):.2f} (95 %: {low:.2f}–{high:.2f}; ties count half)."
+        )
+    return lines
+
+
+def is_guided(row: Row) -> bool:
+    """Return True for a method of the thesis, and False for a peer that it is compared with."""
+    study = load_study(study_path(row.study))
+    environment = {**study.env, **study.methods[row.method].env}
+    return environment.get("guidance", GUIDED[0]) in GUIDED
+
+
+def knowledge(section: Section, tables: Path) -> list[str]:
+    """Return a sentence that names the demonstrated episodes of the learned methods, if they differ."""
+    shown: dict[int, list[str]] = {}
+    for row in section.rows:
+        if _is_trained(last_rows(tables, row)):
+            shown.setdefault(demonstrated_episodes(row), []).append(row.name)
+    if len(shown) < 2:
+        return []
+    parts = [f"{number or 'no'} demonstrated episodes: {', '.join(names)}" for number, names in sorted(shown.items())]
+    return [f"**The methods do not have equal knowledge.** {'; '.join(parts)}."]
+
+
+def demonstrated_episodes(row: Row) -> int:
+    """Return the number of episodes of a demonstrator that a method of a study learns from."""
+    study = load_study(study_path(row.study))
+    choices = [study.learner, study.methods[row.method].learner]
+    algorithm, preset = (
+        next((value for choice in reversed(choices) if (value := getattr(choice, name)) is not None), None)
+        for name in ("algorithm", "preset")
+    )
+    settings = {**choices[0].settings, **choices[1].settings}
+    default = 0 if algorithm is None else resolve_preset(preset, algorithm).demonstration_episodes
+    return int(settings.get("demonstration_episodes", default))
 
 
 def _is_trained(seeds: pd.DataFrame) -> bool:

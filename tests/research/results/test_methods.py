@@ -9,6 +9,7 @@ from research.results.methods import (
     BASELINES,
     NO_DEMONSTRATION,
     SECTIONS,
+    knowledge,
     readme_table,
     task_table,
     update_readme,
@@ -88,12 +89,32 @@ def test_each_seed_is_listed_after_its_last_episode(tmp_path):
     assert residual[1:] == [
         "60 (7, 8)",
         "98, 100",
+        "–",
         "15, never",
         "0.40 mm, in 8 episodes",
         "14.5 (31.0)",
     ]
     (row,) = rows(readme_table(tmp_path))
     assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", "60 (1)", "3 / 6"]
+
+
+def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
+    template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2\n"
+    rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "residual_far": (0.1, 0.2, 0.3, 0.4)}
+    lines = [template.format(name, seed, rate) for name, each in rates.items() for seed, rate in enumerate(each)]
+    (tmp_path / "connector_hard.csv").write_text(HEAD + "".join(lines))
+    text = task_table("BncConnector", tmp_path)
+    assert [row[3].split(" (")[0] for row in rows(text) if len(row) > 3] == ["100", "90", "25"]
+    # Of the 16 pairs of KGRL and residual RL, ten are won and five are ties.
+    assert "A seed of KGRL succeeds more often than one of residual RL with probability 0.78 (95 %: " in text
+    assert "equal knowledge" not in text
+
+
+def test_methods_of_unequal_knowledge_are_marked():
+    (hard, _) = SECTIONS["GridClamp"]
+    (sentence,) = knowledge(hard, TABLES)
+    assert "equal knowledge.** no demonstrated episodes: residual RL, RL of 6D velocities; 3 demonstrated" in sentence
+    assert knowledge(SECTIONS["BncConnector"][0], TABLES) == []
 
 
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
@@ -109,7 +130,7 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
         "kgrl,0,60,,60,1.0,0,-0.01,0,0.0\nkgrl,1,60,,60,0.5,3,1e-12,0,0.0\nkgrl,2,60,,60,0.25,,0,0,3.0\n"
     )
     (row,) = rows(task_table("NarrowPassage", tmp_path))
-    assert row[1:] == ["60 (0–2)", "100, 50, 25 in training", "0, 3, never", "none", "(3.0)"]
+    assert row[1:] == ["60 (0–2)", "100, 50, 25 in training", "–", "0, 3, never", "none", "(3.0)"]
 
 
 def test_update_readme_refuses_a_text_without_markers():
