@@ -76,12 +76,12 @@ class BcLearner(Learner):
         """Store a transition of a demonstration, and its symmetric copies."""
         if self.episodes > self.config.demonstration_episodes:
             return
-        observation, action = np.float32(transition.observation), np.float32(transition.action)
+        observation, action = (np.asarray(x, np.float32) for x in (transition.observation, transition.action))
         self._observations.append(observation)
         self._actions.append(action)
         if self._symmetry is not None:
-            self._observations.extend(np.float32(self._symmetry.observations @ observation))
-            self._actions.extend(np.float32(self._symmetry.actions @ action))
+            self._observations.extend(np.asarray(self._symmetry.observations @ observation, np.float32))
+            self._actions.extend(np.asarray(self._symmetry.actions @ action, np.float32))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Train after the last demonstration."""

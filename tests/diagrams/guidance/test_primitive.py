@@ -179,7 +179,7 @@ def test_nothing_is_computed_between_control_steps(skill):
     for kind in PRIMITIVE_GUIDANCE:
         guidance = build(kind, skill)
         calls = []
-        system = guidance.GetSubsystemByName("kmp" if "kmp" in kind or "residual" in kind else "lc_ns_kmp")
+        system = guidance.GetSubsystemByName("kmp" if guidance.HasSubsystemNamed("kmp") else "lc_ns_kmp")
         predict = system._primitive.predict
         system._primitive.predict = lambda *a, calls=calls, predict=predict: calls.append(a) or predict(*a)
         simulator = Simulator(guidance)
