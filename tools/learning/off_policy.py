@@ -316,7 +316,7 @@ class OffPolicyLearner(Learner):
         The progressive exploration of Yuan et al. (2025): the policy acts with a probability that grows linearly.
         """
         steps = self.config.base_motion_steps
-        return not self._is_greedy and self.transitions < steps and self.random.random() * steps >= self.transitions
+        return not self.is_greedy and self.transitions < steps and self.random.random() * steps >= self.transitions
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
         """Return a sampled action; a subclass with a deterministic policy adds noise."""
