@@ -87,6 +87,10 @@ class Registry(Generic[Entry]):
         """Return the names of all entries, sorted."""
         return sorted({*self._declarations, *self._points, *self._entries})
 
+    def is_packaged(self, name: str) -> bool:
+        """Return True if a module of the package registers the name."""
+        return name in self._declarations
+
     def declared(self, name: str, keyword: str) -> Any:
         """Return an entry's attribute that is a keyword argument of its decorator.
 

@@ -55,6 +55,14 @@ def train(
         list[str] | None,
         option("Write a learning log into the run's logs/: {log_formats}; repeatable.", choices="log_formats"),
     ] = None,
+    pictures: Annotated[
+        bool | None,
+        option(
+            "Draw the learning curve and a page of held-out episodes at the end; guiderail visualize RUN draws the "
+            "page later.  [default: yes]",
+            "--pictures/--no-pictures",
+        ),
+    ] = None,
     human_in_the_loop: Annotated[
         bool,
         option("A supervisor watches in the browser, corrects, stops and labels successes.", "--human-in-the-loop"),
@@ -101,6 +109,23 @@ def train(
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     if num_envs is not None:
         settings["num_envs"] = str(num_envs)
+    if task is not None and not modules and not resume:
+        if out is None:
+            raise InputError("the run needs a folder: name one with --out RUN")
+        from guiderail.tools.learning.config import check_choices
+        from guiderail.tools.learning.learner import check_log_formats
+
+        check_log_formats(log or ())
+        check_choices(
+            task,
+            guidance=environment.get("guidance"),
+            station=environment.get("station"),
+            algorithm=algorithm,
+            preset=preset,
+            settings=settings,
+            episodes=episodes,
+            seed=seed,
+        )
     if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.datasets.validate import leaves_demonstrations
 
@@ -147,6 +172,7 @@ def train(
         imports=modules,
         step_log=step_log,
         log=log or (),
+        pictures=pictures is not False,
         make_supervisor=_wait_for_supervisor if human_in_the_loop else None,
         find_demonstrator=_scripted_policy,
     )

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy  # `scipy.stats` is imported on first use
 
 from guiderail.diagrams.envs.trace import EpisodeTrace, Metric, mean_jerk
 from guiderail.diagrams.tasks.registry import TASKS
@@ -47,10 +47,10 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, tuple[float, flo
     Of fewer than four values none is left out.
     """
     array = np.asarray(values, float)
-    mean = float(stats.trim_mean(array, TRIMMED_FRACTION))
+    mean = float(scipy.stats.trim_mean(array, TRIMMED_FRACTION))
     if len(array) < 2:
         return mean, None
-    low, high = _bootstrap(array, lambda x, axis: stats.trim_mean(x, TRIMMED_FRACTION, axis=axis))
+    low, high = _bootstrap(array, lambda x, axis: scipy.stats.trim_mean(x, TRIMMED_FRACTION, axis=axis))
     return mean, (float(low), float(high))
 
 
@@ -58,7 +58,7 @@ def _bootstrap(values: np.ndarray, statistic: Any) -> tuple[Any, Any]:
     if np.ptp(values, axis=0).max() == 0:  # SciPy warns if there is nothing to resample
         mean = statistic(values, axis=0)
         return mean, mean
-    interval = stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         (values,), statistic, axis=0, vectorized=True, confidence_level=CONFIDENCE, n_resamples=RESAMPLES,
         method="percentile", rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
@@ -67,7 +67,7 @@ def _bootstrap(values: np.ndarray, statistic: Any) -> tuple[Any, Any]:
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
     """Return the 95 % Wilson interval of a success rate."""
-    interval = stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
+    interval = scipy.stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -96,7 +96,7 @@ def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[
     censored = [max(n - CONVERGED_SUCCESSES, 0) for after, n in zip(converged, episodes, strict=True) if after is None]
     if not known:
         return np.array([0.0]), np.array([1.0])
-    function = stats.ecdf(stats.CensoredData(uncensored=known, right=censored)).sf
+    function = scipy.stats.ecdf(scipy.stats.CensoredData(uncensored=known, right=censored)).sf
     return np.append(0.0, function.quantiles), np.append(1.0, function.probabilities)
 
 

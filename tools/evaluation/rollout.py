@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
 
@@ -113,6 +112,8 @@ def rollout(
         held_out: Sample the conditions from the held-out distribution, by the seed.
         options: Options of the reset.
     """
+    from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row  # pandas takes a second
+
     observation = (
         reset_held_out(env, seed or 0, **(options or {}))
         if held_out

@@ -12,8 +12,12 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
+from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.learning.learner import (
     LEARNERS,
     DeferredLearner,
@@ -275,6 +279,43 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
         raise InputError(
             f"the learner's {name} cannot be {brief(values.get(name))} ({first['msg'].lower()}): give a value{example}"
         ) from None
+
+
+def check_choices(
+    task: str,
+    *,
+    guidance: str | None,
+    station: str | None,
+    algorithm: str | None,
+    preset: str | None,
+    settings: Mapping[str, Any],
+    episodes: int | None,
+    seed: int | None,
+) -> None:
+    """Check what can be wrong in a run whatever the options of its task are, without importing Drake.
+
+    None stands for a default. A task of another package may have guidance and stations of its own.
+
+    Raises:
+        InputError: If a name is unknown or a value is out of range.
+    """
+    for registry, name in ((GUIDANCE, guidance), (STATIONS, station)):
+        if name is not None and TASKS.is_packaged(task) and name not in registry.names():
+            registry.get(name)  # refuses the name
+    if algorithm is not None or preset is not None:
+        resolve_preset(preset, algorithm, settings)
+    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)}
+    for name in settings:
+        if name not in known - {"algorithm"}:
+            raise InputError(f"no learner has a setting {brief(name)}: {did_you_mean(name, known - {'algorithm'})}")
+    check_episodes(1 if episodes is None else episodes)
+    check_seed(0 if seed is None else seed)
+
+
+def check_episodes(episodes: int) -> None:
+    """Raise an InputError unless a run has an episode."""
+    if episodes < 1:
+        raise InputError(f"a run needs at least one episode, not {episodes}")
 
 
 def config_values(config: LearnerConfig) -> dict[str, Any]:

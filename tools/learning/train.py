@@ -21,7 +21,7 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import config_values, default_preset, make_config, resolve_preset
+from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.interventions import Supervisor
 from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
@@ -89,6 +89,7 @@ def train(
     log: str | Sequence[str] = (),
     callbacks: Any = None,
     resume: bool = False,
+    pictures: bool = True,
     **options: Any,
 ) -> Run:
     """Train a policy and leave a run folder.
@@ -107,6 +108,7 @@ def train(
         callbacks: Callback of Stable-Baselines3, or a list of them; one that returns False ends the training after the
             episode.
         resume: Continue a run that was stopped, with the result of an undisturbed one.
+        pictures: Draw the learning curve and the replay page after training.
         **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
 
     Returns:
@@ -120,7 +122,7 @@ def train(
     return start_or_resume(
         name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
         episodes=episodes, seed=seed, log=log, resume=resume, imports=imports, sb3_callbacks=callbacks,
-        find_demonstrator=partial(make_baseline, name="scripted"),
+        pictures=pictures, find_demonstrator=partial(make_baseline, name="scripted"),
     )  # fmt: skip
 
 
@@ -138,6 +140,7 @@ def start_or_resume(
     imports: Sequence[str] = (),
     step_log: bool | None = None,
     log: str | Sequence[str] = (),
+    pictures: bool = True,
     sb3_callbacks: Any = None,
     make_supervisor: Callable[[], Supervisor] | None = None,
     find_demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
@@ -181,6 +184,8 @@ def start_or_resume(
             folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervisor=supervisor,
             log=formats, sb3_callbacks=sb3_callbacks,
         )  # fmt: skip
+    if not pictures:
+        return Run(out)
     _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)
     return Run(out, draw_pictures(out))
 
@@ -206,8 +211,7 @@ def configure(
     Raises:
         InputError: If a name is unknown or a value is out of range.
     """
-    if episodes < 1:
-        raise InputError(f"a run needs at least one episode, not {episodes}")
+    check_episodes(episodes)
     check_seed(seed)
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)

@@ -254,6 +254,32 @@ for words in ("--version", "--help", "study --help", "evaluate --help", "list ta
     assert result.returncode == 0, result.stderr
 
 
+def test_train_refuses_mistakes_before_slow_imports(tmp_path):
+    code = """
+import sys
+from guiderail.tools.cli.main import main
+for words in (
+    "", "--guidance nope", "--env guidance=nope", "--station nope", "--algorithm nope", "--preset nope", "--set nope=1",
+    "--preset tqc_fast --set batch_size=0", "--episodes 0", "--seed -1", "--log nope",
+):
+    try:
+        main(["train", "BncConnector", *words.split(), *(["--out", "run"] if words else [])])
+    except SystemExit as end:
+        assert end.code == 2, words
+    assert not {"pydrake", "pandas", "torch", "scipy"} & set(sys.modules), words
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert len(result.stderr.splitlines()) == 11, result.stderr
+    assert not any(tmp_path.iterdir())
+
+
+def test_train_draws_no_pictures_when_none_are_wanted(capsys, tmp_path):
+    options = ["--no-pictures", "--episodes", 1, "--set", "net_arch=8"]
+    assert call(capsys, "train", "Bead", "--out", tmp_path / "run", *options)[0] == 0
+    assert not {"replay.html", "learning_curve.png"} & {path.name for path in (tmp_path / "run").iterdir()}
+
+
 def test_completion_offers_commands_and_choices(monkeypatch, capsys):
     for words, expected in (("guiderail tra", "train"), ("guiderail train Nar", "NarrowPassage")):
         monkeypatch.setenv("_GUIDERAIL_COMPLETE", "complete_bash")
