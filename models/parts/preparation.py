@@ -150,7 +150,7 @@ def make_compliant(
     """
     order = sorted(surfaces, key=lambda name: surfaces[name].num_triangles)
     failure, make, seconds = {
-        "convex": ("too intricate for convex pieces", _cut_bodies, CUT_SECONDS),
+        "convex": ("too intricate for convex pieces", cut_bodies, CUT_SECONDS),
         "tetrahedra": ("no tetrahedra", _mesh_bodies, TETRAHEDRA_SECONDS),
     }[kind]
     for name in order:
@@ -166,7 +166,7 @@ def make_compliant(
         yield name, accepted
 
 
-def _cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
+def cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
     """Return convex pieces of all bodies; None if there are too many or they deviate."""
     from guiderail.models.parts.solids import to_manifold
 

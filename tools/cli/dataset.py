@@ -131,6 +131,9 @@ def create_task(
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,
     friction: Annotated[float, option("Friction coefficient of all surfaces.")] = 0.2,
     scenario: Annotated[list[Path] | None, option("Drake model directives of the surroundings; repeatable.")] = None,
+    hard_episodes: Annotated[
+        int, option("Episodes of each baseline policy per setting that calibrate difficulty=hard; 0: not calibrated.")
+    ] = 10,
     as_json: cli.Json = False,
 ) -> None:
     """Create an insertion task from two mesh files.
@@ -155,6 +158,7 @@ def create_task(
         force_limit=force_limit,
         friction=friction,
         scenario=scenario or (),
+        hard_episodes=hard_episodes,
         say=(lambda text: None) if as_json else print_progress,
     )
     print_result(result, as_json)

@@ -40,6 +40,8 @@ CLEAR = 3.0 * MM  # height of the start above the rim
 MAX_GAP = 1.0 * MM  # between the bounding boxes of parts that are assembled
 MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
 MAX_FORCE = 1e4  # largest force limit [N]
+MAX_SEATED_TURN = 20.0  # turn of a plug in a straight socket that counts as seated [degrees]
+MAX_EPISODES = 100  # largest number of episodes of a calibration
 MAX_CENTER = 1.0  # largest distance of the axis from the plug's own [m]
 
 
@@ -115,6 +117,7 @@ def create_task(
     force_limit: float = COLLISION_FORCE,
     friction: float = 0.2,
     scenario: Sequence[Path] = (),
+    hard_episodes: int = 10,
     only_insert: bool = False,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> dict[str, Any]:
@@ -133,6 +136,8 @@ def create_task(
         force_limit: Contact force that ends an episode as a collision [N].
         friction: Friction coefficient of all surfaces.
         scenario: Files of Drake model directives of the surroundings.
+        hard_episodes: Episodes of each baseline policy for each setting in the calibration of `difficulty=hard`; with 0
+            it is not calibrated.
         only_insert: Stop after the scripted insertions and leave no folder; for benchmarks.
         say: Called with a sentence on each intermediate result.
 
@@ -140,7 +145,7 @@ def create_task(
         InputError: If the parts cannot be used; no folder is left then.
     """
     check_new(out, "folder with --out, or remove it")
-    _check_arguments(plug_pose, turn, shrink, force_limit, friction, scenario)
+    _check_arguments(plug_pose, turn, shrink, force_limit, friction, scenario, hard_episodes)
     clock = Stopwatch()
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     for part in parts:
@@ -184,7 +189,12 @@ def create_task(
         task = make_file(choice.contact, choice.push)
         measured, search = _measure(folder, task, choice, prepared, clock, say)
         if not only_insert:
-            _write_task(folder, task.model_copy(update={"search": search}), choice, measured, clock, say)
+            task = task.model_copy(update={"search": search})
+            from guiderail.tools.parts.mujoco_check import add_convex_pieces
+
+            if not (scenario or choice.contact.snapping):
+                task = add_convex_pieces(folder, task, surfaces, tolerance, say)
+            measured = _write_task(folder, task, choice, measured, hard_episodes, clock, say)
     if only_insert:
         shutil.rmtree(out)
         return measured
@@ -222,6 +232,7 @@ def _check_arguments(
     force_limit: float,
     friction: float,
     scenario: Sequence[Path],
+    hard_episodes: int,
 ) -> None:
     """Raise InputError for arguments that would be refused only after minutes."""
     if not np.isfinite(plug_pose).all():
@@ -232,6 +243,8 @@ def _check_arguments(
         raise InputError(f"--force-limit is positive and at most {MAX_FORCE:g} N, not {force_limit:g}")
     if not 0.0 <= shrink <= MAX_SHRINK:
         raise InputError(f"--shrink is from 0 to {1e3 * MAX_SHRINK:g} mm, not {1e3 * shrink:g}")
+    if not 0 <= hard_episodes <= MAX_EPISODES:
+        raise InputError(f"--hard-episodes is from 0 to {MAX_EPISODES}, not {hard_episodes}")
     from guiderail.diagrams.envs.options import validate_options
     from guiderail.diagrams.tasks.part.file import FILE_NAME, Piece
 
@@ -317,12 +330,14 @@ def _write_task(
     file: PartTaskFile,
     choice: Choice,
     measured: dict[str, Any],
+    hard_episodes: int,
     clock: Stopwatch,
     say: Callable[[str], None],
-) -> None:
-    """Write demonstrations, task file and page, and add to the measurements."""
+) -> dict[str, Any]:
+    """Write demonstrations, task file and page, and return the measurements with those of the demonstrations."""
     from guiderail.diagrams.tasks.part.file import write_task_file
-    from guiderail.tools.parts.trial import demonstrate, demonstration_time, write_preview
+    from guiderail.tools.parts.difficulty import calibrate
+    from guiderail.tools.parts.trial import demonstrate, demonstration_time, triangles_of, write_preview
 
     say(f"recording demonstrations: about {5.0 * demonstration_time(file) / measured['real_time_factor']:.0f} s")
     succeeded = demonstrate(folder, file)
@@ -335,7 +350,14 @@ def _write_task(
     measured["total_s"] = clock.read()
     file = file.model_copy(update={"measured": measured})
     write_task_file(folder, file)
+    if hard_episodes:
+        radius = float(np.hypot(*triangles_of(folder / file.plug.visual).reshape(-1, 3)[:, :2].T).max())
+        file = calibrate(folder, file, radius, hard_episodes, say)
+        if "hard" in file.measured:
+            file.measured["hard"]["seconds"] = round(clock.read() - measured["total_s"], 2)
+        write_task_file(folder, file)
     write_preview(folder / "preview.html", folder, file, choice.aligned)
+    return file.measured
 
 
 def _task_file(
@@ -347,7 +369,7 @@ def _task_file(
     scenario: Sequence[str],
 ) -> PartTaskFile:
     from guiderail.diagrams.envs.options import validate_options
-    from guiderail.diagrams.tasks.part.file import NAMESPACE, MotionNumbers, PartModel, PartTaskFile, Piece
+    from guiderail.diagrams.tasks.part.file import NAMESPACE, MotionNumbers, PartModel, PartTaskFile, Piece, Tolerance
 
     path, friction = values["path"], values["friction"]
     models = {}
@@ -374,6 +396,8 @@ def _task_file(
             {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push},
             "a motion",
         ),
+        # Without a turn at the end, the depth shows that the walls accept the orientation, or that any one fits.
+        tolerance=Tolerance.model_validate({} if path.turn else {"turn": MAX_SEATED_TURN}),
         force_limit=values["force_limit"],
         time_step=contact.time_step,
         sides=values["sides"][0],

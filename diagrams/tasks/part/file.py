@@ -36,7 +36,7 @@ HARD: dict[str, Any] = {
     "observation": "center_of_pressure",
     "action_repeat": 5,
 }
-"""Options of difficulty="hard": the socket is farther off than a chamfer catches, and elsewhere in every episode."""
+"""Options of difficulty="hard" without a calibration: the socket is farther off than most lead-ins catch."""
 
 AUTOMATE: dict[str, Any] = {
     "fixture_offset": "per_episode",
@@ -75,6 +75,9 @@ class PartModel(Options):
     center: Numbers = Field(min_length=3, max_length=3, description="center of mass in the target frame [m]")
     gyration: Number = Field(gt=0, description="radius of gyration [m]")
     pieces: tuple[Piece, ...] = Field(min_length=1, description="collision meshes")
+    convex: tuple[str, ...] = Field(
+        (), description="OBJ files of convex pieces for station=mujoco, which both parts need; default: not offered"
+    )
 
 
 class MotionNumbers(Options):
@@ -210,7 +213,7 @@ class SearchNumbers(Options):
         le=1,
         description="1 if the center of pressure lies towards the socket's axis, -1 if away from it, as measured",
     )
-    reach: Number = Field(3.1 * MM, gt=0, le=20 * MM, description="displacement of the command at an action of 1 [m]")
+    speed: Number = Field(2.0, gt=0, le=10, description="change of the action [1/s]")
 
 
 class PartTaskFile(Options):
@@ -259,7 +262,13 @@ class PartTaskFile(Options):
         """Names of the files that it refers to, in its folder."""
         models = (self.plug, self.socket)
         meshes = [*(model.visual for model in models), *(piece.file for model in models for piece in model.pieces)]
-        return (*meshes, self.demonstrations.file, *self.scenario)
+        convex = [file for model in models for file in model.convex if file not in meshes]
+        return (*meshes, *convex, self.demonstrations.file, *self.scenario)
+
+    @property
+    def is_convex(self) -> bool:
+        """True if both parts have convex pieces, and no other objects are around."""
+        return bool(self.plug.convex and self.socket.convex) and not self.scenario
 
     @cached_property
     def turn(self) -> float:

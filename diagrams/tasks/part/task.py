@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import cache, cached_property, partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, cast
 
@@ -15,6 +15,7 @@ from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import (
     OBSERVATIONS,
@@ -32,7 +33,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.objects.insertion import COMMAND_SCALE, HISTORY_VARIANCE, LEVER_SCALE
+from guiderail.models.objects.insertion import HISTORY_VARIANCE, LEVER_SCALE
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
@@ -45,8 +46,8 @@ if TYPE_CHECKING:
 COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
-Z, CENTER_OF_PRESSURE, COMMAND = 3, slice(13, 15), slice(15, 17)
-STEP = 0.5 * MM  # displacement of the command per action of the scripted search [m]
+TIME, Z, CENTER_OF_PRESSURE, COMMAND = 0, 3, slice(13, 15), slice(15, 17)
+IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
@@ -87,25 +88,47 @@ class PartUncertainty(BncUncertainty):
         return self._turned(rng.uniform(-side, side, 2), rng), np.zeros(2)
 
 
-def scripted_search(file: PartTaskFile, observation: np.ndarray) -> np.ndarray:
-    """Return an action (2,) that moves the command one step towards the socket's axis, as the center of pressure shows.
+class ScriptedSearch:
+    """Search by the center of pressure: on the rim, the action moves steadily towards the socket's axis.
 
-    Once the plug has dropped in, the command is constant. The last command is part of the observation.
-
-    Args:
-        file: Task file.
-        observation: Observation with the center of pressure.
-
-    Raises:
-        InputError: If the observation has no center of pressure.
+    Until the plug touches the rim and after it has dropped in, the action stays as it is. It is zero at the start of an
+    episode, which is where the observed time does not increase. The action is integrated here, because the displacement
+    by an action depends on the guidance and changes during the motion.
     """
-    if len(observation) < COMMAND.stop:
-        raise InputError('this policy needs the center of pressure: choose observation="center_of_pressure"')
-    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
-    height, length = 0.5 * file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
-    if height > file.motion.rim - STEP and length > 0.0:
-        command = command + file.search.lever_sign * STEP * lever / max(length, MM)
-    return np.clip(command / file.search.reach, -1.0, 1.0)
+
+    def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
+        """Construct the policy.
+
+        Args:
+            file: Task file.
+            duration: Returns the duration of the reference trajectory [s]; called at the first observation.
+        """
+        self._file, self._duration = file, duration
+        self._time, self._action = np.inf, np.zeros(2)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return an action (2,).
+
+        Args:
+            observation: Observation with the center of pressure.
+
+        Raises:
+            InputError: If the observation has no center of pressure.
+        """
+        if len(observation) < COMMAND.stop:
+            raise InputError('this policy needs the center of pressure: choose observation="center_of_pressure"')
+        time = 0.5 * (float(observation[TIME]) + 1.0) * self._duration()
+        passed = time - self._time
+        if passed <= 0.0:
+            self._action, passed = np.zeros(2), 0.0
+        self._time = time
+        lever = observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+        height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
+        if height > self._file.motion.rim - IN_SOCKET and length > 0.0:
+            search = self._file.search
+            change = search.lever_sign * search.speed * passed * lever / max(length, MM)
+            self._action = np.clip(self._action + change, -1.0, 1.0)
+        return self._action.copy()
 
 
 class PartInsertion(DemonstratedInsertion):
@@ -119,7 +142,6 @@ class PartInsertion(DemonstratedInsertion):
         file: Content of `task.yaml`.
     """
 
-    excluded_stations = ("mujoco",)  # it simulates analytic surfaces, not meshes
     Options = PartOptions
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
@@ -160,7 +182,13 @@ class PartInsertion(DemonstratedInsertion):
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted search by the center of pressure."""
-        return {"scripted_search": partial(scripted_search, cls.file)}
+        return {"scripted_search": ScriptedSearch(cls.file, cls._reference_duration)}
+
+    @classmethod
+    def _reference_duration(cls) -> float:
+        source = cls.file.demonstrations
+        reference = reference_of_file(cls.folder / source.file, source.components, source.floor)
+        return reference.num_steps * CONTROL_PERIOD
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
@@ -261,6 +289,8 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         cast(tuple[float, float, float], file.place),
         file.stiction_tolerance,
         tuple(str(folder / name) for name in file.scenario),
+        (file.plug.convex, file.socket.convex),
+        file.plug.pieces[0].friction,
     )
 
 
@@ -296,6 +326,7 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         "file": file,
         "defaults": defaults,
         "learner": learner,
+        "excluded_stations": () if file.is_convex else ("mujoco",),
         "__module__": __name__,
     }
     task = type(f"PartInsertion({folder})", (PartInsertion,), members)

@@ -14,6 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.models.common.parsing import add_models
+from guiderail.models.objects.surfaces import Hull, Surface
 
 PLUG, SOCKET = "plug", "socket"
 """Names of the bodies, and of the SDF files that hold them."""
@@ -28,6 +29,8 @@ class PartWorkcell(MovableWorkcell):
         place: Position of the target in the world, (3,) [m].
         stiction_tolerance: Largest creep of a sticking contact [m/s].
         scenario: Paths of Drake model directives of further objects.
+        convex: Names of the files of the convex pieces of plug and socket, for MuJoCo.
+        friction: Friction coefficient of the convex pieces.
     """
 
     fixture: ClassVar[str] = SOCKET
@@ -36,6 +39,8 @@ class PartWorkcell(MovableWorkcell):
     place: tuple[float, float, float] = (0.55, 0.0, 0.15)
     stiction_tolerance: float = 1e-5
     scenario: Sequence[str] = ()
+    convex: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    friction: float = 0.2
 
     @property
     def X_WF(self) -> RigidTransform:
@@ -60,3 +65,23 @@ class PartWorkcell(MovableWorkcell):
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Filter nothing: every piece of the plug may touch every piece of the socket."""
+
+    def fixture_surfaces(self) -> list[Surface]:
+        """Return the convex pieces of the socket."""
+        return self._surfaces(SOCKET, self.convex[1])
+
+    def workpiece_surfaces(self) -> list[Surface]:
+        """Return the convex pieces of the plug."""
+        return self._surfaces(PLUG, self.convex[0])
+
+    def _surfaces(self, body: str, files: Sequence[str]) -> list[Surface]:
+        return [
+            Surface(f"{body}_{number}", "parts", Hull(read_vertices(self.folder / file)), self.friction)
+            for number, file in enumerate(files)
+        ]
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """Return the vertices (V, 3) [m] of an OBJ file."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)

@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
     """Task folder of the simplest of the six parts of `learn_parts.py`."""
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
-    call("create-task", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
+    call("create-task", plug, socket, "--unit", "mm", "--out", where / "peg", "--hard-episodes", 2, "--json")
     yield where / "peg"
     # Other tests must not see the registered task.
     for name in [name for name in TASKS.names() if name.startswith("parts/")]:
@@ -135,19 +135,62 @@ def test_created_task_trains_with_its_own_learner(folder):
 def test_difficulties_of_a_created_task_bound_the_offset_and_the_command(folder):
     from guiderail.diagrams.envs.config import EnvConfig
 
-    for difficulty, is_inside in (
-        ("hard", lambda x, y, *turn: 2.6e-3 <= np.hypot(x, y) <= 3e-3 and not turn),
-        ("automate", lambda x, y, turn: max(abs(x), abs(y)) <= 2e-3 and abs(turn) <= np.deg2rad(5.0)),
+    hard = yaml.safe_load((folder / "task.yaml").read_text())["hard"]
+    low, high = hard["offset_range"]
+    turn = hard["fixture_turn"]
+    assert 0.0 < turn < 2.0  # 0.1 mm of clearance on 7 mm of radius
+    for difficulty, is_inside, bound in (
+        ("hard", lambda x, y, z: low <= np.hypot(x, y) <= high and abs(z) <= np.deg2rad(turn), hard["bound"]),
+        ("automate", lambda x, y, z: max(abs(x), abs(y)) <= 2e-3 and abs(z) <= np.deg2rad(5.0), 3.5e-3),
     ):
         task = EnvConfig.resolve(str(folder), {"difficulty": difficulty}).make_task()
         options = SimpleNamespace(held_out=False, new_run=False, offset=None)
         rng = np.random.default_rng(0)
         offsets = np.array([task.offsets.draw(rng, options)[0] for _ in range(200)])
         assert all(is_inside(*offset) for offset in offsets)
-        assert (np.ptp(offsets[:, :2], axis=0) > 3.5e-3).all()
-        np.testing.assert_allclose(task.constraints().nearest(np.full(6, 9e-3))[:3], [3.5e-3, 3.5e-3, 9e-3])
+        assert (np.ptp(offsets[:, :2], axis=0) > 0.9 * 2.0 * min(high, 2e-3)).all()
+        np.testing.assert_allclose(task.constraints().nearest(np.full(6, 9e-3))[:3], [bound, bound, 9e-3])
     corners = [offset for offset in offsets if np.hypot(*offset[:2]) > 2e-3]
     assert corners, "a square, not a disc"
+
+
+def test_hard_is_calibrated_with_few_episodes(folder):
+    tree = yaml.safe_load((folder / "task.yaml").read_text())
+    found, hard = tree["measured"]["hard"], tree["hard"]
+    assert found["force_limit"] == hard["force_limit"] == min(35.0, max(10.0, np.ceil(2.5 * tree["measured"]["force"])))
+    assert hard["guidance"] == "kgrl"
+    for policy in ("uniform_random", "scripted"):
+        successes, episodes = map(int, found[policy].split(" of "))
+        assert 0 <= successes <= episodes <= 2
+
+
+def test_parts_of_convex_pieces_are_offered_in_mujoco(folder):
+    from guiderail.diagrams.envs.make import make_env
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.diagrams.tasks.part.task import load_task_folder
+    from guiderail.tools.parts.mujoco_check import insert_in_mujoco
+
+    pytest.importorskip("mujoco")
+    file = read_task_file(folder)
+    assert "mujoco" in load_task_folder(folder).stations()
+    assert (len(file.plug.convex), len(file.socket.convex)) == (1, 5)  # four walls and the bottom
+    assert [insert_in_mujoco(folder, file, offset) for offset in (0.0, 2e-3)] == [True, False]
+    env = make_env(str(folder), station="mujoco", guidance="kgrl")
+    env.reset(seed=0, options={"offset": (0.0, 0.0)})
+    done = False
+    while not done:
+        *_, terminated, done, info = env.step(np.zeros(2))
+        done = done or terminated
+    env.close()
+    assert info["is_success"]
+
+
+def test_turned_socket_accepts_a_turned_plug_without_a_turn_at_the_end(folder):
+    from guiderail.diagrams.envs.config import EnvConfig
+
+    task = EnvConfig.resolve(str(folder), {}).make_task()
+    seated = [task.is_seated(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.deg2rad(turn)])) for turn in (19.0, 21.0)]
+    assert seated == [True, False]
 
 
 def test_bound_is_refused_when_the_bounds_of_the_file_change(folder):
@@ -162,20 +205,32 @@ def test_bound_is_refused_when_the_bounds_of_the_file_change(folder):
         task.constraints()
 
 
-def test_scripted_search_follows_the_measured_side_of_the_contact(folder):
+def test_scripted_search_integrates_the_center_of_pressure(folder):
     from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.diagrams.tasks.part.task import CENTER_OF_PRESSURE, Z, scripted_search
+    from guiderail.diagrams.tasks.part.task import CENTER_OF_PRESSURE, TIME, ScriptedSearch, Z
 
     file = read_task_file(folder)
     assert file.search.lever_sign == -1  # a peg stands on its outer side
-    observation = np.zeros(17)
+    search, observation = ScriptedSearch(file, lambda: 2.0), np.zeros(17)
     observation[CENTER_OF_PRESSURE] = 1.0, 0.0
+
+    def act(time, height):
+        observation[TIME], observation[Z] = time - 1.0, height / (0.5 * file.motion.travel) - 1.0
+        return search(observation)
+
     on_rim, inserted = file.motion.rim, 0.5 * file.motion.rim
-    for height, direction in ((on_rim, -1.0), (inserted, 0.0)):
-        observation[Z] = height / (0.5 * file.motion.travel) - 1.0
-        np.testing.assert_array_equal(np.sign(scripted_search(file, observation)), [direction, 0.0])
+    step = 0.1 * file.search.speed
+    for time, height, x in (
+        (0.0, on_rim, 0.0),
+        (0.1, on_rim, -step),
+        (0.2, on_rim, -2 * step),
+        (0.3, inserted, -2 * step),
+    ):
+        np.testing.assert_allclose(act(time, height), [x, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(act(1.9, on_rim), [-1.0, 0.0])  # limited
+    np.testing.assert_array_equal(act(0.0, on_rim), [0.0, 0.0])  # another episode
     with pytest.raises(InputError, match="needs the center of pressure"):
-        scripted_search(file, observation[:13])
+        search(observation[:13])
 
 
 def test_options_of_a_created_task_are_listed(folder, capsys):

@@ -1,0 +1,126 @@
+"""The calibration of difficulty="hard" chooses by success rates alone, and says when none fits."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.parts.demonstrator import plan_search
+from guiderail.tools.parts import difficulty
+from guiderail.tools.parts.create_task import create_task
+from guiderail.tools.parts.difficulty import (
+    FIRST,
+    MAX_TURN,
+    SETTINGS,
+    Score,
+    calibrate,
+    choose_setting,
+    count_successes,
+    force_limit_of,
+    turn_of,
+)
+
+
+def scores(random, scripted):
+    """Scores of ten episodes for each setting, and the list of settings that were asked for."""
+    asked = []
+
+    def score(setting):
+        asked.append(SETTINGS.index(setting))
+        return Score(random[asked[-1]], 10, scripted[asked[-1]], 10)
+
+    return score, asked
+
+
+@pytest.mark.parametrize(
+    ("random", "scripted", "chosen", "tried"),
+    [
+        ([9, 9, 9, 9, 2, 0, 0, 0, 0], 9 * [10], 4, [4]),
+        ([9, 9, 9, 9, 3, 3, 2, 0, 0], 9 * [10], 6, [4, 5, 6]),
+        ([9, 1, 1, 0, 0, 0, 0, 0, 0], [10, 9, 8, 8, 8, 0, 0, 0, 0], 1, [4, 3, 2, 1]),
+        (9 * [9], 9 * [10], None, [4, 5, 6, 7, 8]),
+        (9 * [0], 9 * [5], None, [4, 3, 2, 1, 0]),
+        ([9, 9, 9, 9, 1, 1, 1, 1, 1], [10, 10, 10, 9, 8, 0, 0, 0, 0], None, [4, 3]),  # from too hard to too easy
+        (9 * [3], 9 * [8], None, [4]),  # both at once: no other offset helps
+    ],
+)
+def test_setting_is_the_first_with_the_required_rates(random, scripted, chosen, tried):
+    score, asked = scores(random, scripted)
+    setting, found, is_hard = choose_setting(score)
+    assert asked == tried
+    assert is_hard is (chosen is not None)
+    if chosen is not None:
+        assert setting is SETTINGS[chosen]
+    else:
+        assert found.margin == pytest.approx(max(scripted[one] - random[one] for one in tried) / 10)
+
+
+@pytest.mark.parametrize(
+    ("counts", "too_easy", "too_hard"),
+    [((2, 10, 9, 10), False, False), ((3, 10, 9, 10), True, False), ((2, 10, 8, 10), False, True)],
+)
+def test_rates_are_limited_on_both_sides(counts, too_easy, too_hard):
+    assert (Score(*counts).is_too_easy, Score(*counts).is_too_hard) == (too_easy, too_hard)
+
+
+def test_counting_ends_when_the_verdict_is_decided():
+    assert count_successes(lambda index: True, 10, lambda won, lost: won > 2) == (3, 3)
+    assert count_successes(lambda index: index % 2 == 0, 10, lambda won, lost: lost > 1) == (2, 4)
+    assert count_successes(lambda index: True, 4, lambda won, lost: lost > 1) == (4, 4)
+
+
+def test_settings_become_harder_and_keep_the_socket_in_reach():
+    reached = [(setting.offset, -setting.action_repeat) for setting in SETTINGS]
+    assert reached == sorted(reached)
+    assert 0 <= FIRST < len(SETTINGS)
+    for setting in SETTINGS:
+        options = setting.options(20.0, 0.0)
+        assert options["offset_range"][1] < options["bound"]
+        assert options["offset_range"][1] <= options["action_scale"] * difficulty.REACH
+
+
+def test_force_limit_and_turn_follow_from_the_part():
+    file = SimpleNamespace(force_limit=35.0)
+    assert [force_limit_of(file, peak) for peak in (1.0, 6.1, 30.0)] == [10.0, 16.0, 35.0]
+    assert turn_of(None, 5e-3) == 0.0
+    assert turn_of(0.1e-3, 10e-3) == pytest.approx(0.57)
+    assert turn_of(1e-3, 5e-3) == MAX_TURN
+
+
+class Steps(gymnasium.Env):
+    """Environment with given observations of time [s] and height [m], for a motion from 10 mm with its rim at 7 mm."""
+
+    def __init__(self, rows, duration):
+        self._rows, self._duration = list(rows), duration
+
+    def step(self, action):
+        time, height = self._rows.pop(0)
+        observation = np.zeros(17)
+        observation[0], observation[3] = 2.0 * time / self._duration - 1.0, 2.0 * height / 0.010 - 1.0
+        return observation, 0.0, False, False, {}
+
+
+def test_episode_ends_when_the_plug_stays_on_the_rim():
+    motion = SimpleNamespace(travel=0.010, rim=0.007, push=0.004, press=0.0025)
+    file = SimpleNamespace(motion=motion, turn=0.0)
+    times = plan_search(0.010, 0.007, 0.0, 0.004, 0.0025)[0]
+    late = times[3] + difficulty.PATIENCE
+    rows = [(late - 0.01, 0.007), (late + 0.01, 0.0064), (late + 0.01, 0.0066)]
+    env = difficulty.StopOnRim(Steps(rows, times[-1]), file)
+    assert [env.step(None)[3] for _ in rows] == [False, False, True]
+
+
+def test_failed_calibration_keeps_the_default(monkeypatch, tmp_path):
+    sentences = []
+    file = SimpleNamespace(measured={"force": 5.0, "clearance_mm": None}, force_limit=35.0)
+    assert calibrate(tmp_path / "missing", file, 1e-2, 2, sentences.append) is file
+    assert sentences[0].startswith("difficulty=hard is not calibrated: InputError: there is no task folder")
+
+
+@pytest.mark.parametrize("episodes", [-1, 101])
+def test_number_of_calibration_episodes_is_limited(episodes, tmp_path):
+    with pytest.raises(InputError, match="--hard-episodes is from 0 to 100"):
+        create_task(Path("plug.stl"), Path("socket.stl"), tmp_path / "peg", hard_episodes=episodes)

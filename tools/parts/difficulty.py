@@ -1,0 +1,274 @@
+"""Calibration of difficulty="hard" for a task of two parts, from the success of baseline policies on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from guiderail.diagrams.tasks.part.file import PartTaskFile
+from guiderail.diagrams.tasks.part.task import IN_SOCKET, TIME, Z, load_task_folder
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.common.units import MM
+from guiderail.models.parts.demonstrator import plan_search
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.evaluation.rollout import rollout
+
+EPISODES = 10  # of each policy for each setting
+MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates that a setting is hard with
+SEED = 3_000_000  # of the first episode; the conditions are those of training
+REACH = 2.3 * MM  # displacement of the command by an action of 1 at action_scale 1, late in the search [m]
+MARGIN = 0.75 * MM  # of the bound of commands beyond the offset [m]
+MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # least force limit [N]; force limit over the peak force of an aligned insertion
+MAX_TURN = 3.0  # largest turn of the socket [degrees]
+MAX_SECONDS = 300  # CPU time after which a calibration is given up [s]
+SEARCH_END = 3  # index of the end of the search in the times of `plan_search`
+PATIENCE = 1.0  # time after the search in which the push may still seat a plug [s]
+NAME = "create-task/calibration"  # of the task in the process that calibrates it
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Setting of the difficulty.
+
+    Attributes:
+        offset: Largest offset of the socket [m]; the least is 85 % of it.
+        action_repeat: Control steps per action; random actions that change more often lead less far.
+    """
+
+    offset: float
+    action_repeat: int = 5
+
+    def options(self, force_limit: float, turn: float) -> dict[str, Any]:
+        """Return the options of the environment.
+
+        Args:
+            force_limit: Force limit [N].
+            turn: Largest turn of the socket [degrees].
+        """
+        return {
+            "guidance": "kgrl",
+            "fixture_offset": "per_episode",
+            "offset_range": [round(0.85 * self.offset, 6), self.offset],
+            "fixture_turn": turn,
+            "bound": round(self.offset + MARGIN, 6),
+            "action_scale": max(1.0, math.ceil(100.0 * self.offset / REACH) / 100.0),
+            "force_limit": force_limit,
+            "observation": "center_of_pressure",
+            "action_repeat": self.action_repeat,
+        }
+
+
+SETTINGS = (
+    *(Setting(offset * MM) for offset in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)),
+    Setting(4.0 * MM, 3),
+    Setting(4.0 * MM, 2),
+)
+"""Settings, the easiest for random actions first."""
+FIRST = 4  # index of the setting that is tried first
+
+
+@dataclass(frozen=True)
+class Score:
+    """Successes of the baseline policies with one setting.
+
+    Attributes:
+        random: Number of successes of uniform random actions.
+        random_episodes: Number of their episodes; fewer than `EPISODES` if the verdict was clear.
+        scripted: Number of successes of the scripted search.
+        scripted_episodes: Number of its episodes.
+    """
+
+    random: int
+    random_episodes: int
+    scripted: int
+    scripted_episodes: int
+
+    @property
+    def is_too_easy(self) -> bool:
+        """True if random actions succeed too often."""
+        return self.random > MAX_RANDOM * self.random_episodes
+
+    @property
+    def is_too_hard(self) -> bool:
+        """True if the scripted search succeeds too seldom."""
+        return self.scripted < MIN_SCRIPTED * self.scripted_episodes
+
+    @property
+    def margin(self) -> float:
+        """Difference of the success rates."""
+        return self.scripted / self.scripted_episodes - self.random / self.random_episodes
+
+    def __str__(self) -> str:
+        return (
+            f"uniform random actions {self.random} of {self.random_episodes}, scripted search {self.scripted} of "
+            f"{self.scripted_episodes}"
+        )
+
+
+def choose_setting(
+    score: Callable[[Setting], Score], settings: Sequence[Setting] = SETTINGS, first: int = FIRST
+) -> tuple[Setting, Score, bool]:
+    """Return a setting with its score, and whether it is as hard as required.
+
+    Starting at `first`, the settings are walked through towards the required success rates until one has them, the
+    direction changes, or there are no more. If none has them, the one with the largest difference of the success rates
+    is returned.
+
+    Args:
+        score: Returns the score of a setting.
+        settings: Settings, the easiest first.
+        first: Index of the setting that is tried first.
+    """
+    tried: dict[int, Score] = {}
+    number = first
+    while 0 <= number < len(settings) and number not in tried:
+        found = tried[number] = score(settings[number])
+        if found.is_too_easy == found.is_too_hard:
+            break
+        number += 1 if found.is_too_easy else -1
+    best = max(tried, key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin))
+    return settings[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
+
+
+def count_successes(run: Callable[[int], bool], episodes: int, decided: Callable[[int, int], bool]) -> tuple[int, int]:
+    """Return the numbers of successes and of episodes, which end early once the verdict is decided.
+
+    Args:
+        run: Runs an episode by its index, and returns whether it succeeded.
+        episodes: Largest number of episodes.
+        decided: Returns whether successes and failures so far decide the verdict.
+    """
+    successes = 0
+    for index in range(episodes):
+        successes += bool(run(index))
+        if decided(successes, index + 1 - successes):
+            return successes, index + 1
+    return successes, episodes
+
+
+class StopOnRim(gymnasium.Wrapper):
+    """Truncate an episode in which the plug still stands on the rim a while after the search: it cannot succeed."""
+
+    def __init__(self, env: gymnasium.Env, file: PartTaskFile):
+        """Construct the wrapper for an environment with the task file `file`."""
+        super().__init__(env)
+        numbers = file.motion
+        times, _ = plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
+        self._progress = 2.0 * (times[SEARCH_END] + PATIENCE) / times[-1] - 1.0
+        self._height = 2.0 * (numbers.rim - IN_SOCKET) / numbers.travel - 1.0
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Return the result of the environment's step, truncated if the plug is too late."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        is_late = observation[TIME] > self._progress and observation[Z] > self._height
+        return observation, reward, terminated, truncated or bool(is_late), info
+
+
+def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episodes: int) -> Score:
+    """Return the successes of uniform random actions and of the scripted search.
+
+    Args:
+        task: Name of the task.
+        file: Its task file.
+        options: Options of its environment.
+        episodes: Largest number of episodes of each.
+    """
+    env = StopOnRim(make_environment(task, options), file)
+    counts: list[int] = []
+    try:
+        for name, allowed in (("uniform_random", MAX_RANDOM), ("scripted", 1.0 - MIN_SCRIPTED)):
+            act: Any = make_baseline(task, name)(env)
+
+            def run(index: int, act: Any = act) -> bool:
+                if (start := getattr(act, "start_episode", None)) is not None:
+                    start(index)
+                return bool(rollout(env, act, index=index, seed=SEED + index)["success"])
+
+            most = math.floor(allowed * episodes + 1e-9)  # random successes, or failures of the search
+            counts += count_successes(
+                run, episodes, lambda won, lost, most=most, act=name: (won if act == "uniform_random" else lost) > most
+            )
+    finally:
+        env.close()
+    return Score(*counts)
+
+
+def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
+    """Return the force limit [N]: a multiple of what an aligned insertion takes, at most that of the task.
+
+    Args:
+        file: Task file.
+        peak_force: Peak force of an aligned insertion [N].
+    """
+    return float(min(file.force_limit, max(MIN_FORCE, math.ceil(FORCE_RATIO * peak_force))))
+
+
+def turn_of(clearance: float | None, radius: float) -> float:
+    """Return the largest turn of the socket that its walls leave to the plug, at most `MAX_TURN` [degrees].
+
+    Args:
+        clearance: Clearance between the walls [m]; None without walls.
+        radius: Largest distance of the plug from the axis [m].
+    """
+    if not clearance or clearance < 0.0:
+        return 0.0
+    return round(min(MAX_TURN, math.degrees(clearance / max(radius, clearance))), 2)
+
+
+def calibrate(
+    folder: Path, file: PartTaskFile, radius: float, episodes: int, say: Callable[[str], None]
+) -> PartTaskFile:
+    """Return a task file with a calibrated `hard`, and its measurements; without them if the calibration fails.
+
+    Args:
+        folder: Folder of the task.
+        file: Content of its file, as written.
+        radius: Largest distance of the plug from the axis [m].
+        episodes: Largest number of episodes of each policy for each setting.
+        say: Called with a sentence on the result.
+    """
+    clearance = file.measured.get("clearance_mm")
+    force_limit = force_limit_of(file, float(file.measured["force"]))
+    turn = turn_of(None if clearance is None else clearance * MM, radius)
+    try:
+        setting, score, is_hard = run_isolated(
+            _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
+        )
+    except IsolatedError as error:
+        say(f"difficulty=hard is not calibrated: {error}")
+        return file
+    demonstrations = Demonstrations.load(folder / file.demonstrations.file)
+    seconds = float(np.mean([times[-1] - times[0] for times in demonstrations.times]))
+    options = setting.options(force_limit, turn)
+    nearest, farthest = options["offset_range"]
+    found = {
+        "offset_mm": [round(nearest / MM, 3), round(farthest / MM, 3)],
+        "turn_degrees": turn,
+        "force_limit": force_limit,
+        "time_s": round(seconds, 2),
+        "uniform_random": f"{score.random} of {score.random_episodes}",
+        "scripted": f"{score.scripted} of {score.scripted_episodes}",
+        "calibrated": is_hard,
+    }
+    say(
+        f"difficulty=hard: socket {nearest / MM:.2f} to {farthest / MM:.2f} mm off, turned by up to {turn:g}°, force "
+        f"limit {force_limit:g} N, {seconds:.1f} s: {score}"
+        + ("" if is_hard else f"; no setting has at most {MAX_RANDOM:.0%} and at least {MIN_SCRIPTED:.0%}")
+    )
+    return file.model_copy(update={"hard": options, "measured": {**file.measured, "hard": found}})
+
+
+def _choose_for(folder: Path, force_limit: float, turn: float, episodes: int) -> tuple[Setting, Score, bool]:
+    """Return the setting of a folder; in a child process, whose registry of tasks has no other use."""
+    task = load_task_folder(folder)
+    register_task(NAME)(task)
+    return choose_setting(lambda one: score_setting(NAME, task.file, one.options(force_limit, turn), episodes))
