@@ -158,4 +158,16 @@ def learn(
     found = dict(json.loads(output.strip().splitlines()[-1]))
     measured = yaml.safe_load((folder / "task.yaml").read_text(encoding="utf-8"))["measured"]
     found |= {key: measured[key] for key in ("demonstrations_seated", "total_s")}
+    if difficulty == "hard":
+        found["calibration"] = describe_calibration(measured.get("hard"))
     return {**found, "training_episodes": len(rows), "training_minutes": rows["wall_time"].sum() / 60}
+
+
+def describe_calibration(measured: dict[str, Any] | None) -> str:
+    """Return the calibration of `hard`, as `create-task` stored it, as a cell of the table."""
+    if measured is None:
+        return "not calibrated"
+    nearest, farthest = measured["offset_mm"]
+    text = f"{nearest:g} to {farthest:g} mm, {measured['turn_degrees']:g}°, {measured['force_limit']:g} N: random "
+    text += f"{measured['uniform_random']}, scripted {measured['scripted']}"
+    return text if measured["calibrated"] else f"{text} (not as hard as required)"

@@ -27,6 +27,7 @@ MEASURED = (
 LEARNED = (
     "demonstrations_seated",
     "total_s",
+    "calibration",
     "success_rate",
     "uniform_random_success_rate",
     "scripted_success_rate",

@@ -386,6 +386,7 @@ def _task_file(
             center=tuple(np.round(middle, 6).tolist()),
             gyration=round(float(np.sqrt(((vertices - middle) ** 2).sum(axis=1).mean())), 6),
             pieces=tuple(Piece.model_validate(piece) for piece in pieces),
+            convex=(),
         )
     content: dict[str, Any] = dict(
         name=f"{NAMESPACE}/{_plain_name(values['name'])}",

@@ -139,18 +139,21 @@ def choose_setting(
     return settings[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
 
 
-def count_successes(run: Callable[[int], bool], episodes: int, decided: Callable[[int, int], bool]) -> tuple[int, int]:
-    """Return the numbers of successes and of episodes, which end early once the verdict is decided.
+def count_successes(
+    run: Callable[[int], bool], episodes: int, *, most_successes: float = math.inf, most_failures: float = math.inf
+) -> tuple[int, int]:
+    """Return the numbers of successes and of episodes, which end early once one of the limits is exceeded.
 
     Args:
         run: Runs an episode by its index, and returns whether it succeeded.
         episodes: Largest number of episodes.
-        decided: Returns whether successes and failures so far decide the verdict.
+        most_successes: Number of successes that may not be exceeded.
+        most_failures: Number of failures that may not be exceeded.
     """
     successes = 0
     for index in range(episodes):
         successes += bool(run(index))
-        if decided(successes, index + 1 - successes):
+        if successes > most_successes or index + 1 - successes > most_failures:
             return successes, index + 1
     return successes, episodes
 
@@ -183,23 +186,24 @@ def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episod
         episodes: Largest number of episodes of each.
     """
     env = StopOnRim(make_environment(task, options), file)
-    counts: list[int] = []
+
+    def count(name: str, **limits: float) -> tuple[int, int]:
+        act: Any = make_baseline(task, name)(env)
+
+        def run(index: int) -> bool:
+            if (start := getattr(act, "start_episode", None)) is not None:
+                start(index)
+            return bool(rollout(env, act, index=index, seed=SEED + index)["success"])
+
+        return count_successes(run, episodes, **limits)
+
     try:
-        for name, allowed in (("uniform_random", MAX_RANDOM), ("scripted", 1.0 - MIN_SCRIPTED)):
-            act: Any = make_baseline(task, name)(env)
-
-            def run(index: int, act: Any = act) -> bool:
-                if (start := getattr(act, "start_episode", None)) is not None:
-                    start(index)
-                return bool(rollout(env, act, index=index, seed=SEED + index)["success"])
-
-            most = math.floor(allowed * episodes + 1e-9)  # random successes, or failures of the search
-            counts += count_successes(
-                run, episodes, lambda won, lost, most=most, act=name: (won if act == "uniform_random" else lost) > most
-            )
+        return Score(
+            *count("uniform_random", most_successes=MAX_RANDOM * episodes + 1e-9),
+            *count("scripted", most_failures=(1.0 - MIN_SCRIPTED) * episodes + 1e-9),
+        )
     finally:
         env.close()
-    return Score(*counts)
 
 
 def force_limit_of(file: PartTaskFile, peak_force: float) -> float:

@@ -10,11 +10,12 @@ import numpy as np
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.part.file import PartModel, PartTaskFile
-from guiderail.diagrams.tasks.part.task import PartInsertion, write_workcell
+from guiderail.diagrams.tasks.part.task import write_workcell
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.demonstrator import plan_straight_insertion
 from guiderail.models.parts.pieces import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
+from guiderail.tools.parts.trial import is_seated
 
 CHECK_SECONDS = 30  # CPU time of the insertions in MuJoCo [s]
 OFFSET = 3.5e-3  # offset of the socket at which it must block the plug [m]
@@ -81,5 +82,4 @@ def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> b
     station = MujocoStation(write_workcell(folder, file), time_step=file.time_step)
     _, recording = drive_along(station, times, poses)
     pose = recording["pose"][-1]
-    task = type("Task", (PartInsertion,), {"file": file})
-    return bool(task.is_seated(np.array([*pose[:3], *pose[:2:-1]])))
+    return is_seated(file, np.array([*pose[:3], *pose[:2:-1]]))

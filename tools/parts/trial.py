@@ -185,7 +185,7 @@ def insert(
     spent = time.process_time() - start - depths.seconds
     pose = _plug_pose(driven)
     return Trial(
-        success=_is_seated(file, pose),
+        success=is_seated(file, pose),
         pose=pose,
         peak_force=float(recording["contact_force"].max()),
         penetration=depths.deepest,
@@ -204,7 +204,8 @@ def _plug_pose(driven: DrivenStation) -> np.ndarray:
     return np.concatenate([X.translation(), rotation.angle() * rotation.axis()])
 
 
-def _is_seated(file: PartTaskFile, pose: np.ndarray) -> bool:
+def is_seated(file: PartTaskFile, pose: np.ndarray) -> bool:
+    """Return True if a plug, as position and rotation vector in the socket (6,), is at the target of a task file."""
     task: Any = type("Task", (PartInsertion,), {"file": file})
     return bool(task.is_seated(pose))
 
@@ -306,4 +307,4 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
     driven, _ = drive_along(GantryStation(write_workcell(folder, file), time_step=file.time_step), times, motion)
-    return _is_seated(file, _plug_pose(driven))
+    return is_seated(file, _plug_pose(driven))

@@ -9,7 +9,7 @@ pytest.importorskip("manifold3d")
 pytest.importorskip("igl")
 
 from guiderail.models.common.errors import InputError
-from research.parts.campaign import StepError, finish
+from research.parts.campaign import StepError, describe_calibration, finish
 from research.parts.pairs import find_pairs
 from research.parts.table import summarize, write_tables
 
@@ -49,3 +49,12 @@ def test_tables_hold_measurements_and_reasons(tmp_path):
     assert (summary["pairs"], summary["prepared"], summary["inserted"]) == (2, 1, 1)
     assert summary["deeper than half the clearance"] == 1
     assert summary["reasons"] == {"b": "the parts overlap | here"}
+
+
+def test_calibration_is_described_with_its_verdict():
+    found = {"offset_mm": [2.55, 3.0], "turn_degrees": 3.0, "force_limit": 15.0, "calibrated": True}
+    found |= {"uniform_random": "0 of 10", "scripted": "10 of 10"}
+    text = describe_calibration(found)
+    assert text == "2.55 to 3 mm, 3°, 15 N: random 0 of 10, scripted 10 of 10"
+    assert describe_calibration(found | {"calibrated": False}) == f"{text} (not as hard as required)"
+    assert describe_calibration(None) == "not calibrated"

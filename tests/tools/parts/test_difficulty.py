@@ -67,9 +67,9 @@ def test_rates_are_limited_on_both_sides(counts, too_easy, too_hard):
 
 
 def test_counting_ends_when_the_verdict_is_decided():
-    assert count_successes(lambda index: True, 10, lambda won, lost: won > 2) == (3, 3)
-    assert count_successes(lambda index: index % 2 == 0, 10, lambda won, lost: lost > 1) == (2, 4)
-    assert count_successes(lambda index: True, 4, lambda won, lost: lost > 1) == (4, 4)
+    assert count_successes(lambda index: True, 10, most_successes=2) == (3, 3)
+    assert count_successes(lambda index: index % 2 == 0, 10, most_failures=1) == (2, 4)
+    assert count_successes(lambda index: True, 4, most_failures=1) == (4, 4)
 
 
 def test_settings_become_harder_and_keep_the_socket_in_reach():
