@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ class Score:
         random: Number of successes of uniform random actions.
         random_episodes: Number of their episodes; fewer than `EPISODES` if the verdict was clear.
         scripted: Number of successes of the scripted search.
-        scripted_episodes: Number of its episodes.
+        scripted_episodes: Number of its episodes; 0 if random actions succeed too often, so that it does not matter.
     """
 
     random: int
@@ -104,8 +104,9 @@ class Score:
 
     @property
     def margin(self) -> float:
-        """Difference of the success rates."""
-        return self.scripted / self.scripted_episodes - self.random / self.random_episodes
+        """Difference of the success rates; below all others if the search was not tried."""
+        scripted = self.scripted / self.scripted_episodes if self.scripted_episodes else -1.0
+        return scripted - self.random / self.random_episodes
 
     def __str__(self) -> str:
         return (
@@ -198,10 +199,11 @@ def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episod
         return count_successes(run, episodes, **limits)
 
     try:
-        return Score(
-            *count("uniform_random", most_successes=MAX_RANDOM * episodes + 1e-9),
-            *count("scripted", most_failures=(1.0 - MIN_SCRIPTED) * episodes + 1e-9),
-        )
+        random = Score(*count("uniform_random", most_successes=MAX_RANDOM * episodes + 1e-9), 0, 0)
+        if random.is_too_easy:
+            return random
+        scripted, scripted_episodes = count("scripted", most_failures=(1.0 - MIN_SCRIPTED) * episodes + 1e-9)
+        return replace(random, scripted=scripted, scripted_episodes=scripted_episodes)
     finally:
         env.close()
 

@@ -66,6 +66,12 @@ def test_rates_are_limited_on_both_sides(counts, too_easy, too_hard):
     assert (Score(*counts).is_too_easy, Score(*counts).is_too_hard) == (too_easy, too_hard)
 
 
+def test_untried_search_is_neither_too_hard_nor_preferred():
+    untried, tried = Score(3, 9, 0, 0), Score(2, 10, 1, 10)
+    assert (untried.is_too_easy, untried.is_too_hard) == (True, False)
+    assert Score(3, 3, 0, 0).margin < untried.margin < tried.margin
+
+
 def test_counting_ends_when_the_verdict_is_decided():
     assert count_successes(lambda index: True, 10, most_successes=2) == (3, 3)
     assert count_successes(lambda index: index % 2 == 0, 10, most_failures=1) == (2, 4)
