@@ -1,1 +1,1 @@
-"""Guidance around environments of other packages: metaworld, in the environment of `make outside`."""
+"""Guidance around environments of other packages, metaworld and robosuite; `make outside` installs them."""

@@ -1,10 +1,11 @@
 """Train TQC with and without guidance in an environment of another package, and evaluate it on held-out episodes.
 
-    python -m research.outside_envs.learn peg --guidance kgrl --seed 0 --episodes 300 --out DIR
-    python -m research.outside_envs.learn peg --guidance kgrl --baselines --out DIR
+    python -m research.outside_envs.learn peg --method kgrl --seeds 0 1 2 3 4 --out DIR
+    python -m research.outside_envs.learn peg --method baselines --out DIR
     python -m research.outside_envs.learn table --out DIR
 
-`make outside` makes the environment with metaworld and its version of MuJoCo.
+`make outside` makes the Python environment with metaworld, robosuite and their version of MuJoCo. A result that exists
+in DIR is not computed again.
 """
 
 import argparse
@@ -17,23 +18,35 @@ from typing import Any
 
 import numpy as np
 
-TASKS = ("peg", "assembly")
+from guiderail.tools.guided.guide import Guide
+from research.outside_envs.table import print_table
+from research.outside_envs.task import OutsideTask
+
+TASKS = ("peg", "assembly", "nut")
+METHODS = ("kgrl", "skgrl", "residual", "clipped_residual", "tqc", "rlpd")  # the last two are without guidance
 TOLERANCE = 1e-9  # of a constraint [unit of the output]
 HELD_OUT_SEED = 10_000
+SELECTION_SEED = 5_000  # of the episodes that select the best constant action
+NUM_DEMONSTRATIONS = 10
+LEARNING_STARTS = 120  # transitions with random actions
+GRADIENT_STEPS = 8  # per transition with guidance; a bare environment has several times as many transitions
+Row = dict[str, Any]
+PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
+"""(observation, info of the last step) → action (A,)."""
 
 
-def run_episode(env: Any, policy: Callable[[Any], np.ndarray], seed: int | None = None) -> dict[str, Any]:
+def run_episode(env: Any, policy: PolicyFn, seed: int, side: float) -> Row:
     """Run an episode; return its success, side, largest violation and force."""
-    observation, _ = env.reset(seed=seed)
-    row: dict[str, Any] = {}
+    observation, info = env.reset(seed=seed, options={"side": side})
+    row: Row = {}
     done = False
     while not done:
-        observation, _, terminated, truncated, info = env.step(policy(observation))
-        row, done = add(row, info), terminated or truncated
+        observation, _, terminated, truncated, info = env.step(policy(observation, info))
+        row, done = add_step(row, info), terminated or truncated
     return row
 
 
-def add(row: dict[str, Any], info: dict[str, Any]) -> dict[str, Any]:
+def add_step(row: Row, info: dict[str, Any]) -> Row:
     """Return the row of an episode after one more step."""
     row = row or {"success": False, "violation": -np.inf, "force": 0.0, "fallbacks": 0, "decisions": 0}
     return {
@@ -42,18 +55,23 @@ def add(row: dict[str, Any], info: dict[str, Any]) -> dict[str, Any]:
         "force": max(row["force"], float(info.get("peak_force", 0.0))),
         "fallbacks": row["fallbacks"] + int(info["fallback"]),
         "decisions": row["decisions"] + 1,
-        "side": info.get("side"),
+        "side": info["side"],
     }
 
 
-def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return success rates, by side too, and the worst violation of some episodes."""
-    sides = sorted({row["side"] for row in rows if row["side"] is not None})
+def evaluate(env: Any, policy: PolicyFn, episodes: int, seed: int = HELD_OUT_SEED) -> dict[str, Any]:
+    """Return the summary of held-out episodes, alternately with the goal on either side."""
+    return summarize([run_episode(env, policy, seed + i, (-1.0) ** i) for i in range(episodes)])
+
+
+def summarize(rows: list[Row]) -> dict[str, Any]:
+    """Return successes and episodes, by side too, the worst violation and forces of some episodes."""
+    sides = [[row["success"] for row in rows if row["side"] == side] for side in (-1.0, 1.0)]
     return {
         "episodes": len(rows),
-        "success": float(np.mean([row["success"] for row in rows])),
-        "by_side": [float(np.mean([row["success"] for row in rows if row["side"] == side])) for side in sides],
-        "violated": float(np.mean([row["violation"] > TOLERANCE for row in rows])),
+        "successes": sum(row["success"] for row in rows),
+        "by_side": [[sum(side), len(side)] for side in sides],
+        "violated_episodes": sum(row["violation"] > TOLERANCE for row in rows),
         "max_violation": max(row["violation"] for row in rows),
         "fallbacks": sum(row["fallbacks"] for row in rows),
         "median_force": float(np.median([row["force"] for row in rows])),
@@ -61,103 +79,151 @@ def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def train(env: Any, episodes: int, seed: int) -> tuple[Any, list[dict[str, Any]]]:
-    """Train TQC; return the model and the row of every episode."""
-    from sb3_contrib import TQC
+def train(
+    env: Any, episodes: int, seed: int, demonstrated: list[tuple[Any, ...]] | None = None
+) -> tuple[Any, list[Row]]:
+    """Train TQC; return the model and the row of every episode.
+
+    Args:
+        env: Environment.
+        episodes: Number of training episodes.
+        seed: Seed of the learner.
+        demonstrated: Transitions that are half of every batch (RLPD), as arguments of a replay buffer's `add`.
+    """
     from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import configure
+
+    from guiderail.tools.learning.fast_sb3 import FastTqc
+    from guiderail.tools.learning.replay import DemonstrationReplayBuffer
 
     class Rows(BaseCallback):
-        rows: list[dict[str, Any]]
-        row: dict[str, Any]
+        rows: list[Row]
+        row: Row
 
         def _on_training_start(self) -> None:
             self.rows, self.row = [], {}
 
         def _on_step(self) -> bool:
-            self.row = add(self.row, self.locals["infos"][0])
+            self.row = add_step(self.row, self.locals["infos"][0])
             if self.locals["dones"][0]:
                 self.rows.append(self.row)
                 self.row = {}
-                if len(self.rows) % 25 == 0:
-                    print(len(self.rows), summarize(self.rows[-25:])["success"], flush=True)
+                if len(self.rows) % 20 == 0:
+                    successes = sum(row["success"] for row in self.rows[-20:])
+                    print(f"episode {len(self.rows)}: {successes} of 20", flush=True)
             return len(self.rows) < episodes
 
-    model = TQC(
-        "MlpPolicy", env, seed=seed, learning_rate=1e-3, gamma=0.98, batch_size=128, learning_starts=200, train_freq=1,
-        gradient_steps=2, top_quantiles_to_drop_per_net=2, tau=0.01, device="cpu",
+    model = FastTqc(
+        "MlpPolicy", env, seed=seed, learning_rate=1e-3, gamma=0.98, batch_size=64, learning_starts=LEARNING_STARTS,
+        train_freq=1, gradient_steps=GRADIENT_STEPS if hasattr(env, "guide") else 2, top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
         policy_kwargs={"net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15},
     )  # fmt: skip
+    if demonstrated:
+        model.replay_buffer = buffer = DemonstrationReplayBuffer(
+            model.buffer_size, model.observation_space, model.action_space, device="cpu", gamma=model.gamma
+        )
+        for transition in demonstrated:
+            buffer.add(*transition)
+        buffer.num_demonstrated = len(demonstrated)
+    model.set_logger(configure(None, []))
     callback = Rows()
     model.learn(10**9, callback=callback)
     return model, callback.rows
 
 
-def baseline_policies(size: int, seed: int) -> dict[str, Callable[[Any], np.ndarray]]:
-    """Return policies that learn nothing, by name."""
-    rng = np.random.default_rng(seed)
-    policies: dict[str, Callable[[Any], np.ndarray]] = {
-        "zero": lambda _: np.zeros(size),
-        "uniform_random": lambda _: rng.uniform(-1.0, 1.0, size),
+def demonstrate_transitions(task: OutsideTask, env: Any, count: int, seed: int = 1000) -> list[tuple[Any, ...]]:
+    """Return the transitions of `count` successful episodes of the scripted policy in the bare environment."""
+    transitions: list[tuple[Any, ...]] = []
+    successes = 0
+    for attempt in range(10 * count):
+        observation, info = env.reset(seed=seed + attempt, options={"side": (-1.0) ** successes})
+        episode, done = [], False
+        while not done:
+            action = task.scripted(env.env)
+            following, reward, terminated, truncated, info = env.step(action)
+            done = terminated or truncated
+            infos = [{"TimeLimit.truncated": truncated and not terminated}]
+            row = (observation[None], following[None], action[None], np.array([reward]), np.array([done]), infos)
+            episode.append(row)
+            observation = following
+        if info["is_success"]:
+            transitions += episode
+            successes += 1
+        if successes == count:
+            return transitions
+    raise RuntimeError(f"the scripted policy succeeded in {successes} of {10 * count} episodes")
+
+
+def evaluate_baselines(task: OutsideTask, env: Any, episodes: int) -> dict[str, Any]:
+    """Return the summaries of policies that learn nothing, by name.
+
+    The constant action is the best of 27 (each entry −0.7, 0 or 0.7), selected on episodes of its own.
+    """
+    size = env.action_space.shape[0]
+    rng = np.random.default_rng(0)
+    result = {
+        "zero": evaluate(env, lambda *_: np.zeros(size), episodes),
+        "uniform_random": evaluate(env, lambda *_: rng.uniform(-1.0, 1.0, size), episodes),
     }
-    for axis in range(min(size, 3)):
-        for sign in (-1.0, 1.0):
-            policies[f"constant {sign * (axis + 1):+.0f}"] = lambda _, a=axis, s=sign: s * np.eye(size)[a]
-    return policies
-
-
-def print_table(folder: Path) -> None:
-    """Print the results of a folder as a Markdown table."""
-    print("| task | guidance | policy | held out | by side | episodes outside | worst [mm] | largest force [N] |")
-    print("|---|---|---|---|---|---|---|---|")
-    for path in sorted(folder.glob("*.json")):
-        result = json.loads(path.read_text())
-        for name, row in result["held_out"].items():
-            sides = " / ".join(f"{share:.0%}" for share in row["by_side"])
-            training = result.get("training")
-            outside = max(row["violated"], training["violated"] if training else 0.0)
-            worst = max(row["max_violation"], training["max_violation"] if training else -np.inf)
-            force = max(row["max_force"], training["max_force"] if training else 0.0)
-            print(
-                f"| {result['task']} | {result['guidance']} | {name} | {row['success']:.0%} of {row['episodes']} | "
-                f"{sides} | {outside:.0%} | {1e3 * max(worst, 0.0):.1f} | {force:.0f} |"
-            )
+    grid = np.array(np.meshgrid(*[[-0.7, 0.0, 0.7]] * min(size, 3))).reshape(min(size, 3), -1).T
+    actions = [np.concatenate([row, np.zeros(size - len(row))]) for row in grid]
+    wins = [evaluate(env, lambda *_, a=a: a, 4, SELECTION_SEED)["successes"] for a in actions]
+    finalists = [actions[i] for i in np.argsort(wins)[::-1][:3]]
+    wins = [evaluate(env, lambda *_, a=a: a, 10, SELECTION_SEED + 100)["successes"] for a in finalists]
+    best = finalists[int(np.argmax(wins))]
+    result[f"constant {best.tolist()}"] = evaluate(env, lambda *_: best, episodes)
+    if task.schedule and hasattr(env, "guide"):
+        result["schedule"] = evaluate(env, lambda _, info: task.schedule[info["segment"]], episodes)
+    for name, row in result.items():
+        print(name, row["by_side"], flush=True)
+    return result
 
 
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=(*TASKS, "table"))
-    parser.add_argument("--guidance", default="kgrl")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--method", default="kgrl", choices=(*METHODS, "baselines"))
+    parser.add_argument("--guidance", default="kgrl", choices=METHODS[:4], help="of the baselines")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)
-    parser.add_argument("--baselines", action="store_true", help="evaluate policies that learn nothing instead")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     if given.task == "table":
         print_table(given.out)
         return
-    module = import_module(f"research.outside_envs.{given.task}")
-    begin = time.process_time()
-    env = module.make(given.guidance, given.seed, module.make_segments())
-    result: dict[str, Any] = {"task": given.task, "guidance": given.guidance, "seed": given.seed, "held_out": {}}
-    if given.baselines:
-        policies = baseline_policies(env.action_space.shape[0], given.seed)
-        name = f"{given.task}_{given.guidance}_baselines.json"
-    else:
-        model, rows = train(env, given.episodes, given.seed)
-        result |= {"training": summarize(rows), "curve": [row["success"] for row in rows]}
-        policies = {
-            f"TQC, {given.episodes} episodes, seed {given.seed}": lambda o: model.predict(o, deterministic=True)[0]
-        }
-        name = f"{given.task}_{given.guidance}_{given.seed}.json"
-    for label, policy in policies.items():
-        held_out = [run_episode(env, policy, HELD_OUT_SEED + i) for i in range(given.held_out)]
-        result["held_out"][label] = summarize(held_out)
-        print(given.guidance, label, result["held_out"][label], flush=True)
-    result["cpu_s"] = time.process_time() - begin
+    import torch
+
+    torch.set_num_threads(1)
     given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / name).write_text(json.dumps(result, indent=1))
+    is_baselines = given.method == "baselines"
+    label = f"baselines_{given.guidance}" if is_baselines else given.method
+    paths = {seed: given.out / f"{given.task}_{label}_{seed}.json" for seed in given.seeds}
+    if is_baselines:
+        paths = {0: given.out / f"{given.task}_{label}.json"}
+    paths = {seed: path for seed, path in paths.items() if not path.exists()}
+    if not paths:
+        return
+    task: OutsideTask = import_module(f"research.outside_envs.{given.task}").TASK
+    guidance: str | Guide = given.guidance if is_baselines else {"tqc": "none", "rlpd": "none"}.get(label, label)
+    segments = task.make_segments(NUM_DEMONSTRATIONS)
+    for seed, path in paths.items():
+        begin = time.process_time()
+        env = task.make(guidance, seed, segments)
+        guidance = getattr(env, "guide", guidance)  # fitted once
+        result: dict[str, Any] = {"task": given.task, "method": label, "seed": seed}
+        if is_baselines:
+            result["held_out"] = evaluate_baselines(task, env, given.held_out)
+        else:
+            demonstrated = demonstrate_transitions(task, env, NUM_DEMONSTRATIONS) if label == "rlpd" else None
+            model, rows = train(env, given.episodes, seed, demonstrated)
+            result |= {"training": summarize(rows), "curve": [int(row["success"]) for row in rows]}
+            policy: PolicyFn = lambda o, _, model=model: model.predict(o, deterministic=True)[0]  # noqa: E731
+            result["held_out"] = {"learned": evaluate(env, policy, given.held_out)}
+            print(label, seed, result["held_out"]["learned"], flush=True)
+        result["cpu_s"] = time.process_time() - begin
+        path.write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

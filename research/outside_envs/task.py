@@ -1,0 +1,167 @@
+"""A task in an environment of another package: the segments of its motion, with and without guidance."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from guiderail import Demonstrations, Frame, GuidedEnv, LinearConstraints, Segment, cut_demonstrations
+from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.tools.guided.guide import Guide
+
+BARE_REPEAT = 5  # steps of the bare environment for which an action is applied
+SUCCESS_REWARD, REWARD_SCALE = 5.0, 0.05  # reward of the last step, and scale of the reward before
+BOX_MARGIN, MIN_BOX_MARGIN = 0.15, 0.01  # of a segment's box: relative to the demonstrated range, and least [m]
+FLOOR = 2e-3  # standard deviation added to every covariance [unit of the output]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One segment of a task's motion.
+
+    Attributes:
+        steps: Control steps.
+        frame: Attribute of the environment with the frame's origin (O,).
+        extra: Discrete output, as in `Segment`.
+        dwell: Control steps for which the last point is then held.
+        source: Name of the recorded part, if it is another one's.
+        is_reversed: The recorded part is run backwards.
+        lower: Lower limits (O,) of the commands in the frame, where they are narrower than the demonstrated ones.
+        until: (env, observation) → true to end the segment early.
+    """
+
+    steps: int
+    frame: str
+    extra: Any
+    dwell: int = 0
+    source: str = ""
+    is_reversed: bool = False
+    lower: float | np.ndarray = -np.inf
+    until: Callable[[Any, Any], bool] | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One demonstration.
+
+    Attributes:
+        path: Outputs (N, O) in the world.
+        events: Samples at which the recorded parts after the first begin.
+        origins: Origins (O,) by the name of the environment's attribute.
+    """
+
+    path: np.ndarray
+    events: list[int]
+    origins: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class OutsideTask:
+    """A task in an environment of another package.
+
+    Attributes:
+        parts: Segments of the motion by name, in their order.
+        outputs: Names of the outputs.
+        period: Duration of a step of the environment [s].
+        make_env: (seed) → environment; its `info` has `is_success`, `side` and `peak_force` [N].
+        record: (count, seed) → successful recordings of the package's scripted policy, which observes what is hidden.
+        pose: (env, observation) → commanded pose (O,), at which a motion begins.
+        to_action: (env, observation, command, extra) → the environment's own action.
+        scripted: (env) → the scripted policy's own action, which observes what is hidden.
+        schedule: Name of the segment → a fixed action of guidance, which searches without observations.
+        action_repeat: Steps of the guided environment for which an action is applied.
+    """
+
+    parts: Mapping[str, Part]
+    outputs: tuple[str, ...]
+    period: float
+    make_env: Callable[[int], gymnasium.Env]
+    record: Callable[[int, int], list[Recording]]
+    pose: Callable[[Any, Any], np.ndarray]
+    to_action: Callable[[Any, Any, np.ndarray, Any], np.ndarray]
+    scripted: Callable[[Any], np.ndarray]
+    schedule: Mapping[str, np.ndarray] = field(default_factory=dict)
+    action_repeat: int = 20
+
+    def make_segments(self, count: int = 10, seed: int = 1000) -> list[Segment]:
+        """Return the segments, from `count` demonstrations recorded with a seed."""
+        recorded = [name for name, part in self.parts.items() if not part.source]
+        recordings = self.record(count, seed)
+        clocks = [self.period * np.arange(len(one.path)) for one in recordings]
+        whole = Demonstrations(clocks, [one.path for one in recordings], list(self.outputs))
+        cut = dict(zip(recorded, cut_demonstrations(whole, [one.events for one in recordings]), strict=True))
+        segments, local = [], {}
+        for name, each in cut.items():
+            origins = [one.origins[self.parts[name].frame] for one in recordings]
+            outputs = [y - origin for y, origin in zip(each.outputs, origins, strict=True)]
+            local[name] = Demonstrations(each.times, outputs, each.names)
+        for name, part in self.parts.items():
+            demonstrations = local[part.source or name]
+            if part.is_reversed:
+                backwards = [y[::-1] for y in demonstrations.outputs]
+                demonstrations = Demonstrations(demonstrations.times, backwards, demonstrations.names)
+            bounds = compute_bounds(demonstrations, 1, BOX_MARGIN, MIN_BOX_MARGIN)
+            segments.append(
+                Segment(
+                    demonstrations, frame=_origin_of(part.frame),
+                    constraints=LinearConstraints.box(np.maximum(bounds.lower[0], part.lower), bounds.upper[0]),
+                    until=part.until, extra=part.extra, num_steps=part.steps, dwell=part.dwell, floor=FLOOR, name=name,
+                )
+            )  # fmt: skip
+        return segments
+
+    def make(self, guidance: str | Guide, seed: int, segments: list[Segment]) -> gymnasium.Env:
+        """Return the guided environment, or for guidance="none" the bare one with repeated actions."""
+        env = self.make_env(seed)
+        if guidance == "none":
+            return RepeatedAction(env, segments, self.pose)
+        return GuidedEnv(
+            env, demonstrations=segments, pose=self.pose, to_action=self.to_action, guidance=guidance,
+            period=self.period, action_repeat=self.action_repeat,
+        )  # fmt: skip
+
+
+def num_steps(parts: Mapping[str, Part]) -> int:
+    """Return the largest number of control steps of a motion."""
+    return sum(part.steps + part.dwell for part in parts.values())
+
+
+class RepeatedAction(gymnasium.Wrapper):
+    """The environment's own action, repeated; its commands are compared with the boxes of all segments together.
+
+    The time of the episode, from −1 to 1, is appended to the observation.
+    """
+
+    def __init__(self, env: Any, segments: list[Segment], pose: Callable[[Any, Any], np.ndarray]):
+        super().__init__(env)
+        self._segments, self._pose = segments, pose
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, env.action_space.shape, np.float32)
+        size = env.observation_space.shape[0] + 1
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """Reset the environment."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._with_time(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Apply an action (A,) for several steps."""
+        total, worst = 0.0, -np.inf
+        for _ in range(BARE_REPEAT):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += reward
+            pose = self._pose(self.env, observation)
+            worst = max(worst, min(s.constraints.violation(pose - s.frame(self.env, None).p) for s in self._segments))
+            if terminated or truncated:
+                break
+        info = {**info, "constraint_violation": worst, "fallback": 0, "segment": ""}
+        return self._with_time(observation), total, terminated, truncated, info
+
+    def _with_time(self, observation: np.ndarray) -> np.ndarray:
+        return np.append(observation, 2.0 * self.env.steps / self.env.length - 1.0).astype(np.float32)
+
+
+def _origin_of(name: str) -> Callable[[Any, Any], Frame]:
+    return lambda env, _: Frame(getattr(env, name))

@@ -1,0 +1,111 @@
+"""Tasks around environments of other packages, with an environment made here, and the table of results."""
+
+import csv
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from research.outside_envs.table import print_table, read_rows
+from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
+
+PARTS = {
+    "approach": Part(12, "start", -1.0),
+    "insert": Part(12, "goal", 1.0, dwell=3, lower=np.array([-0.02, -np.inf])),
+    "retract": Part(12, "goal", 1.0, source="insert", is_reversed=True),
+}
+
+
+class Point(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+    def __init__(self, seed=0):
+        self.steps, self.length = 0, num_steps(PARTS)
+
+    def reset(self, *, seed=None, options=None):
+        self.p, self.start, self.goal, self.steps, self.grips = np.zeros(2), np.zeros(2), np.array([0.5, 0.1]), 0, []
+        return self.p.astype(np.float32), {}
+
+    def step(self, action):
+        self.p, self.steps = self.p + 0.1 * np.clip(action[:2], -1, 1), self.steps + 1
+        self.grips.append(action[2])
+        info = {"is_success": False, "peak_force": 0.0, "side": 1.0}
+        return self.p.astype(np.float32), -1.0, False, self.steps >= self.length, info
+
+
+def record(count, seed):
+    rng = np.random.default_rng(seed)
+    origins = {"start": np.zeros(2), "goal": np.array([0.5, 0.1])}
+    paths = [np.linspace([0, 0], [0.5, 0.1], 21) + [0, 1] * rng.normal(0, 0.02, 2) for _ in range(count)]
+    return [Recording(path, [10], origins) for path in paths]
+
+
+TASK = OutsideTask(
+    PARTS, ("x [m]", "y [m]"), 0.05, Point, record,
+    pose=lambda env, _: env.unwrapped.p,
+    to_action=lambda env, _, command, grip: np.append(np.clip((command - env.unwrapped.p) / 0.1, -1, 1), grip),
+    scripted=lambda env: np.zeros(3),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def segments():
+    return TASK.make_segments(5, 0)
+
+
+def test_segments_have_frames_limits_and_reversed_parts(segments):
+    approach, insert, retract = segments
+    assert [segment.name for segment in segments] == list(PARTS)
+    assert np.allclose(approach.recorded.outputs[0][0][0], 0.0)
+    assert np.allclose(insert.recorded.outputs[0][-1][0], 0.0), "in the goal's frame"
+    for forwards, backwards in zip(insert.recorded.outputs, retract.recorded.outputs, strict=True):
+        assert np.array_equal(forwards[::-1], backwards)
+    assert insert.constraints.violation(np.array([-0.021, 0.0])) == pytest.approx(0.001)
+    assert insert.constraints.violation(np.array([-0.019, 0.0])) < 0.0
+    assert retract.constraints.violation(np.array([-0.021, 0.0])) < 0.0
+
+
+def test_guided_commands_are_inside_and_extra_is_passed_on(segments):
+    env, rng = TASK.make("kgrl", 0, segments), np.random.default_rng(0)
+    env.reset(seed=0)
+    done, worst = False, -np.inf
+    while not done:
+        *_, truncated, info = env.step(rng.choice([-1.0, 1.0], 2))
+        worst, done = max(worst, info["constraint_violation"]), truncated
+    assert worst <= 1e-9
+    assert env.unwrapped.grips == [-1.0] * 12 + [1.0] * 27
+
+
+def test_bare_environment_measures_the_distance_to_the_nearest_box(segments):
+    env = TASK.make("none", 0, segments)
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (3,)
+    assert observation[-1] == -1.0
+    *_, info = env.step(np.zeros(3))
+    assert info["constraint_violation"] <= 0.0
+    *_, info = env.step(np.array([0.0, 1.0, 0.0]))
+    assert info["constraint_violation"] > 0.3
+    assert env.unwrapped.steps == 10
+
+
+def test_table_has_intervals_and_the_worst_of_training_and_held_out(tmp_path, capsys):
+    row = {
+        "episodes": 10, "successes": 9, "by_side": [[5, 5], [4, 5]], "violated_episodes": 0, "max_violation": -0.1,
+        "fallbacks": 0, "median_force": 1.0, "max_force": 20.0,
+    }  # fmt: skip
+    training = {**row, "violated_episodes": 3, "max_violation": 0.002, "max_force": 30.0}
+    result = {"task": "peg", "method": "kgrl", "seed": 1, "curve": [0, 1], "held_out": {"learned": row}, "cpu_s": 1.0}
+    (tmp_path / "a.json").write_text(json.dumps({**result, "training": training}))
+    (tmp_path / "b.json").write_text(
+        json.dumps({**result, "method": "baselines", "held_out": {"zero": row}, "curve": []})
+    )
+    learned, zero = read_rows(tmp_path)
+    assert (learned["success_rate"], learned["success_right"], learned["violated_episodes"]) == (0.9, 0.8, 3)
+    assert (learned["max_commanded_violation"], learned["peak_force"]) == (0.002, 30.0)
+    assert 0.55 < learned["success_low"] < 0.6 < 0.98 < learned["success_high"] < 1.0
+    assert (zero["method"], zero["max_commanded_violation"]) == ("baselines: zero", 0.0)
+    print_table(tmp_path)
+    assert "| peg | kgrl | 1 | 2 | 90% of 10 (60% to 98%) | 100%, 80% | 3, 2.0 | 30 |" in capsys.readouterr().out
+    assert len(list(csv.DictReader((tmp_path / "outside_envs.csv").open()))) == 2
