@@ -77,14 +77,13 @@ fci:  ## rehearse a Franka on the simulator of its protocol, minutes
 motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, half an hour
 	$(BIN)/python tests/harness/motion_limits.py
 
-outside: $(OUTSIDE)/.ready  ## train in metaworld with guidance, in an environment of its own, hours (downloads 3 GB)
+outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, in an environment of its own, hours (downloads 3 GB)
 	$(OUTSIDE)/bin/python -m pytest -q -c /dev/null --noconftest tests/research/outside_envs
-	for seed in 0 1 2 3 4; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance kgrl --seed $$seed --out runs/outside; done
-	for guidance in residual clipped_residual none; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance $$guidance --out runs/outside; \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance $$guidance --baselines --out runs/outside; done
-	$(OUTSIDE)/bin/python -m research.outside_envs.learn peg --guidance kgrl --baselines --out runs/outside
+	for method in kgrl residual clipped_residual tqc rlpd; do \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 0 1 2 3 4 --out runs/outside; done
+	for task in peg assembly nut; do \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method baselines --out runs/outside; \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 0 --out runs/outside; done
 	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
@@ -98,10 +97,12 @@ $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@
 
-# metaworld needs an older MuJoCo than this package's extra: neither Drake nor that extra is installed here.
+# metaworld and robosuite need an older MuJoCo than this package's extra: neither Drake nor that extra is installed here.
+# robosuite's own requirements have a whole-body inverse kinematics that needs NumPy 1 and that no task here uses.
 $(OUTSIDE)/.ready: pyproject.toml research/outside_envs/requirements.txt
 	$(PYTHON) -m venv $(OUTSIDE)
 	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check -r research/outside_envs/requirements.txt -e .
+	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check --no-deps robosuite==1.5.2
 	touch $@
 
 $(VENV)/.ready: pyproject.toml setup.py constraints.txt

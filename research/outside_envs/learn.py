@@ -29,7 +29,7 @@ HELD_OUT_SEED = 10_000
 SELECTION_SEED = 5_000  # of the episodes that select the best constant action
 NUM_DEMONSTRATIONS = 10
 LEARNING_STARTS = 120  # transitions with random actions
-GRADIENT_STEPS = 8  # per transition with guidance; a bare environment has several times as many transitions
+GRADIENT_STEPS, BARE_GRADIENT_STEPS = 8, 2  # per transition; a bare environment has four times as many
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
@@ -115,7 +115,8 @@ def train(
 
     model = FastTqc(
         "MlpPolicy", env, seed=seed, learning_rate=1e-3, gamma=0.98, batch_size=64, learning_starts=LEARNING_STARTS,
-        train_freq=1, gradient_steps=GRADIENT_STEPS if hasattr(env, "guide") else 2, top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
+        train_freq=1, gradient_steps=GRADIENT_STEPS if hasattr(env, "guide") else BARE_GRADIENT_STEPS,
+        top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
         policy_kwargs={"net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15},
     )  # fmt: skip
     if demonstrated:
