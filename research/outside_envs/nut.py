@@ -24,6 +24,7 @@ OFFSETS = (0.01, 0.02)  # distance of the believed peg from the true one in y, o
 HANDLE = 0.054  # distance of the handle from the nut's center [m]
 MAX_YAW = np.radians(110.0)  # of the gripper, because of the range of the last joint
 MAX_LAG = 0.03  # height of the gripper above its command at which the first attempt ends: the nut lies on the peg [m]
+LONGEST = 170  # steps of a recording
 OPEN, CLOSED = -1.0, 1.0
 
 
@@ -246,7 +247,7 @@ def _limit(vector: np.ndarray, length: float) -> np.ndarray:
 
 def record_nut(count: int, seed: int, noise: float = 0.003) -> list[Recording]:
     """Return successful recordings of the scripted policy, with noise added to its commands [m], for both sides."""
-    rng, env, script = np.random.default_rng(seed), HiddenPeg(seed, 300), Script()
+    rng, env, script = np.random.default_rng(seed), HiddenPeg(seed, LONGEST), Script()
     recordings: list[Recording] = []
     while len(recordings) < count:
         env.reset(options={"side": (-1.0) ** len(recordings)})
