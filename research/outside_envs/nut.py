@@ -40,7 +40,7 @@ def is_blocked(env: Any, observation: Any) -> bool:
 
 PARTS = {
     "reach": Part(20, "object_start", OPEN),
-    "grasp": Part(14, "object_start", close_at_end, dwell=6),
+    "grasp": Part(14, "object_start", close_at_end, dwell=14),  # the gripper takes ten steps to close
     "lift": Part(14, "object_start", CLOSED),
     "carry": Part(26, "believed_goal", CLOSED),
     "insert": Part(16, "believed_goal", CLOSED, dwell=4, until=is_blocked),
