@@ -70,9 +70,13 @@ class FciDriver(PoseDriver):
     def configure(self, impedance: RobotImpedance) -> None:
         """Set tool center, payload and collision thresholds, and the impedance of the next motion.
 
+        During a motion nothing changes, because the robot refuses it; another station takes over the same impedance.
+
         Raises:
             InputError: If the robot refuses them.
         """
+        if self._motion is not None:
+            return
         robot = self._robot
         X_NP = RigidTransform(robot.state.F_T_NE.matrix).InvertAndCompose(impedance.X_FlangeTool)
         force = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3]))

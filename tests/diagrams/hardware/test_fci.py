@@ -196,6 +196,17 @@ def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
     )
 
 
+def test_robot_is_not_configured_during_a_motion(driver, robot, model):
+    impedance = make_robot_impedance(model, IMPEDANCE)
+    driver.write_pose(RigidTransform(), 0.0)
+    number = len(robot.calls)
+    driver.configure(impedance)
+    assert len(robot.calls) == number
+    driver.stop()
+    driver.configure(impedance)
+    assert [name for name, *_ in robot.calls[number + 1 :]] == ["set_ee", "set_load", "set_collision_behavior"]
+
+
 def failed(driver):
     return [check.name for check in driver.check_setup() if not check.passed]
 
