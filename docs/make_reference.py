@@ -355,9 +355,9 @@ def options() -> str:
         "# Tasks, guidance and their options\n\n`make_env(task, …)`, `gymnasium.make`, and `--env key=value` take "
         "them; `guiderail list --json` prints them.\n\n## All environments\n\n"
     )
-    page += _options(known["options"]["of every environment"])
-    for kind_of_guidance in ("guidance made of demonstrations", "guidance made of a template"):
-        page += f"## With {kind_of_guidance}\n\n" + _options(known["options"][f"of {kind_of_guidance}"])
+    page += _options(known["options"]["common"])
+    for part, title in (("primitive", "guidance made of demonstrations"), ("template", "guidance made of a template")):
+        page += f"## With {title}\n\n" + _options(known["options"][part])
     for name, task in known["tasks"].items():
         page += f"## Task {name}\n\n{prose(task['is'])}\n\n"
         rows = [("environment", code(task["environment"]))]

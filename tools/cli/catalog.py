@@ -35,10 +35,10 @@ def describe_all() -> dict[str, Any]:
         "learners": {name: {} for name in LEARNERS.names()},
         "kernels": {name: {"is": _first_line(KERNELS.get(name))} for name in KERNELS.names()},
         "options": {
-            "of every environment": describe_options(CommonOptions),
-            "of guidance made of demonstrations": describe_options(PrimitiveOptions),
-            "of guidance made of a template": describe_options(TemplateOptions),
-            "of everything that an insertion may be disturbed by": describe_options(Disturbances),
+            "common": describe_options(CommonOptions),
+            "primitive": describe_options(PrimitiveOptions),
+            "template": describe_options(TemplateOptions),
+            "disturbances": describe_options(Disturbances),
         },
     }
 
