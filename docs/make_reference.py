@@ -359,7 +359,7 @@ def options() -> str:
     for part, title in (("primitive", "guidance made of demonstrations"), ("template", "guidance made of a template")):
         page += f"## With {title}\n\n" + _options(known["options"][part])
     for name, task in known["tasks"].items():
-        page += f"## Task {name}\n\n{prose(task['is'])}\n\n"
+        page += f"## Task {name}\n\n{prose(task['description'])}\n\n"
         rows = [("environment", code(task["environment"]))]
         rows += [
             (key, _listed(task[key])) for key in ("guidance", "stations", "rewards", "observations", "difficulties")
@@ -370,20 +370,20 @@ def options() -> str:
     page += "## Guidance\n\n" + table(
         ["name", "description", "needs"],
         [
-            (code(n), cell(g["is"]), cell(" or ".join(" and ".join(x) for x in g["needs"])))
+            (code(n), cell(g["description"]), cell(" or ".join(" and ".join(x) for x in g["needs"])))
             for n, g in known["guidance"].items()
         ],
     )
     page += "## Stations\n\n" + table(
         ["name", "description", "world"],
-        [(code(n), cell(s["is"]), cell(s["world"])) for n, s in known["stations"].items()],
+        [(code(n), cell(s["description"]), cell(s["world"])) for n, s in known["stations"].items()],
     )
     for name, station in known["stations"].items():
         if station["options"]:
             page += f"### Station {name}\n\n" + _options(station["options"])
     page += "## Robots and end effectors\n\n" + table(
         ["name", "description"],
-        [(code(n), cell(r["is"])) for part in ("robots", "end_effectors") for n, r in known[part].items()],
+        [(code(n), cell(r["description"])) for part in ("robots", "end_effectors") for n, r in known[part].items()],
     )
     return page + "## Learners\n\n" + _listed(known["learners"]) + "\n"
 

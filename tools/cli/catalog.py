@@ -29,11 +29,12 @@ def describe_all() -> dict[str, Any]:
         "guidance": {name: _guidance(name) for name in GUIDANCE.names()},
         "stations": {name: _station(name) for name in STATIONS.names()},
         "robots": {
-            name: {"is": find_robot(name).title, "joints": find_robot(name).num_joints} for name in robot_names()
+            name: {"description": find_robot(name).title, "joints": find_robot(name).num_joints}
+            for name in robot_names()
         },
-        "end_effectors": {name: {"is": find_end_effector(name).title} for name in end_effector_names()},
+        "end_effectors": {name: {"description": find_end_effector(name).title} for name in end_effector_names()},
         "learners": {name: {} for name in LEARNERS.names()},
-        "kernels": {name: {"is": _first_line(KERNELS.get(name))} for name in KERNELS.names()},
+        "kernels": {name: {"description": _first_line(KERNELS.get(name))} for name in KERNELS.names()},
         "options": {
             "common": describe_options(CommonOptions),
             "primitive": describe_options(PrimitiveOptions),
@@ -56,7 +57,7 @@ def describe_task(name: str) -> dict[str, Any]:
     """
     declared = TASKS.get(name)
     return {
-        "is": _first_line(declared),
+        "description": _first_line(declared),
         "environment": environment_id(name),
         "guidance": possible_guidance(declared.provides()),
         "stations": declared.stations(),
@@ -119,7 +120,7 @@ def _describe_option(row: Mapping[str, Any], default: Any, choices: Collection[s
 def _guidance(name: str) -> dict[str, Any]:
     kind = GUIDANCE.get(name)
     return {
-        "is": kind.label,
+        "description": kind.label,
         "needs": [list(names) for names in kind.needs],
         "inputs": list(GUIDANCE_INPUTS),
         "outputs": list(GUIDANCE_OUTPUTS),
@@ -130,7 +131,7 @@ def _guidance(name: str) -> dict[str, Any]:
 def _station(name: str) -> dict[str, Any]:
     kind = STATIONS.get(name)
     return {
-        "is": kind.description,
+        "description": kind.description,
         "world": kind.world,
         "inputs": list(STATION_INPUTS),
         "outputs": list(STATION_OUTPUTS),
