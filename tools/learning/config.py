@@ -163,14 +163,11 @@ class BcConfig(LearnerConfig):
 
 register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
 register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
-for _name, _module, _class, _config in (
-    ("td3", "sb3_algorithms", "Td3Learner", Td3Config),
-    ("crossq", "sb3_algorithms", "CrossQLearner", CrossQConfig),
-    ("ppo", "on_policy", "PpoLearner", PpoConfig),
-    ("trpo", "on_policy", "TrpoLearner", TrpoConfig),
-    ("bc", "cloning", "BcLearner", BcConfig),
-):
-    register_learner(_name, DeferredLearner(f"guiderail.tools.learning.{_module}", _class, _config))
+register_learner("td3", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "Td3Learner", Td3Config))
+register_learner("crossq", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "CrossQLearner", CrossQConfig))
+register_learner("ppo", DeferredLearner("guiderail.tools.learning.on_policy", "PpoLearner", PpoConfig))
+register_learner("trpo", DeferredLearner("guiderail.tools.learning.on_policy", "TrpoLearner", TrpoConfig))
+register_learner("bc", DeferredLearner("guiderail.tools.learning.cloning", "BcLearner", BcConfig))
 
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0

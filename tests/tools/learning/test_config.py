@@ -2,6 +2,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.learner import LEARNERS
 
 
 @pytest.mark.parametrize(
@@ -24,3 +25,7 @@ def test_config_accepts_large_networks():
         4096,
         4096,
     )
+
+
+def test_learners_are_listed_without_importing_their_modules():
+    assert {*LEARNERS._declarations} == {"bc", "crossq", "ppo", "sac", "td3", "tqc", "trpo"}
