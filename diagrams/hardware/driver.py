@@ -27,7 +27,7 @@ POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
 TORQUE_TOLERANCE_SHARE = 0.02  # error of a joint's torque by friction, gravity compensation and sensor, of its limit
 
-CommandCallback = Callable[[np.ndarray], None]
+CommandCallback = Callable[[np.ndarray, float], None]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Driver(ABC):
         period: Period of statuses and commands [s].
         url: Address that the connection was opened with; empty for the default.
         num_statuses: Number of different statuses received; a repeated one counts once.
-        num_foreign_commands: Number of commands received by the robot from other programs.
+        num_foreign_commands: Number of commands received by the robot from other programs, without those of a safety
+            monitor that stops the arm.
     """
 
     name: ClassVar[str]
@@ -118,7 +119,7 @@ class Driver(ABC):
         """Raise `InputError` if the connection cannot receive in this environment."""
 
     def add_listener(self, on_command: CommandCallback) -> None:
-        """Call back for the torques of every readable command of another program.
+        """Call back for the torques and the time [s] of every readable command of another program.
 
         Raises:
             InputError: If the driver does not show the commands of other programs.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from enum import IntEnum
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.hardware.driver import Driver, status_limits, torque_tolerance
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, STATUS_FAULTS, Fault, Heartbeat, damping_torque
+from guiderail.models.control.message_sequence import CommandSequence
 from guiderail.models.control.state_estimator import Estimate, EstimatorState, StateEstimator
 from guiderail.systems.support.joint_dynamics import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
@@ -26,14 +28,20 @@ class MonitorState(IntEnum):
     RESTING = 3
 
 
+MAX_REPEATS = 2  # times that the monitor repeats its torque between two checks
+
+STOP_FAULTS = frozenset({*STATUS_FAULTS, Fault.SECOND_COMMANDER} - {Fault.NO_STATUS})
+
+
 class SafetyMonitor:
     """Watch the statuses and commands of a robot, and damp the arm to rest when commands stop or a status is wrong.
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
     lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
     `StateEstimator` as the station, by a clock of its own, and sends a heartbeat with every check, so that a commanding
-    program stops if the monitor stops the arm or has exited. During a stop it sends torques even if no status arrives,
-    so that the driver never repeats a torque.
+    program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
+    (`CommandSequence`): the arm is kept without torque until one of them is left. During a stop it sends torques even
+    if no status arrives, so that the driver never repeats a torque.
 
     Attributes:
         state: Current state.
@@ -67,6 +75,8 @@ class SafetyMonitor:
         self._estimated = EstimatorState.initial(plant.num_positions())
         self._torque_limits = np.array(limits.torque)
         self._command: np.ndarray | None = None  # torques that the driver repeats
+        self._commands = CommandSequence(driver.period)
+        self._num_repeats = 0  # since the last check
         # Local times [s]: last command, last change of state, last check.
         self._commanded_at = self._entered_at = self._checked_at = -np.inf
         self._sender, self._num_heartbeats = secrets.randbits(48), 0
@@ -86,7 +96,10 @@ class SafetyMonitor:
         is_due = now - self._checked_at >= 0.99 * self._driver.period
         if not is_due and (status is None or status.time == self._estimated.last_time):
             return
-        self._checked_at = now
+        self._checked_at, self._num_repeats = now, 0
+        if status is not None:
+            # To the driver the commands of every other program are foreign.
+            status = replace(status, foreign_commands=self._commands.num_conflicts)
         self._plant.SetPositions(self._context, self._estimated.accepted_values[: self._plant.num_positions()])
         self._plant.SetVelocities(self._context, self._estimated.velocity)
         M, drag = self._dynamics.evaluate(self._context)
@@ -94,6 +107,9 @@ class SafetyMonitor:
         self.fault = estimate.fault
         self._update_state(now)
         is_stopping = self._is_stopping
+        # Sent before a command, so that the commanding program attributes that to this monitor.
+        self._num_heartbeats += 1
+        self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
         if self._is_holding:
             self._driver.hold()
         elif is_stopping:
@@ -101,8 +117,6 @@ class SafetyMonitor:
             self._driver.write(self._command, now)
         command = np.zeros(len(M)) if self._command is None else self._command
         self._estimated = self._estimator.advance(estimate, command)
-        self._num_heartbeats += 1
-        self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
 
     @property
     def _is_stopping(self) -> bool:
@@ -112,12 +126,18 @@ class SafetyMonitor:
     def _is_holding(self) -> bool:
         return self._is_stopping and self._driver.can_hold and self.fault in STATUS_FAULTS
 
-    def _on_command(self, torque: np.ndarray) -> None:
+    def _on_command(self, torque: np.ndarray, command_time: float) -> None:
         if torque.shape != self._torque_limits.shape:
             return
         self._commanded_at = self._clock()
+        heartbeats = self._driver.read_heartbeats()
+        if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
+            self._commands.add(torque, command_time, self._commanded_at)  # else it may be another monitor's
         if self._is_stopping and self._command is not None and not self._is_holding:
-            self._driver.write(self._command, self._commanded_at)  # the robot obeys the last command
+            # The robot obeys the last command. Two monitors must not answer each other without end.
+            if self._num_repeats < MAX_REPEATS:
+                self._num_repeats += 1
+                self._driver.write(self._command, self._commanded_at)
             return
         self._command = torque
         if self.state == MonitorState.IDLE:
@@ -125,16 +145,17 @@ class SafetyMonitor:
 
     def _update_state(self, now: float) -> None:
         is_silent = now - self._commanded_at > self._max_silence
-        has_fault = self.fault in STATUS_FAULTS and self.fault != Fault.NO_STATUS
+        has_fault = self.fault in STOP_FAULTS
         if self.state == MonitorState.WATCHING and (is_silent or has_fault):
             has_torque = self._command is not None and bool(np.any(self._command))
-            if has_torque:
+            if has_torque or self.fault == Fault.SECOND_COMMANDER:
                 self.state, self._entered_at = MonitorState.DAMPING, now
             elif is_silent:
                 self.state = MonitorState.IDLE
         if self.state == MonitorState.DAMPING and now - self._entered_at >= self._limits.damping_time:
             self.state, self._entered_at = MonitorState.RESTING, now
-        if self.state == MonitorState.RESTING and now - self._entered_at > ZERO_TORQUE_TIME:
+        is_over = now - self._entered_at > ZERO_TORQUE_TIME and self.fault != Fault.SECOND_COMMANDER
+        if self.state == MonitorState.RESTING and is_over:
             self.state = MonitorState.IDLE
 
     def _torque(self, estimate: Estimate, M: np.ndarray) -> np.ndarray:

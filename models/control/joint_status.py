@@ -54,7 +54,7 @@ class Fault(IntEnum):
     MALFORMED = 5, "a status message cannot be decoded"
     WRONG_SIZE = 6, "a status message has the wrong number of joints"
     NOT_FINITE = 7, "a status message contains NaN or infinity"
-    CONFLICT = 8, "two different status messages have one time stamp: a second robot on the channel, or a frozen clock"
+    CONFLICT = 8, "status messages contradict each other: a second robot on the channel, or a frozen clock"
     POSITION_JUMP = 9, "a joint position changed faster than the joint can move"
     VELOCITY_JUMP = 10, "a joint velocity changed faster than the joint can accelerate"
     FROZEN = 11, "a joint is moving, but its position or velocity does not change"
@@ -69,6 +69,7 @@ class Fault(IntEnum):
     USER_STOP = 20, "stop requested by the user"
     DEADLINE_MISSED = 21, "the controller missed its deadline and sent no command in time"
     MONITOR_STOP = 22, "a safety monitor stopped the arm, or its heartbeat timed out"
+    SECOND_COMMANDER = 23, "another program commands the arm as well"
 
 
 STATUS_FAULTS = tuple(fault for fault in Fault if Fault.NONE < fault <= Fault.CLOCK_RATE)
@@ -84,7 +85,8 @@ class JointStatus:
         positions: Joint positions, (n,) [rad].
         velocities: Joint velocities, (n,) [rad/s].
         external_torque: External joint torques, (n,) [Nm].
-        conflicts: Number of messages so far that had the time stamp of their predecessor and other values.
+        conflicts: Number of messages so far that contradict their predecessors, such as those of a second robot.
+        foreign_commands: Number of commands so far that contradict those of the one program that commands the arm.
     """
 
     time: float
@@ -92,6 +94,7 @@ class JointStatus:
     velocities: np.ndarray
     external_torque: np.ndarray
     conflicts: int = 0
+    foreign_commands: int = 0
 
     def __deepcopy__(self, memo: object) -> "JointStatus":
         """Return the same immutable object, because Drake copies abstract values often."""

@@ -11,7 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 
-ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED)  # the status itself is valid
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # the status itself is valid
 # The message is dropped, and the next one is compared with its predecessor. After every other fault statuses are in
 # doubt: one is accepted only if it agrees with the prediction, until all have been valid for the settling time.
 DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
@@ -27,6 +27,7 @@ REACTION_WINDOW = 0.02  # time in which the external torque must explain a chang
 MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
 MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # of a joint whose values must change [rad], [rad/s]
 MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # statuses with the same value of a moving joint that are a fault
+MAX_EQUAL_STATUSES = 4  # the same with all values of a joint while another joint is moving
 MODEL_ERROR, SENSOR_ERROR = 0.3, 0.1  # largest relative error of inertia times acceleration, and of external torque
 EXTERNAL_STEP = 2.0  # largest change of the predicted external torque between statuses, in torque tolerances
 LAG = 1.0  # largest delay of a velocity's filter [periods]
@@ -49,6 +50,7 @@ class EstimatorState:
         doubt_time: Local time of the last fault that put statuses in doubt [s]; NaN if none.
         early: Sum of the recent corrections of the clock offset for early statuses [s].
         conflicts: `JointStatus.conflicts` of the last status.
+        foreign_commands: `JointStatus.foreign_commands` of the last status.
         last_time: Time stamp of the last readable status [s]; NaN before the first.
         last_offset: Its offset from the robot's clock to the local clock [s].
         accepted_time: Time stamp of the accepted status [s]; NaN before the first.
@@ -60,6 +62,7 @@ class EstimatorState:
         residual: Recent difference between positions and integrated velocities, (n,) [rad].
         equal_positions: Number of consecutive equal positions of each moving joint, (n,).
         equal_velocities: Number of consecutive equal velocities of each moving joint, (n,).
+        equal_values: Number of consecutive statuses with equal values of a joint while another one moves, (n,).
         external: External torque in the prediction, which follows the accepted one at a limited rate, (n,) [Nm].
         torque: Torques in effect until the next check, (n,) [Nm].
         variation: Last change of torques and external torques, (n,) [Nm].
@@ -78,6 +81,7 @@ class EstimatorState:
     doubt_time: float
     early: float
     conflicts: float
+    foreign_commands: float
     last_time: float
     last_offset: float
     accepted_time: float
@@ -88,6 +92,7 @@ class EstimatorState:
     residual: np.ndarray
     equal_positions: np.ndarray
     equal_velocities: np.ndarray
+    equal_values: np.ndarray
     external: np.ndarray
     torque: np.ndarray
     variation: np.ndarray
@@ -101,17 +106,17 @@ class EstimatorState:
     @classmethod
     def initial(cls, num_joints: int) -> "EstimatorState":
         """Return the state before the first check."""
-        scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
-        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((13, num_joints)))
+        scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
+        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((14, num_joints)))
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
         """Return the state that `vector` returned as a vector."""
-        values, vectors = np.split(vector[11:], [6 * num_joints])
-        return cls(*vector[:11].tolist(), *values.reshape(2, -1), *vectors.reshape(13, -1))
+        values, vectors = np.split(vector[12:], [6 * num_joints])
+        return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(14, -1))
 
     def vector(self) -> np.ndarray:
-        """Return the state as one vector, (11 + 19 n,)."""
+        """Return the state as one vector, (12 + 20 n,)."""
         return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
 
     @property
@@ -148,7 +153,8 @@ class StateEstimator:
     `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
     with a model, for each joint:
 
-    - *Equal values*: a moving joint has the same position, or the same velocity, to the bit in consecutive statuses.
+    - *Equal values*: a moving joint has the same position, or the same velocity, to the bit in consecutive statuses;
+      or any joint has the same position, velocity and external torque while another joint moves.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
       the position tolerance.
     - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay,
@@ -205,11 +211,15 @@ class StateEstimator:
         if status is None or fault in DROPPED_FAULTS:
             return self._finish(state, before, fault, now)
         values = status.values()
-        state = replace(state, conflicts=float(status.conflicts))
-        is_reordered = status.time <= last.time and not fault
+        state = replace(state, conflicts=float(status.conflicts), foreign_commands=float(status.foreign_commands))
+        is_reordered = status.time <= last.time and fault in ACCEPTABLE_FAULTS
         if is_reordered or (status.time == last.time and np.array_equal(values, last.values)):
             return self._finish(state, before, fault, now)
 
+        if fault == Fault.CONFLICT and not is_doubted:
+            # The last statuses may be of the other robot; the sums contain what they say and what they miss.
+            reported = before.last_values[self._velocities]
+            state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values
         is_comparable = 0.0 < elapsed <= self._limits.max_age and fault in ACCEPTABLE_FAULTS
         if (is_doubted and is_trusted) or not is_comparable:
@@ -232,14 +242,9 @@ class StateEstimator:
             values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
             velocity = np.median((velocity, *others), axis=0)
         if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING):
-            # If the velocity is wrong, it misses the effect of the torques with and without the external ones; if only
-            # one of the two is missing, the external torque is wrong.
-            missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
             is_frozen = (change[self._positions] == 0.0) | (fault == Fault.NOT_REACTING)
-            is_missing = is_frozen & (np.prod(np.sign(missing), axis=1) > 0.0)
-            smaller = np.sign(missing[:, 0]) * np.abs(missing).min(axis=1)
-            reported = status.velocities + smaller
-            state = replace(state, velocity=np.where(is_missing, reported, velocity))
+            missing, is_missing = self._missing_velocity(state, M)
+            state = replace(state, velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
         if fault not in ACCEPTABLE_FAULTS or not is_trusted:
             return self._finish(state, before, fault, now)
         age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
@@ -277,8 +282,11 @@ class StateEstimator:
 
     def _find_fault(self, before: EstimatorState, last: LastStatus, status: JointStatus | None, now: float) -> Fault:
         fault = check_status(status, last, now, self._limits)
-        if not fault and status is not None and status.conflicts > before.conflicts and np.isfinite(last.time):
-            return Fault.CONFLICT
+        if not fault and status is not None and np.isfinite(last.time):
+            if status.conflicts > before.conflicts:
+                return Fault.CONFLICT
+            if status.foreign_commands > before.foreign_commands:
+                return Fault.SECOND_COMMANDER
         if not fault and now - before.check_time > self._limits.max_check_interval:
             return Fault.DEADLINE_MISSED
         return fault
@@ -306,17 +314,20 @@ class StateEstimator:
         speed, is_equal = np.abs(values[self._velocities]), change == 0.0
         equal_positions = is_equal[self._positions] & (speed * elapsed > MIN_MOTION)
         equal_velocities = is_equal[self._velocities] & (speed > MIN_SPEED)
+        equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
         decay = np.exp(-elapsed / POSITION_WINDOW)
         return replace(
             state,
             residual=decay * state.residual + self._deviation(values, change, elapsed),
             equal_positions=np.where(equal_positions, state.equal_positions + 1.0, 0.0),
             equal_velocities=np.where(equal_velocities, state.equal_velocities + 1.0, 0.0),
+            equal_values=np.where(equal_values, state.equal_values + 1.0, 0.0),
         )
 
     def _restart(self, state: EstimatorState) -> EstimatorState:
         """Return the state without a predecessor of the status."""
-        return replace(state, residual=self._zeros, equal_positions=self._zeros, equal_velocities=self._zeros)
+        zero = self._zeros
+        return replace(state, residual=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
 
     def _update_momentum(
         self, state: EstimatorState, M: np.ndarray, change: np.ndarray, elapsed: float
@@ -344,10 +355,23 @@ class StateEstimator:
         limit = MAX_BIAS * self._torque_tolerance
         return np.clip(bias, -limit, limit)
 
+    def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the reported velocity misses of the recent torques, (n,) [rad/s], and where it misses any.
+
+        A wrong velocity misses the effect of the torques with and without the external ones; the smaller one counts. If
+        only one of the two is missing, or they differ in sign, the external torque is wrong.
+        """
+        missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
+        is_missing = np.prod(np.sign(missing), axis=1) > 0.0
+        return np.where(is_missing, np.sign(missing[:, 0]) * np.abs(missing).min(axis=1), 0.0), is_missing
+
     def _find_contradiction(self, state: EstimatorState, M: np.ndarray) -> Fault:
-        if (state.equal_positions >= MAX_EQUAL_POSITIONS).any() or (
-            state.equal_velocities >= MAX_EQUAL_VELOCITIES
-        ).any():
+        counts = (
+            (state.equal_positions, MAX_EQUAL_POSITIONS),
+            (state.equal_velocities, MAX_EQUAL_VELOCITIES),
+            (state.equal_values, MAX_EQUAL_STATUSES),
+        )
+        if any((count >= limit).any() for count, limit in counts):
             return Fault.FROZEN
         if (np.abs(state.residual) > self._limits.position_tolerance).any():
             return Fault.INCONSISTENT

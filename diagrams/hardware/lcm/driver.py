@@ -17,6 +17,7 @@ from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from guiderail.diagrams.hardware.driver import CommandCallback, Driver, register_driver
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.joint_status import MALFORMED_STATUS, MAX_SENDERS, Heartbeat, JointStatus
+from guiderail.models.control.message_sequence import StatusSequence
 
 PROVIDERS = ("udpm", "mpudpm", "tcpq", "memq")
 MICROSECOND = 1e-6  # unit of a message's time [s]
@@ -131,9 +132,9 @@ class LcmDriver(Driver):
         super().__init__(lcm if isinstance(lcm, str) else "")
         self.lcm = open_bus(lcm) if isinstance(lcm, str) else lcm
         self.statuses = MessageCounter()
-        self._message: bytes | None = None  # newest status
-        self._status: JointStatus | None = None  # the same, decoded when it is read
-        self._num_conflicts = 0  # statuses with the time stamp of their predecessor and another content
+        self._status: JointStatus | None = None  # newest status
+        self._sequence = StatusSequence(self.period)
+        self._num_contested = 0  # foreign commands since this program has commanded the arm
         self._heartbeats: dict[int, Heartbeat] = {}  # by sender, the newest last
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
         self._listeners: list[CommandCallback] = []
@@ -165,18 +166,20 @@ class LcmDriver(Driver):
         return JointStatus(status.utime * MICROSECOND, positions, velocities, cls.external_torque_sign * external)
 
     @classmethod
-    def decode_command(cls, message: bytes) -> np.ndarray | None:
-        """Return the torques of a command message (n,) [Nm], None if it cannot be decoded."""
+    def decode_command(cls, message: bytes) -> tuple[np.ndarray, float] | None:
+        """Return the torques (n,) [Nm] and the time [s] of a command message, None if it cannot be decoded."""
         try:
-            return np.array(cls.command_type.decode(message).joint_torque, dtype=float)
+            command = cls.command_type.decode(message)
+            return np.array(command.joint_torque, dtype=float), command.utime * MICROSECOND
         except (ValueError, struct.error, OverflowError):
             return None
 
     def read(self) -> JointStatus | None:
         """Return the newest status, or None before the first."""
-        if self._status is None and self._message is not None:
-            self._status = replace(self.decode(self._message), conflicts=self._num_conflicts)
-        return self._status
+        status = self._status
+        if status is not None and status.foreign_commands != self._num_contested:
+            self._status = status = replace(status, foreign_commands=self._num_contested)
+        return status
 
     def write(self, torque: np.ndarray, time: float) -> None:
         """Send joint torques (n,) [Nm]; `time` is the time of the command [s]."""
@@ -193,7 +196,7 @@ class LcmDriver(Driver):
         check_handlers()
 
     def add_listener(self, on_command: CommandCallback) -> None:
-        """Call back for the torques of every readable command of another program."""
+        """Call back for the torques and the time [s] of every readable command of another program."""
         self._listeners.append(on_command)
 
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
@@ -210,19 +213,23 @@ class LcmDriver(Driver):
         return f"{self.url or 'LCM'}, channel {self.status_channel}"
 
     def _on_status(self, message: bytes) -> None:
-        self._num_conflicts += message[:HEAD_SIZE] == self.statuses.head and message != self._message
-        self._message, self._status = message, None
+        status = self.decode(message)
+        self._sequence.add(status)
+        self._status = replace(status, conflicts=self._sequence.num_conflicts, foreign_commands=self._num_contested)
         self.statuses.add(message)
         self.num_statuses = self.statuses.count
 
     def _on_command(self, message: bytes) -> None:
         if message in self._written:
             return
-        self.num_foreign_commands += 1
-        torque = self.decode_command(message)
-        if torque is not None:
+        # A safety monitor sends its heartbeat before it commands.
+        if not any(heartbeat.is_stopping for heartbeat in self._heartbeats.values()):
+            self.num_foreign_commands += 1
+            self._num_contested += bool(self._written)
+        command = self.decode_command(message)
+        if command is not None:
             for on_command in self._listeners:
-                on_command(torque)
+                on_command(*command)
 
     def _on_heartbeat(self, message: bytes) -> None:
         if len(message) == HEARTBEAT_FORMAT.size:

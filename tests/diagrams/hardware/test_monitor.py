@@ -7,7 +7,7 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.driver import safety_limits, torque_tolerance
 from guiderail.diagrams.hardware.lcm.driver import HEARTBEAT_FORMAT, IiwaDriver
-from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
+from guiderail.diagrams.hardware.monitor import MAX_REPEATS, MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
@@ -48,10 +48,10 @@ class Bus:
         return HEARTBEAT_FORMAT.unpack(self.heartbeats[-1])[1]
 
     def record_command(self, message):
-        torque = IiwaDriver.decode_command(message)
-        if torque is not None and len(torque) == 7:
-            self.commands.append(torque)
-            self.torque = torque
+        command = IiwaDriver.decode_command(message)
+        if command is not None and len(command[0]) == 7:
+            self.torque = command[0]
+            self.commands.append(self.torque)
 
     def go(self, steps=1, status=True, command=False, **changed):
         """Advance the robot, send its status (or another message, or none), and possibly a command."""
@@ -200,6 +200,59 @@ def test_monitor_drops_reordered_statuses(known):
     old = round((100.0 + (bus.step - 1) * PERIOD) * 1e6)
     bus.go(1, command=True, utime=old)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
+
+
+def contend(bus, steps, torque, clock=0.0):
+    """Let a second program send torques after each command of the first; return what the robot did in between."""
+    for _ in range(steps):
+        bus.go(1, command=True)
+        bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(torque, bus.now + clock))
+        bus.settle()
+
+
+@pytest.mark.parametrize("torque", [0.001 * PUSH, -PUSH], ids=["small", "negated"])
+@pytest.mark.parametrize("clock", [0.0, -5.0, 300.0])
+def test_monitor_stops_the_arm_when_two_programs_command(known, torque, clock):
+    bus = Bus(known).watch()
+    contend(bus, 3, torque, clock)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.SECOND_COMMANDER)
+    contend(bus, 20, torque, clock)
+    assert bus.speed < 0.02
+    contend(bus, 100, torque, clock)  # the robot obeys the monitor's zero torque as long as both command
+    assert (bus.monitor.state, bus.is_stopping) == (MonitorState.RESTING, True)
+    np.testing.assert_array_equal(bus.torque, 0.0)
+    bus.go(round(IiwaDriver.hold_off / PERIOD) + 3, command=True)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
+
+
+def test_two_monitors_stop_the_arm_and_go_on(known):
+    """Each one repeats its torque after a command, but not after the other one's without end."""
+    bus = Bus(known)
+    other = SafetyMonitor(IiwaDriver(bus.lcm), known.plant, bus.limits, clock=lambda: bus.now)
+
+    def go(steps, command=True, **changed):
+        for _ in range(steps):
+            bus.go(1, command=command, **changed)
+            other.receive()
+            bus.settle()
+        return [(monitor.state, monitor.fault) for monitor in (bus.monitor, other)]
+
+    go(100, command=False)
+    assert go(10) == [(MonitorState.WATCHING, Fault.NONE)] * 2
+    bus.commands.clear()
+    assert go(1, joint_velocity_estimated=[np.nan] * 7) == [(MonitorState.DAMPING, Fault.NOT_FINITE)] * 2
+    go(20)
+    assert len(bus.commands) <= 21 * (1 + 2 * (1 + MAX_REPEATS))
+    assert bus.speed < 0.02
+    assert go(200) == [(MonitorState.WATCHING, Fault.NONE)] * 2
+
+
+def test_monitor_announces_its_commands_by_a_heartbeat(known):
+    bus, order = Bus(known).watch(), []
+    bus.lcm.Subscribe("IIWA_COMMAND", lambda message: order.append("command"))
+    bus.lcm.Subscribe(IiwaDriver.heartbeat_channel(), lambda message: order.append(bus.is_stopping))
+    bus.go(MAX_MISSED_MESSAGES + 1)
+    assert order[-2:] == [True, "command"]
 
 
 def test_monitors_heartbeats_have_its_number(known):

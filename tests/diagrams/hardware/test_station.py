@@ -209,6 +209,18 @@ def test_station_stops_and_is_silent_when_statuses_stop():
     np.testing.assert_allclose(both["pose"][:3], goal[:3], atol=2e-3)
 
 
+def test_station_stops_when_another_program_commands():
+    both = OneProcess()
+    both.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.zeros(7), 77.0))
+    both.go(START, 2 * PERIOD)
+    assert (both.arm_state, both.fault) == (ArmState.DAMPING, Fault.SECOND_COMMANDER)
+    both.go(START, 0.4)
+    assert both.arm_state == ArmState.OFF
+    both.station.resume(both.context)
+    both.go(START, 0.2)
+    assert (both.arm_state, both.fault) == (ArmState.RUNNING, Fault.NONE)
+
+
 def test_station_sends_nothing_during_the_hold_off():
     both = OneProcess(settled=False)
     both.go(START, 0.25)

@@ -297,7 +297,9 @@ def read_part(folder):
     attempt("execution, scenario", InputError, lambda: load_scenario(folder / "scenario.yaml"))
 
 
-CERTIFICATE = {"certificate.json": json.dumps({"format": "guiderail certificate 3", "assumes": ["x"]}).encode()}
+CLAIMS = {"about": {"task": "x"}, "always": {}, "assumes": ["x"], "budgeted": None, "digest": "", "digests": {}}
+CLAIMS |= {"format": "guiderail certificate 4", "free": {}, "impedance": None, "kernel": "squared_exponential"}
+CERTIFICATE = {"certificate.json": json.dumps(CLAIMS | {"period": 0.1}).encode()}
 TASK_FILES = {
     "task.yaml": yaml.safe_dump(TASK).encode(),
     "part.obj": BOX,

@@ -213,6 +213,11 @@ class Bus:
             if lcm is self.near_robot or (settle and self.has_controller):
                 self._settle(lcm)
 
+    def settle(self) -> None:
+        """Deliver all messages that are on their way."""
+        for lcm in (self._arm, self.near_robot, self.near_station):
+            self._settle(lcm)
+
     def _settle(self, lcm: DrakeLcm) -> None:
         while lcm.HandleSubscriptions(0):
             pass

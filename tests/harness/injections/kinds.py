@@ -255,13 +255,14 @@ def _resized(message: bytes, rng: np.random.Generator) -> bytes:
     return status.encode()
 
 
-def _torque(change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault by a second program that commands other torques after each command."""
+def _second_program(change: Callable[[np.ndarray], np.ndarray], delay: float) -> Callable[[np.random.Generator], Fault]:
+    """Return a fault by a second program that commands other torques after each command; its clock differs [s]."""
 
     def make(rng: np.random.Generator) -> Fault:
         def relay(message: bytes, elapsed: float) -> list[bytes]:
             command = lcmt_iiwa_command.decode(message)
-            command.joint_torque = change(np.array(command.joint_torque), rng).tolist()
+            command.joint_torque = change(np.array(command.joint_torque)).tolist()
+            command.utime += round(1e6 * delay)
             return [message, command.encode()]
 
         return relay
@@ -278,7 +279,7 @@ TIMEOUT, HEARTBEAT, SLOW = 8 * PERIOD, 14 * PERIOD, 24 * PERIOD
 UNDETECTED = float("nan")
 KINDS = (
     Kind("all values frozen", FEW, _frozen(FIELDS, one=False)),
-    Kind("one joint frozen", SLOW, _frozen((Q, V, T), one=True)),
+    Kind("one joint frozen", FEW, _frozen((Q, V, T), one=True)),
     Kind("positions frozen", FEW, _frozen((Q,), one=False)),
     Kind("velocities frozen", FEW, _frozen((V,), one=False)),
     Kind("one position frozen", HEARTBEAT, _frozen((Q,), one=True)),
@@ -328,14 +329,16 @@ KINDS = (
     Kind("statuses twice", UNDETECTED, _duplicated, "network"),
     Kind("statuses reordered", UNDETECTED, _reordered, "network"),
     Kind("second robot, same clock", NEXT, _second_robot(0.0, 0.0)),
-    Kind("second robot, clock + 1 ms", TIMEOUT, _second_robot(1e-3, 0.0)),
+    Kind("second robot, clock + 1 ms", FEW, _second_robot(1e-3, 0.0)),
     Kind("second robot, another clock", NEXT, _second_robot(7.0, 0.0)),
     Kind("second robot, another posture", NEXT, _second_robot(1e-3, 0.3)),
     Kind("commands lost", TIMEOUT, _lost(1.0), "command"),
     Kind("commands 60 ms late", TIMEOUT, _delayed(0.06), "command"),
     Kind("half of the commands lost", UNDETECTED, _lost(0.5), "command"),
-    Kind("second program, torque zero", UNDETECTED, _torque(lambda torque, rng: np.zeros(7)), "command"),
-    Kind("second program, torque negated", UNDETECTED, _torque(lambda torque, rng: -torque), "command"),
+    Kind("second program, torque zero", FEW, _second_program(lambda torque: np.zeros(7), 0.0), "command"),
+    Kind("second program, torque negated", FEW, _second_program(lambda torque: -torque, 0.0), "command"),
+    Kind("second program, another clock", FEW, _second_program(lambda torque: -torque, 40.0), "command"),
+    Kind("second program, clock + 1 ms", SLOW, _second_program(lambda torque: 0.5 * torque, 1e-3), "command"),
     Kind("commander killed", TIMEOUT, None, "program", ("kill", "controller")),
     Kind("commander stopped", TIMEOUT, None, "program", ("stop", "controller")),
     Kind("robot killed", TIMEOUT, None, "program", ("kill", "robot")),

@@ -2,8 +2,8 @@
 
     python tests/harness/injections/processes.py --injections 20       # one or two minutes
 
-One process is a simulated robot with its safety monitor, another commands it; this one checks the messages on the bus.
-Only killed processes are restarted. The exit code is 1 if a check failed.
+One process is a simulated robot with its safety monitor, one commands it, and one is a second safety monitor; this one
+checks the messages on the bus. Only killed processes are restarted. The exit code is 1 if a check failed.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] o
 # Without a status a step takes one and a half periods.
 SILENT_AFTER = 0.95
 PAUSES = (0.1, 0.3, 1.0)  # by the robot's clock [s]
+MISSED_WITHIN, MISSED_FOR = 0.08, 0.9  # after which, and until when, a safety monitor is missed [s]
 MOVING = 0.15  # speed of the fastest joint of a moving arm [rad/s]
 
 
@@ -40,7 +41,8 @@ class Listener:
 
     def __init__(self, url: str):
         self.lcm = DrakeLcm(url)
-        self.clock, self.speed, self.is_acting, self.torque = 0.0, 0.0, False, np.zeros(7)
+        self.clock, self.speed, self.torque = 0.0, 0.0, np.zeros(7)
+        self.is_stopping: dict[int, bool] = {}  # by the number of a safety monitor
         self.speeds: list[tuple[float, float]] = []
         self.acting: list[float] = []
         self.commands: list[tuple[float, float]] = []  # wall clock time of the arrival, largest torque
@@ -56,16 +58,23 @@ class Listener:
         self.speeds.append((self.clock, self.speed))
 
     def _command(self, message: bytes) -> None:
-        torque = IiwaDriver.decode_command(message)
+        command = IiwaDriver.decode_command(message)
+        torque = None if command is None else command[0]
         if torque is None or len(torque) != 7 or not (np.abs(torque) <= self.limits + 1e-12).all():
             self.wrong.append(f"sent {torque}")
             return
         self.commands.append((time.monotonic(), float(np.abs(torque).max())))
 
     def _heartbeat(self, message: bytes) -> None:
-        self.is_acting = HEARTBEAT_FORMAT.unpack(message)[1]
-        if self.is_acting:
+        _, is_stopping, sender = HEARTBEAT_FORMAT.unpack(message)
+        self.is_stopping[sender] = is_stopping
+        if is_stopping:
             self.acting.append(self.clock)
+
+    @property
+    def is_acting(self) -> bool:
+        """True if a safety monitor stops the arm."""
+        return any(self.is_stopping.values())
 
     def listen(self, seconds: float) -> None:
         """Receive for some wall clock time [s]."""
@@ -91,6 +100,7 @@ class Listener:
         """Clear the records before an injection."""
         for records in (self.speeds, self.acting, self.commands, self.wrong):
             records.clear()
+        self.is_stopping.clear()
 
 
 def robot(url: str, rate: float) -> subprocess.Popen:
@@ -103,6 +113,19 @@ def controller(url: str, rate: float) -> subprocess.Popen:
     """Start the commanding program."""
     program = str(Path(__file__).with_name("controller.py"))
     return subprocess.Popen([sys.executable, program, url, str(rate)], stderr=subprocess.DEVNULL)
+
+
+def monitor(url: str, rate: float) -> subprocess.Popen:
+    """Start a second safety monitor."""
+    call = f"from guiderail.tools.cli.main import main; main(['safety-monitor', '--url', {url!r}, '--rate', '{rate}'])"
+    return subprocess.Popen([sys.executable, "-c", call], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+
+
+def check_rest(listener: Listener, before: float, until: float) -> list[str]:
+    """Check that the commanding program stopped the arm after its safety monitor had gone; return the problems."""
+    first, last = before + MISSED_WITHIN + STOPPED_WITHIN, min(before + MISSED_FOR, until)
+    fastest = max((speed for clock, speed in listener.speeds if first < clock < last), default=0.0)
+    return listener.wrong + ([f"the arm was not stopped: {fastest:.2f} rad/s"] if fastest > STANDSTILL else [])
 
 
 def check_arm(listener: Listener, before: float, until: float) -> list[str]:
@@ -131,9 +154,10 @@ def main() -> int:
     rate, url = arguments.rate, f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     listener, rng = Listener(url), np.random.default_rng(0)
     set_realtime_priority()
-    ends = {"robot": robot(url, rate), "controller": controller(url, rate)}
+    start = {"robot": robot, "controller": controller, "monitor": monitor}
+    ends = {name: program(url, rate) for name, program in start.items()}
     counts: Counter[tuple[str, str]] = Counter()
-    kinds = ["controller killed", "controller held up", "robot killed", "robot held up"]
+    kinds = [f"{name} {what}" for name in ("controller", "robot", "monitor") for what in ("killed", "held up")]
     try:
         for number in range(arguments.injections):
             kind = kinds[number % len(kinds)]
@@ -148,10 +172,10 @@ def main() -> int:
                 ends[process].kill()
                 ends[process].wait()
                 listener.listen(1.2 / rate)
-                ends[process] = {"robot": robot, "controller": controller}[process](url, rate)
                 until = listener.clock
+                ends[process] = start[process](url, rate)
             else:
-                held_up = float(rng.choice(PAUSES))
+                held_up = float(rng.choice(PAUSES[1:] if process == "monitor" else PAUSES))
                 ends[process].send_signal(signal.SIGSTOP)
                 listener.listen(held_up / rate)
                 ends[process].send_signal(signal.SIGCONT)
@@ -159,6 +183,8 @@ def main() -> int:
                 listener.listen(0.2 / rate)
             if process == "controller":
                 wrong = check_arm(listener, before, until)
+            elif process == "monitor":
+                wrong = check_rest(listener, before, until)
             else:
                 wrong = list(listener.wrong)
                 late = [when for when, _ in listener.commands if when - happened > SILENT_AFTER / rate]

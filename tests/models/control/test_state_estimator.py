@@ -282,6 +282,16 @@ def test_reordered_status_is_dropped():
     assert rig.estimate.is_new
 
 
+def test_reordered_status_is_dropped_when_another_program_commands():
+    rig = Rig().settle()
+    late = rig.status(external_torque=np.array([50.0, 0.0]), foreign_commands=1)
+    rig.check()
+    before = rig.accepted
+    assert rig.check(late) == Fault.SECOND_COMMANDER
+    np.testing.assert_array_equal(rig.accepted, before)
+    assert not rig.estimate.is_new
+
+
 def test_repeated_status_is_not_new():
     rig = Rig().settle()
     last = rig.status()
@@ -370,6 +380,46 @@ def test_equal_values_of_an_arm_at_rest_are_no_fault():
     assert rig.detected(lambda status: status, 50) is None
 
 
+PARTS = ("positions", "velocities", "external_torque")
+
+
+def frozen(kept, joint, **offsets):
+    """Return a change that repeats the values of one joint, with an offset of some of them."""
+
+    def change(status):
+        changed = {name: getattr(status, name).copy() for name in PARTS}
+        for name, values in changed.items():
+            values[joint] = getattr(kept, name)[joint] + offsets.get(name, 0.0)
+        return replace(status, **changed)
+
+    return change
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(("speed", "expected"), [(0.99, None), (1.01, (4, Fault.FROZEN))])
+def test_joint_frozen_at_rest_is_a_fault_when_another_moves(speed, expected, joint):
+    velocity = np.full(2, speed * module.MIN_SPEED)
+    velocity[joint] = 0.0
+    rig = Rig(velocity=velocity).settle()
+    assert rig.detected(frozen(rig.status(), joint), 8) == expected
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_joint_at_rest_is_not_frozen_when_one_value_changes(name):
+    rig = Rig(velocity=[0.0, 0.1]).settle()
+    kept = rig.status()
+    assert rig.detected(lambda status: frozen(kept, 0, **{name: 1e-9 * rig.step})(status), 20) is None
+
+
+def test_counter_of_equal_values_restarts_when_one_changes():
+    rig = Rig(velocity=[0.0, 0.1]).settle()
+    kept, counts = rig.status(), []
+    for offset in (0.0, 0.0, 1e-9, 1e-9, 1e-9):
+        assert rig.check(frozen(kept, 0, velocities=offset)) == Fault.NONE
+        counts.append(rig.estimate.state.equal_values[0])
+    assert counts == [1.0, 2.0, 0.0, 1.0, 2.0]
+
+
 def test_counters_restart_when_values_change():
     rig = Rig().settle()
     for _ in range(10):
@@ -430,6 +480,44 @@ def test_velocity_change_within_a_period_is_no_contradiction():
         assert rig.check() == Fault.NONE, share
         assert rig.estimate.state.residual[0] == pytest.approx(0.0, abs=1e-9)
         assert impact.is_readable
+
+
+# A second robot, a second program.
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_velocity_is_that_before_a_second_robots_statuses(number):
+    """At rest in the same posture: its first statuses are accepted, like those of an arm that was stopped."""
+    rig = Rig().settle()
+    kept, rest = rig.status(), {"velocities": np.zeros(2)}
+    for _ in range(number):
+        assert rig.check(lambda status: replace(kept, time=status.time, **rest)) == Fault.NONE
+    assert np.abs(rig.estimate.state.velocity).max() < 0.3 * CRUISE.max()
+    assert rig.check(lambda status: replace(status, conflicts=1)) == Fault.CONFLICT
+    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.1)
+    energy, speed = stop(rig, lambda status: replace(kept, time=status.time, conflicts=rig.step, **rest))
+    assert energy <= 0.5 * CRUISE @ M @ CRUISE * 1.05
+    assert speed < 0.15
+
+
+def test_second_program_is_a_fault_and_statuses_are_accepted():
+    rig = Rig().settle()
+    assert rig.check(lambda status: replace(status, foreign_commands=3)) == Fault.SECOND_COMMANDER
+    assert rig.estimate.is_new
+    steps = 1
+    while rig.check(lambda status: replace(status, foreign_commands=3)):
+        assert rig.estimate.is_new
+        steps += 1
+    assert LIMITS.settling_time <= steps * PERIOD <= LIMITS.settling_time + 2 * PERIOD
+    change = {"conflicts": 1, "foreign_commands": 4}
+    assert rig.check(lambda status: replace(status, **change)) == Fault.CONFLICT
+
+
+def test_first_status_may_have_counts_from_before():
+    rig = Rig(velocity=np.zeros(2))
+    for _ in range(SETTLED):
+        rig.check(lambda status: replace(status, conflicts=5, foreign_commands=7))
+    assert rig.estimate.fault == Fault.NONE
 
 
 # Velocity against torque.
@@ -691,7 +779,7 @@ def test_state_is_restored_from_its_vector():
     np.testing.assert_array_equal(restored.vector(), rig.state.vector())
     np.testing.assert_array_equal(restored.bias, rig.state.bias)
     assert (restored.doubt_time, restored.last_time) == (rig.state.doubt_time, rig.state.last_time)
-    assert EstimatorState.initial(3).vector().shape == (11 + 19 * 3,)
+    assert EstimatorState.initial(3).vector().shape == (12 + 20 * 3,)
 
 
 def test_torque_that_is_not_finite_counts_as_zero():

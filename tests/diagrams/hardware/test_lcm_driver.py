@@ -1,0 +1,84 @@
+"""Driver on LCM: which messages contradict others."""
+
+import numpy as np
+import pytest
+from drake import lcmt_iiwa_status
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.models.control.joint_status import Heartbeat
+
+OWN, OTHER = np.full(7, 0.5), np.full(7, -0.5)
+
+
+class Pair:
+    """This program's driver and another one on the same bus."""
+
+    def __init__(self):
+        lcm = DrakeLcm("memq://")
+        self.driver, self.other, self.step = IiwaDriver(lcm), IiwaDriver(lcm), 0
+
+    def status(self, time=None, position=0.0):
+        self.step += 1
+        message = lcmt_iiwa_status()
+        message.utime, message.num_joints = round((self.step * 0.005 if time is None else time) * 1e6), 7
+        for name in message.__slots__[2:]:
+            setattr(message, name, [0.0] * 7)
+        message.joint_position_measured = [position] * 7
+        self.driver.lcm.Publish("IIWA_STATUS", message.encode())
+        return self.read()
+
+    def read(self):
+        while self.driver.lcm.HandleSubscriptions(0):
+            pass
+        return self.driver.read()
+
+
+def test_own_commands_are_not_foreign():
+    pair = Pair()
+    pair.driver.write(OWN, 1.0)
+    assert pair.status().foreign_commands == pair.driver.num_foreign_commands == 0
+
+
+def test_foreign_commands_contradict_once_this_program_commands():
+    pair = Pair()
+    pair.other.write(OTHER, 1.0)
+    assert pair.status().foreign_commands == 0
+    assert pair.driver.num_foreign_commands == 1
+    pair.driver.write(OWN, 1.0)
+    assert pair.read().foreign_commands == 0
+    pair.other.write(OTHER, 1.0)
+    assert pair.read().foreign_commands == 1  # without a new status
+    pair.other.write(OTHER, 1.005)
+    assert pair.status().foreign_commands == pair.driver.num_foreign_commands - 1 == 2
+
+
+@pytest.mark.parametrize("is_stopping", [False, True])
+def test_commands_of_a_safety_monitor_are_not_foreign(is_stopping):
+    pair = Pair()
+    pair.driver.write(OWN, 1.0)
+    pair.other.write_heartbeat(Heartbeat(1, False, 5))
+    pair.other.write_heartbeat(Heartbeat(1, is_stopping, 4))
+    pair.other.write(OTHER, 1.0)
+    assert pair.status().foreign_commands == pair.driver.num_foreign_commands == (not is_stopping)
+    pair.other.write_heartbeat(Heartbeat(2, False, 4))
+    pair.other.write(OTHER, 1.005)
+    assert pair.read().foreign_commands == 1 + (not is_stopping)
+
+
+def test_every_status_is_compared_also_if_it_is_not_read():
+    pair = Pair()
+    assert pair.status().conflicts == 0
+    pair.status(time=0.006, position=0.1)
+    assert pair.status(time=0.006, position=0.2).conflicts == 1
+    assert pair.status(time=0.006, position=0.2).conflicts == 1
+    pair.status(time=0.008, position=0.4)
+    assert pair.status(time=0.01, position=0.2).conflicts == 2
+    np.testing.assert_array_equal(pair.read().positions, 0.2)
+
+
+def test_command_is_decoded_with_its_time():
+    torque, time = IiwaDriver.decode_command(IiwaDriver.encode(OWN, 2.5))
+    np.testing.assert_array_equal(torque, OWN)
+    assert time == 2.5
+    assert IiwaDriver.decode_command(b"nonsense") is None

@@ -1,0 +1,183 @@
+"""Messages of two robots or two programs, on both sides of each limit."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.control import message_sequence as module
+from guiderail.models.control.joint_status import MALFORMED_STATUS, MAX_MISSED_MESSAGES, JointStatus
+from guiderail.models.control.message_sequence import CommandSequence, StatusSequence
+
+PERIOD = 2.0**-8
+TORQUE = np.array([1.0, -2.0])
+REACH = MAX_MISSED_MESSAGES * PERIOD
+
+
+def status(time, *positions, velocity=0.0):
+    return JointStatus(time, np.array(positions), np.full(len(positions), velocity), np.zeros(len(positions)))
+
+
+def conflicts(*statuses):
+    sequence = StatusSequence(PERIOD)
+    for each in statuses:
+        sequence.add(each)
+    return sequence.num_conflicts
+
+
+def test_equal_time_stamps_conflict_when_values_differ():
+    assert conflicts(status(1.0, 0.0), status(1.0, 0.0)) == 0
+    assert conflicts(status(1.0, 0.0), status(1.0, 0.0, velocity=1e-9)) == 1
+    assert conflicts(status(1.0, 0.0), status(1.0, 1e-9), status(1.0, 0.0)) == 2
+    assert conflicts(status(1.0, 0.0), status(1.0, 0.0), status(1.0, 1e-9)) == 1
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(("share", "is_conflict"), [(0.999, False), (1.001, True)])
+def test_positions_conflict_when_they_go_to_and_fro(share, is_conflict, joint, sign):
+    """Forth in 3/4 and back in 1/4 of a period."""
+    times = 1.0 + PERIOD * np.array([0.0, 0.75, 1.0])
+    rates = 1.0 / np.diff(times)
+    limit = (module.REVERSAL + 2.0 * module.RESOLUTION * rates.sum()) / rates.sum()
+    positions = np.zeros((3, 2))
+    positions[1, joint] = sign * share * limit
+    assert conflicts(*(status(*each) for each in zip(times, *positions.T, strict=True))) == is_conflict
+    assert module.REVERSAL == 1.5
+    assert module.RESOLUTION == 1e-4
+
+
+def test_positions_do_not_conflict_without_a_reversal():
+    """As in a collision or a jump."""
+    steps = [0.0, 0.05, 0.05, 0.0501, 0.0502]
+    assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate(steps))) == 0
+    assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate([0.0, 0.001, 0.05]))) == 0
+
+
+@pytest.mark.parametrize(("gap", "is_conflict"), [(REACH, True), (REACH + 1e-9, False)])
+def test_positions_are_compared_within_the_maximum_interval(gap, is_conflict):
+    times = np.cumsum([1.0, gap, PERIOD])
+    assert conflicts(*(status(t, q) for t, q in zip(times, [0.0, 0.5, 0.0], strict=True))) == is_conflict
+    times = np.cumsum([1.0, PERIOD, gap])
+    assert conflicts(*(status(t, q) for t, q in zip(times, [0.0, 0.5, 0.0], strict=True))) == is_conflict
+
+
+@pytest.mark.parametrize(
+    "between", [MALFORMED_STATUS, status(1.0 + 1.5 * PERIOD), status(0.5, 0.0)], ids=["malformed", "size", "reordered"]
+)
+def test_positions_are_compared_again_after_a_gap(between):
+    before, peak = status(1.0, 0.0), status(1.0 + PERIOD, 0.5)
+    assert conflicts(before, peak, status(1.0 + 2 * PERIOD, 0.0)) == 1
+    assert conflicts(before, peak, between, status(1.0 + 2 * PERIOD, 0.0)) == 0
+    again = (status(1.0 + n * PERIOD, 0.5 * (n % 2)) for n in range(2, 5))
+    assert conflicts(before, peak, between, *again) == 1
+
+
+def test_second_robot_conflicts_while_this_one_moves():
+    speed, sequence = 0.4, StatusSequence(PERIOD)
+    for step in range(4):
+        time = step * PERIOD
+        sequence.add(status(time, speed * time, velocity=speed))
+        sequence.add(status(time + 0.2 * PERIOD, 0.0))
+        if step == 1:
+            assert sequence.num_conflicts <= 1
+    assert sequence.num_conflicts >= 2
+
+
+# Commands.
+
+
+def count(times, nows=None, torques=None):
+    sequence = CommandSequence(PERIOD)
+    nows = times if nows is None else nows
+    for n, (time, now) in enumerate(zip(times, nows, strict=True)):
+        sequence.add(TORQUE + n if torques is None else torques[n], time, now)
+    return sequence.num_conflicts
+
+
+def test_commands_of_one_program_do_not_conflict():
+    times = PERIOD * np.arange(500)
+    assert count(times) == 0
+    assert count(times + 100.0, times) == 0
+    assert count(times / 1.15) == 0  # 15 % faster
+    assert count(np.repeat(times, 2), torques=np.repeat(times, 2)[:, None]) == 0  # each message twice
+
+
+def test_gaps_do_not_conflict():
+    times = PERIOD * np.array([*range(10), *range(30, 40), *range(60, 70), *range(90, 100)])
+    assert count(times) == 0
+
+
+def test_restart_does_not_conflict():
+    nows = PERIOD * np.arange(60)
+    times = np.where(nows < 30 * PERIOD, nows + 50.0, nows - 30 * PERIOD)
+    assert count(times, nows) == 0
+    twice = np.where(nows < 40 * PERIOD, times, nows - 40 * PERIOD)
+    assert count(twice, nows) == 0
+
+
+@pytest.mark.parametrize("offset", [-50.0, 50.0, 2.0 * REACH])
+def test_time_stamps_that_return_conflict(offset):
+    nows = PERIOD * np.repeat(np.arange(10), 2)
+    times = nows + np.tile([0.0, offset], 10)
+    assert count(times[:2], nows[:2]) == 0
+    assert count(times[:3], nows[:3]) == 1
+    assert count(times, nows) >= 17
+
+
+@pytest.mark.parametrize(("late", "is_conflict"), [(0.999, True), (1.001, False), (-0.999, True), (-1.001, False)])
+def test_return_is_to_a_clock_that_has_continued(late, is_conflict):
+    elapsed = 0.25
+    assert count([100.0, 3.0, 100.0 + elapsed + late * REACH], [0.0, 0.01, elapsed]) == is_conflict
+
+
+@pytest.mark.parametrize(("elapsed", "is_conflict"), [(1.0, True), (1.0 + 1e-9, False)])
+def test_return_is_attributed_for_a_while(elapsed, is_conflict):
+    assert count([100.0, 3.0, 100.0 + elapsed], [0.0, 0.01, elapsed]) == is_conflict
+    assert module.RETURN_TIME == 1.0
+
+
+@pytest.mark.parametrize(("jump", "is_conflict"), [(REACH, False), (REACH + 2.0**-20, True)])
+def test_jump_is_longer_than_the_delay_of_a_message(jump, is_conflict):
+    assert count([1.0, 1.0 - jump, 1.0 + REACH], [0.0, 0.0, REACH]) == is_conflict
+
+
+@pytest.mark.parametrize(("gap", "is_conflict"), [(0.1, True), (0.1 + 1e-9, False)])
+def test_equal_time_stamps_conflict_when_they_recur(gap, is_conflict):
+    assert count([1.0, 1.0], [0.0, 0.0]) == 0
+    assert count([1.0, 1.0, 1.005, 1.005], [0.0, 0.0, gap, gap]) == is_conflict
+    assert module.EQUAL_TIME == 0.1
+
+
+def test_rate_conflicts_above_its_limit():
+    """Two programs with the same clock: 2 commands per period, of which 1.2 are expected."""
+    times = PERIOD * (0.5 * np.arange(60))
+    sequence = CommandSequence(PERIOD)
+    found = None
+    for n, time in enumerate(times):
+        sequence.add(TORQUE + n, time, time)
+        found = n if found is None and sequence.num_conflicts else found
+    # The level rises by 1 − 0.6 with each command after the first, up to 8.
+    assert found == int((module.MAX_LEVEL - 1.0) / 0.4) + 1
+    assert count(PERIOD / 1.19 * np.arange(1000)) == 0
+    assert count(PERIOD / 1.25 * np.arange(1000)) > 0
+    assert (module.LEAK, module.MAX_LEVEL) == (1.2, 8)
+
+
+@pytest.mark.parametrize(("number", "is_conflict"), [(8, False), (9, True)])
+def test_rate_allows_a_burst(number, is_conflict):
+    assert count(1.0 + 1e-3 * np.arange(number), np.zeros(number)) == is_conflict
+
+
+def test_level_falls_when_one_program_is_left():
+    sequence = CommandSequence(PERIOD)
+    for n in range(100):
+        sequence.add(TORQUE + n, 0.5 * n * PERIOD, 0.5 * n * PERIOD)
+    before = sequence.num_conflicts
+    for n in range(1, 100):
+        sequence.add(TORQUE + n, (49.5 + n) * PERIOD, (49.5 + n) * PERIOD)
+    assert sequence.num_conflicts == before
+
+
+def test_level_does_not_fall_below_zero():
+    times = [0.0, *(10.0 + 1e-3 * np.arange(9))]
+    nows = [0.0, *np.full(9, 10.0)]
+    assert count(times, nows) == 1
