@@ -54,8 +54,8 @@ class StatusSequence:
 class CommandSequence:
     """Counts the commands that cannot be of the program that sent the previous ones.
 
-    The commands of one program have increasing time stamps and arrive as often as its period says; a restart sets its
-    clock once, and the network may delay commands by a few periods. These contradict that:
+    The commands of one program have increasing time stamps and arrive once per period; a restart sets its clock once,
+    and the network may delay commands by a few periods. These contradict that:
 
     - *Return*: time stamps that jump relative to the local clock, and then back to where the first clock has to be.
     - *Equal time*: within `EQUAL_TIME`, two commands with the time stamp of their predecessor and other torques.

@@ -217,7 +217,7 @@ class StateEstimator:
             return self._finish(state, before, fault, now)
 
         if fault == Fault.CONFLICT and not is_doubted:
-            # The last statuses may be of the other robot; the sums contain what they say and what they miss.
+            # The last statuses may be of the other robot; the sums contain by how much the torques contradict them.
             reported = before.last_values[self._velocities]
             state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values

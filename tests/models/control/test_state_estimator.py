@@ -282,7 +282,7 @@ def test_reordered_status_is_dropped():
     assert rig.estimate.is_new
 
 
-def test_reordered_status_is_dropped_when_another_program_commands():
+def test_reordered_status_is_dropped_at_a_second_program():
     rig = Rig().settle()
     late = rig.status(external_torque=np.array([50.0, 0.0]), foreign_commands=1)
     rig.check()
