@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.stations.workcell import MovableWorkcell
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.parsing import add_models
 from guiderail.models.objects.surfaces import Hull, Surface
 
@@ -67,14 +68,22 @@ class PartWorkcell(MovableWorkcell):
         """Filter nothing: every piece of the plug may touch every piece of the socket."""
 
     def fixture_surfaces(self) -> list[Surface]:
-        """Return the convex pieces of the socket."""
+        """Return the convex pieces of the socket.
+
+        Raises:
+            InputError: If the part has none; without them, nothing would be in the plug's way.
+        """
         return self._surfaces(SOCKET, self.convex[1])
 
     def workpiece_surfaces(self) -> list[Surface]:
-        """Return the convex pieces of the plug."""
+        """Return the convex pieces of the plug; as `fixture_surfaces`."""
         return self._surfaces(PLUG, self.convex[0])
 
     def _surfaces(self, body: str, files: Sequence[str]) -> list[Surface]:
+        if not files:
+            raise InputError(
+                f"the {body} in {self.folder} has no convex pieces, which MuJoCo needs: choose station='gantry'"
+            )
         return [
             Surface(f"{body}_{number}", "parts", Hull(read_vertices(self.folder / file)), self.friction)
             for number, file in enumerate(files)

@@ -134,6 +134,21 @@ def test_part_offers_no_station_that_cannot_simulate_meshes(tmp_path):
         EnvConfig.resolve(str(folder), {"station": "mujoco"})
 
 
+def test_convex_pieces_of_both_parts_offer_mujoco(tmp_path):
+    both = {name: part(name, convex=[f"{name}.obj"]) for name in ("plug", "socket")}
+    for number, (parts, is_offered) in enumerate(((both, True), ({"plug": both["plug"]}, False))):
+        folder = write(tmp_path / f"convex_{number}", **parts)
+        assert ("mujoco" in load_task_folder(folder).stations()) is is_offered
+        workcell = EnvConfig.resolve(str(folder), {}).make_task().workcell()
+        (plug,) = workcell.workpiece_surfaces()
+        assert np.ptp(plug.shape.vertices, axis=0)[2] == pytest.approx(0.02)
+        with nullcontext() if is_offered else pytest.raises(InputError, match=r"the socket .* has no convex pieces"):
+            workcell.fixture_surfaces()
+    folder = write(tmp_path / "crowded", **both, scenario=["table.yaml"])
+    (folder / "table.yaml").write_text("directives: []")
+    assert "mujoco" not in load_task_folder(folder).stations()
+
+
 def test_missing_part_folder_is_named(tmp_path):
     with pytest.raises(InputError, match=f"there is no task folder {tmp_path}/gone: restore it"):
         read_task_file(tmp_path / "gone")
