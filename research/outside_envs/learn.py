@@ -194,6 +194,8 @@ def main() -> None:
     if given.task == "table":
         print_table(given.out)
         return
+    if given.task == "nut" and given.method == "rlpd":
+        parser.error("rlpd needs a scripted policy whose actions can be repeated: choose peg or assembly")
     import torch
 
     torch.set_num_threads(1)

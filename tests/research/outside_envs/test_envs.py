@@ -14,7 +14,7 @@ def load(name):
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_commands_satisfy_the_constraints_and_the_motion_reaches_the_end(name):
+def test_commands_are_inside_and_the_motion_ends(name):
     task = load(name)
     segments = task.make_segments(count=4)
     assert all(segment.recorded.num_demonstrations == 4 for segment in segments)

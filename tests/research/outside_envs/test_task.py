@@ -78,7 +78,7 @@ def test_guided_commands_are_inside_and_extra_is_passed_on(segments):
     assert env.unwrapped.grips == [-1.0] * 12 + [1.0] * 27
 
 
-def test_bare_environment_measures_the_distance_to_the_nearest_box(segments):
+def test_bare_environment_measures_distance_to_nearest_box(segments):
     env = TASK.make("none", 0, segments)
     observation, _ = env.reset(seed=0)
     assert observation.shape == (3,)
@@ -90,7 +90,7 @@ def test_bare_environment_measures_the_distance_to_the_nearest_box(segments):
     assert env.unwrapped.steps == 10
 
 
-def test_table_has_intervals_and_the_worst_of_training_and_held_out(tmp_path, capsys):
+def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
     row = {
         "episodes": 10, "successes": 9, "by_side": [[5, 5], [4, 5]], "violated_episodes": 0, "max_violation": -0.1,
         "fallbacks": 0, "median_force": 1.0, "max_force": 20.0,
