@@ -7,7 +7,7 @@ OUTSIDE := .venv-outside
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling motions fci outside newest clean
+.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling motions fci lerobot outside newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -74,6 +74,13 @@ fci:  ## rehearse a Franka on the simulator of its protocol, minutes
 	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[fci,mujoco]" franky-sim
 	.venv-fci/bin/python tests/harness/fci/rehearse.py
 
+lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its own, minutes (downloads 4 GB)
+	python3.12 -m venv .venv-lerobot
+	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e integrations/lerobot_robot_guiderail \
+	  "lerobot[core-scripts]" pytest
+	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null \
+	  integrations/lerobot_robot_guiderail/tests
+
 motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, half an hour
 	$(BIN)/python tests/harness/motion_limits.py
 
@@ -91,7 +98,7 @@ newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
 	.ci/newest python3.13
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) $(OUTSIDE) .venv-fci build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) $(OUTSIDE) .venv-fci .venv-lerobot build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
 $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"

@@ -20,6 +20,7 @@ CHECKED = (
     "diagrams/",
     "docs/",
     "examples/",
+    "integrations/",
     "models/",
     "research/",
     "src/",
