@@ -23,8 +23,9 @@ BENCHMARKS = (
     "training",
     "cold_start",
     "many_envs",
+    "actors",
 )
-WITH_TASK = ("training", "cold_start")  # benchmarks of a task that the caller names
+WITH_TASK = ("training", "cold_start", "actors")  # benchmarks of a task that the caller names
 WITH_IMPORTS = ("cold_start",)  # benchmarks that start other processes, which have to import the task's modules
 WITH_PICTURE = ("time_step", "engines")
 
