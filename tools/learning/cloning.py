@@ -15,7 +15,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import BcConfig
 from guiderail.tools.learning.learner import Learner
-from guiderail.tools.learning.off_policy import export_layers
+from guiderail.tools.learning.networks import export_layers
 
 
 class BcLearner(Learner):

@@ -13,7 +13,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner
-from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, export_policy
+from guiderail.tools.learning.networks import export_policy
+from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
 
 
 class SpacesOnlyEnv(gymnasium.Env):

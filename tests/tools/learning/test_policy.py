@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, _digest
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.off_policy import export_policy
+from guiderail.tools.learning.networks import export_policy
 
 
 class SpacesOnlyEnv(gymnasium.Env):

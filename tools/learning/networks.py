@@ -1,0 +1,121 @@
+"""Networks of Stable-Baselines3 learners: features of images, activations, and their export as a policy."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from sb3_contrib.common.torch_layers import BatchRenorm
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import FORMAT, Policy
+
+IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22×28×3
+
+
+class AveragePooledImage(BaseFeaturesExtractor):
+    """Features of an image: the averages of squares of pixels, as one vector (thesis, 4.4.1).
+
+    Without pooling, an image of 110×144×3 makes a first layer of twelve million weights per network and a gradient step
+    of most of a second on one core. What the task needs to see is larger than a pixel.
+    """
+
+    def __init__(self, observation_space: spaces.Box, pool: int):
+        """Construct the extractor for images (channels, height, width), with squares of side `pool` [pixels]."""
+        channels, height, width = observation_space.shape
+        super().__init__(observation_space, channels * (height // pool) * (width // pool))
+        self.pool = pool
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Map images (batch, channels, height, width) in [0, 1] to features (batch, features)."""
+        return torch.nn.functional.avg_pool2d(observations, self.pool).flatten(1)
+
+
+class NormalizedReLU(torch.nn.Module):
+    """Layer normalization without learned parameters, followed by a rectifier."""
+
+    kind = "normalized_relu"
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """Map features (…, units) to the same shape."""
+        return torch.relu(torch.nn.functional.layer_norm(features, features.shape[-1:]))
+
+
+class DroppedNormalizedReLU(NormalizedReLU):
+    """Dropout, followed by layer normalization and a rectifier (DroQ; Hiraoka et al., 2022)."""
+
+    def __init__(self, probability: float):
+        """Construct the module, which drops features with a probability while it is trained."""
+        super().__init__()
+        self.dropout = torch.nn.Dropout(probability)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """Map features (…, units) to the same shape."""
+        return super().forward(self.dropout(features))
+
+
+def add_dropout(critic: Any, probability: float) -> None:
+    """Replace the activations of the critics by ones with dropout."""
+    for network in critic.q_networks:
+        for index, layer in enumerate(network):
+            if not isinstance(layer, torch.nn.Linear):
+                network[index] = DroppedNormalizedReLU(probability)
+
+
+def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
+    """Return the policy of a Stable-Baselines3 actor: linear layers with rectifiers between them, and a final tanh.
+
+    `description` holds further entries of the policy's description, such as the observation's shape.
+
+    Raises:
+        InputError: If the actor has other layers.
+    """
+    layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
+    pool = getattr(actor.features_extractor, "pool", 1)
+    return export_layers(layers, actor.action_space, {"pool": pool, "squash": "tanh", **description})
+
+
+def export_layers(layers: Sequence[torch.nn.Module], space: Any, description: Mapping[str, Any]) -> Policy:
+    """Return the policy of a network's layers; one that normalizes by running statistics joins the next linear layer.
+
+    Args:
+        layers: Linear layers with one kind of activation between them.
+        space: Action space.
+        description: Entries of the policy's description.
+
+    Raises:
+        InputError: If there are other layers.
+    """
+    linear: list[tuple[torch.Tensor, torch.Tensor]] = []
+    activations: list[str | None] = []
+    scale, shift = torch.ones(1), torch.zeros(1)
+    for layer in layers:
+        if isinstance(layer, torch.nn.Linear):
+            linear.append((layer.weight * scale, layer.bias + layer.weight @ shift.expand(layer.in_features)))
+            scale, shift = torch.ones(1), torch.zeros(1)
+        elif isinstance(layer, BatchRenorm):
+            renorm: Any = layer  # its buffers have no type
+            scale = renorm.scale / (renorm.ra_var + renorm.eps).sqrt()
+            shift = renorm.bias - renorm.ra_mean * scale
+        else:
+            activations.append(_ACTIVATIONS.get(type(layer), getattr(layer, "kind", None)))
+    if len(activations) + 1 != len(linear) or len({*activations}) != 1 or None in activations:
+        raise InputError(
+            f"an actor of {', '.join(type(layer).__name__ for layer in layers)} can't be exported: use linear layers "
+            "with one kind of rectifier between them"
+        )
+    return Policy(
+        [(weight.detach().numpy().copy(), bias.detach().numpy().copy()) for weight, bias in linear],
+        {
+            "format": FORMAT,
+            "pool": 1,
+            "action_low": space.low.tolist(),
+            "action_high": space.high.tolist(),
+            "activation": activations[0],
+            **description,
+        },
+    )
+
+
+_ACTIVATIONS = {torch.nn.ReLU: "relu", torch.nn.Tanh: "tanh"}
