@@ -79,6 +79,18 @@ _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
 SECTIONS: dict[str, list[Section]] = {
     "BncConnector": [
         Section(
+            "Connector, hard, on an iiwa with a robot's sensors",
+            [
+                Row("KGRL", "connector_robot_sensing", "kgrl"),
+                Row("KGRL, light push", "connector_robot_sensing", "light_push"),
+                Row("KGRL, critic without privileged observation", "connector_robot_sensing", "own_observation"),
+                Row("residual RL", "connector_robot_sensing", "residual"),
+                Row("residual RL, force not bounded", "connector_robot_sensing", "residual_unbounded"),
+                *_baselines("connector_robot_sensing_baselines", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+            guided=("KGRL",),
+        ),
+        Section(
             "Connector, hard",
             [
                 Row("KGRL", "connector_hard", "kgrl"),
@@ -100,7 +112,6 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("residual RL", "connector_hard_fine", "residual", "MuJoCo"),
                 *_baselines("connector_hard_fine", _NOT_CONSTANT, "MuJoCo", _NAMES_NOT_CONSTANT),
             ],
-            guided=("KGRL", "sKGRL, adaptive history"),
         ),
         Section(
             "Connector, hard, commands within 2.8 mm",
@@ -140,6 +151,18 @@ SECTIONS: dict[str, list[Section]] = {
         ),
     ],
     "GridClamp": [
+        Section(
+            "Grid clamp, hard, on an iiwa with a robot's sensors",
+            [
+                Row("RL-SCT, 3 demonstration episodes", "grid_clamp_robot_sensing", "sct"),
+                Row("RL-SCT", "grid_clamp_robot_sensing", "sct_not_shown"),
+                Row("residual RL", "grid_clamp_robot_sensing", "residual"),
+                Row("residual RL, force not bounded", "grid_clamp_robot_sensing", "residual_unbounded"),
+                Row("straight down", "grid_clamp_robot_sensing", "straight"),
+                *_baselines("grid_clamp_robot_sensing", _NOT_CONSTANT[1:], names=_NAMES_NOT_CONSTANT[1:]),
+            ],
+            guided=("RL-SCT, 3 demonstration episodes",),
+        ),
         Section(
             "Grid clamp, hard",
             [
