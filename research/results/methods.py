@@ -443,6 +443,6 @@ def _percent(seeds: pd.DataFrame) -> str:
 def _stopped(seeds: pd.DataFrame) -> str:
     """Return the share of training episodes of all seeds that ended in a collision [%]; a dash where it is unknown."""
     column = "training_ended_in_collision"
-    if column not in seeds or seeds[column].isna().any():
+    if seeds.empty or column not in seeds or seeds[column].isna().any():
         return "–"
     return f"{100 * seeds[column].sum() / seeds['training_episodes'].sum():.0f}"
