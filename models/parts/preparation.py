@@ -1,4 +1,4 @@
-"""From two drawn parts to contact geometry: united, decimated, cropped, and cut into convex pieces or tetrahedra."""
+"""Preparation of contact geometry from two drawn parts: unite, decimate, crop, and cut into convex pieces or tetrahedra."""
 
 from __future__ import annotations
 
