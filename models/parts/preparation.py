@@ -1,4 +1,4 @@
-"""Preparation of contact geometry from two drawn parts: unite, decimate, crop, and cut into convex pieces or tetrahedra."""
+"""Preparation of contact geometry from two drawn parts: unite, decimate, crop, cut into convex pieces or tetrahedra."""
 
 from __future__ import annotations
 
