@@ -83,7 +83,8 @@ HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
 """Options of difficulty="hard": little time, and a force limit of 10 N; snapping in takes 6 N.
 
 The force is bounded below the limit: an untrained policy does not end an episode by force, but may search until its
-end. Random actions find the holes in 10 of 14 episodes of 10 s and in 4 of 14 of 6 s, a scripted search in all.
+end. On the gantry with exact sensors random actions find the holes in 10 of 14 episodes of 10 s and in 4 of 14 of 6 s,
+a scripted search in all.
 """
 
 
