@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from guiderail.models.common.errors import InputError
@@ -127,13 +127,17 @@ def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") ->
 
     Args:
         name: Name of the kind.
-        known: Prior knowledge.
+        known: Prior knowledge; options that it lacks have their defaults.
         task: Name of the task, for the message.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing.
     """
     kind = check_guidance(name, [one for one in REQUIREMENTS if known.has(one)], task)
+    if kind.options is not None:
+        declared = kind.options.model_fields.items()
+        defaults = {name: field.get_default() for name, field in declared if not field.is_required()}
+        known = replace(known, options=defaults | dict(known.options))
     guidance = kind.build(known)
     guidance.set_name("guidance")
     return guidance

@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations import gantry
 from guiderail.diagrams.stations.gantry import GantryStation, max_stable_time_step
-from guiderail.diagrams.stations.station import INPUTS, PLANT_PERIOD, Impedance
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, INPUTS, PLANT_PERIOD, Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from research.benchmarks.impedance import step_response
@@ -25,7 +25,13 @@ class Held:
     """Gantry with its jack far away, which holds a pose while a wrench acts on its tool."""
 
     def __init__(self, pose, control, impedance=None, time_step=None):
-        self.station = GantryStation(WORKCELL, impedance or Impedance(), time_step, impedance_control=control)
+        self.station = GantryStation(
+            WORKCELL,
+            impedance or Impedance(),
+            time_step,
+            impedance_control=control,
+            control_period=2 * time_step if time_step else CONTROL_PERIOD,
+        )
         self.plant = self.station.plant
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
@@ -108,7 +114,7 @@ def fastest_after_a_push(impedance, time_step):
 def test_station_raises_when_the_time_step_is_unstable(impedance, monkeypatch):
     longest = max_stable_time_step(impedance)
     with pytest.raises(InputError, match="too long for impedance_control='cartesian'"):
-        GantryStation(WORKCELL, impedance, longest, impedance_control="cartesian")
+        GantryStation(WORKCELL, impedance, longest, impedance_control="cartesian", control_period=2 * longest)
     assert fastest_after_a_push(impedance, 0.95 * longest) < 0.01
     monkeypatch.setattr(gantry, "_check_time_step", lambda impedance, time_step: None)
     assert fastest_after_a_push(impedance, 1.1 * longest) > 1.0  # unstable up to the limits
