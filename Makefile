@@ -7,7 +7,7 @@ OUTSIDE := .venv-outside
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling motions fci lerobot outside newest clean
+.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling fci lerobot motions outside newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help

@@ -250,7 +250,7 @@ def test_constructor_refuses_a_history_that_is_not_shorter(history):
 
 @pytest.mark.parametrize(
     ("shorter", "words"),
-    [([primitive(1, upper=0.4)], "other constraints"), ([primitive(1), primitive(1)], "of one length")],
+    [([primitive(1, upper=0.4)], "other constraints"), ([primitive(1), primitive(1)], "have the same length")],
 )
 def test_constructor_refuses_primitives_with_other_constraints(shorter, words):
     with pytest.raises(InputError, match=words):

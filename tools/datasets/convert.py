@@ -64,7 +64,7 @@ def import_recording(
         raise InputError(f"{source} is not a LeRobot dataset, a bag, an .mcap or .csv file, or a folder of them")
     given = [name for name, value in csv_options.items() if value is not None]
     if given and kind != "CSV files":
-        raise InputError(f"{kind} state this themselves: leave --{given[0].replace('_', '-')} out")
+        raise InputError(f"leave --{given[0].replace('_', '-')} out: it is stated in {kind}")
     demonstrations = Demonstrations(recorded.times, recorded.outputs, recorded.names)
     if rate is not None:
         demonstrations = _at_rate(demonstrations, rate)

@@ -265,7 +265,7 @@ def test_import_writes_no_file_that_cannot_be_read(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])
 def test_import_refuses_csv_options_for_other_formats(kind, file, tmp_path):
     export_demonstrations(file, tmp_path / "set", kind)
-    with pytest.raises(InputError, match="state what --unit would"):
+    with pytest.raises(InputError, match="leave --unit out: it is stated in"):
         import_recording(tmp_path / "set", tmp_path / "again.npz", unit="mm")
     assert not (tmp_path / "again.npz").exists()
 
