@@ -2,8 +2,8 @@
 
     python -m research.pretrained [NAME...] [--out runs/pretrained]
 
-The policies of contact tasks are learned on the arm at `difficulty="hard"`. Each is evaluated on 100 held-out episodes
-with all baseline policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An
+The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Each is evaluated
+on 40 held-out episodes with all baseline policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An
 interrupted training is resumed.
 """
 
@@ -19,17 +19,24 @@ import guiderail
 from guiderail.tools.cli.output import to_json
 from guiderail.tools.pretrained import PRETRAINED_FOLDER
 
-ARM = {"station": "arm", "difficulty": "hard"}
+ARM = {"station": "arm", "sensing": "robot", "difficulty": "hard", "reward": "aligned"}
 POLICIES: dict[str, dict[str, Any]] = {
     "passage": {"task": "NarrowPassage", "guidance": "skgrl", "episodes": 60},
-    "connector": {"task": "BncConnector", "guidance": "kgrl", "episodes": 60, **ARM},
-    "clamp": {"task": "GridClamp", "guidance": "sct", "episodes": 60, **ARM},
+    "connector": {
+        "task": "BncConnector", "guidance": "kgrl", "episodes": 80, "seed": 2200001, **ARM,
+        "demonstrations": "firm_search", "settings": {"symmetry": "near", "privileged_critic": True},
+    },
+    "clamp": {
+        "task": "GridClamp", "guidance": "sct", "episodes": 60, "seed": 2300001, **ARM, "fixture_offset": "per_run",
+        "algorithm": "sac", "preset": "sac_gridclamp", "settings": {"demonstration_episodes": 3},
+    },
     "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100, "difficulty": "hard"},
-}
-"""Arguments of `guiderail.train` by the name of the policy."""
+}  # fmt: skip
+"""Arguments of `guiderail.train` by the name of the policy; connector and clamp are the first seeds of the studies
+connector_robot_sensing and grid_clamp_robot_sensing."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
 MAX_SIZE = 200_000  # of the files of one policy [bytes]
-EPISODES = 100  # held-out episodes
+EPISODES = 40  # held-out episodes of the policy and of each baseline policy
 
 
 def make(name: str, out: Path) -> guiderail.Evaluation:

@@ -139,7 +139,8 @@ def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.n
         spread[:, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
         size = np.abs(spread).sum(axis=1)
         # A constraint that is almost reached counts, so that the checker's rounding cannot decide.
-        near = BORDER * (np.abs(value - [[*lower], [*upper]]) + size)
+        limits = np.array([lower, upper])
+        near = BORDER * (np.abs(value - np.where(np.isfinite(limits), limits, value)) + size)
         can_be_active[n] = bool((value - size < lower + near[0]).any() or (value + size > upper - near[1]).any())
     return can_be_active
 

@@ -28,26 +28,23 @@ class StatusSequence:
         self.num_conflicts = 0
         self._max_interval = MAX_MISSED_MESSAGES * period
         self._last: JointStatus | None = None
-        self._velocity: np.ndarray | None = None  # from the last two positions [rad/s]
-        self._margin = 0.0  # of that velocity
+        self._motion: tuple[np.ndarray, float] | None = None  # velocity from the last two positions, its margin [rad/s]
 
     def add(self, status: JointStatus) -> None:
-        """Add the next status as it arrives; one that cannot be decoded is left out."""
-        last, velocity, margin = self._last, self._velocity, self._margin
-        if not status.is_readable or (last is not None and len(last.positions) != len(status.positions)):
-            self._last = self._velocity = None
-            return
-        self._last, self._velocity = status, None
-        if last is None:
+        """Add the next status as it arrives; one that cannot be decoded is compared with no other."""
+        last, motion = self._last, self._motion
+        self._last, self._motion = status, None
+        if last is None or len(last.positions) != len(status.positions):
             return
         elapsed = status.time - last.time
         if elapsed == 0.0:
             self.num_conflicts += not np.array_equal(status.values(), last.values())
         if 0.0 < elapsed <= self._max_interval:
-            self._velocity, self._margin = (status.positions - last.positions) / elapsed, 2.0 * RESOLUTION / elapsed
-            if velocity is not None:
-                is_reversed = self._velocity * velocity < 0.0
-                change = np.abs(self._velocity - velocity) - self._margin - margin
+            velocity, margin = (status.positions - last.positions) / elapsed, 2.0 * RESOLUTION / elapsed
+            self._motion = velocity, margin
+            if motion is not None:
+                is_reversed = velocity * motion[0] < 0.0
+                change = np.abs(velocity - motion[0]) - margin - motion[1]
                 self.num_conflicts += bool((is_reversed & (change > REVERSAL)).any())
 
 
@@ -70,7 +67,7 @@ class CommandSequence:
         self.num_conflicts = 0
         self._period, self._reach = period, MAX_MISSED_MESSAGES * period
         self._last = (np.nan, -np.inf)  # time stamp of the last command, and local time of its arrival [s]
-        self._left = (np.nan, -np.inf)  # the same before the last jump
+        self._left = (np.nan, np.nan)  # the same before the last jump
         self._torque = np.empty(0)
         self._equal_time = -np.inf  # local time of the last command with its predecessor's time stamp [s]
         self._level = 0.0

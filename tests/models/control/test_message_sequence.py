@@ -32,7 +32,7 @@ def test_equal_time_stamps_conflict_when_values_differ():
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("joint", [0, 1])
-@pytest.mark.parametrize(("share", "is_conflict"), [(0.999, False), (1.001, True)])
+@pytest.mark.parametrize(("share", "is_conflict"), [(0.9999, False), (1.0001, True)])
 def test_positions_conflict_when_they_go_to_and_fro(share, is_conflict, joint, sign):
     """Forth in 3/4 and back in 1/4 of a period."""
     times = 1.0 + PERIOD * np.array([0.0, 0.75, 1.0])
@@ -50,6 +50,7 @@ def test_positions_do_not_conflict_without_a_reversal():
     steps = [0.0, 0.05, 0.05, 0.0501, 0.0502]
     assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate(steps))) == 0
     assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate([0.0, 0.001, 0.05]))) == 0
+    assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate([0.0, 0.0, -0.05]))) == 0
 
 
 @pytest.mark.parametrize(("gap", "is_conflict"), [(REACH, True), (REACH + 1e-9, False)])
@@ -61,7 +62,9 @@ def test_positions_are_compared_within_the_maximum_interval(gap, is_conflict):
 
 
 @pytest.mark.parametrize(
-    "between", [MALFORMED_STATUS, status(1.0 + 1.5 * PERIOD), status(0.5, 0.0)], ids=["malformed", "size", "reordered"]
+    "between",
+    [MALFORMED_STATUS, status(1.0 + 1.5 * PERIOD, 0.0, 0.0, 0.0), status(0.5, 0.0)],
+    ids=["malformed", "size", "reordered"],
 )
 def test_positions_are_compared_again_after_a_gap(between):
     before, peak = status(1.0, 0.0), status(1.0 + PERIOD, 0.5)
@@ -123,7 +126,7 @@ def test_time_stamps_that_return_conflict(offset):
     assert count(times, nows) >= 17
 
 
-@pytest.mark.parametrize(("late", "is_conflict"), [(0.999, True), (1.001, False), (-0.999, True), (-1.001, False)])
+@pytest.mark.parametrize(("late", "is_conflict"), [(1.0, True), (1.0001, False), (-1.0, True), (-1.0001, False)])
 def test_return_is_to_a_clock_that_has_continued(late, is_conflict):
     elapsed = 0.25
     assert count([100.0, 3.0, 100.0 + elapsed + late * REACH], [0.0, 0.01, elapsed]) == is_conflict
@@ -165,6 +168,12 @@ def test_rate_conflicts_above_its_limit():
 @pytest.mark.parametrize(("number", "is_conflict"), [(8, False), (9, True)])
 def test_rate_allows_a_burst(number, is_conflict):
     assert count(1.0 + 1e-3 * np.arange(number), np.zeros(number)) == is_conflict
+
+
+@pytest.mark.parametrize(("periods", "is_conflict"), [(0.999 / 1.2, True), (1.001 / 1.2, False)])
+def test_rate_allows_one_more_command_when_the_level_has_fallen_by_one(periods, is_conflict):
+    times = 1.0 + 1e-3 * np.arange(9)
+    assert count(times, [*np.zeros(8), periods * PERIOD]) == is_conflict
 
 
 def test_level_falls_when_one_program_is_left():
