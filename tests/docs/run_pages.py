@@ -21,6 +21,7 @@ from pathlib import Path
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CELL = re.compile(r"^```\{code-cell\} (\w+)\n(?:---\n.*?^---\n)?(.*?)^```$", re.MULTILINE | re.DOTALL)
+SHORTER = {"create-task": ["--hard-episodes", "1"]}  # options that a page leaves at defaults that take a minute
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
@@ -38,7 +39,7 @@ def command(line: str) -> None:
     if words[0] != "guiderail":
         raise ValueError(f"a page may only call guiderail, not {words[0]}")
     try:
-        main(words[1:])
+        main(words[1:] + SHORTER.get(words[1], []))
     except SystemExit as end:
         if end.code:
             raise RuntimeError(f"{line!r} ended with {end.code}") from None
@@ -117,8 +118,16 @@ def run(page: Path, shell: Shell | None) -> str:
     return ""
 
 
+def plain_pictures() -> None:
+    """Skip the layout of labels, and show one episode on the page of a training, as in the tests of the tools."""
+    from guiderail.tools.visualization import replay, style
+
+    style.LAYOUT, replay.EPISODES = None, 1
+
+
 def main(pages: list[Path]) -> None:
     """Run pages one after the other."""
+    plain_pictures()
     failures = {}
     shells = [Shell() if "--import" in page.read_text(encoding="utf-8") else None for page in pages]
     for page, shell in zip(pages, shells, strict=True):

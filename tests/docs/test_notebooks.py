@@ -1,10 +1,12 @@
 """Notebooks in `examples/notebooks`: their cells run, in order, and no output is stored."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+PLAIN_PICTURES = "import run_pages; run_pages.plain_pictures()"
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples" / "notebooks").glob("*.ipynb"))
 
 
@@ -16,7 +18,8 @@ def code_cells(notebook):
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(notebook, forks, tmp_path):
     program = tmp_path / "cells.py"
-    program.write_text("\n".join("".join(cell["source"]) for cell in code_cells(notebook)))
+    shutil.copy(Path(__file__).with_name("run_pages.py"), tmp_path)  # next to the program, where it can be imported
+    program.write_text("\n".join([PLAIN_PICTURES, *("".join(cell["source"]) for cell in code_cells(notebook))]))
     finished = forks.run(program, folder=tmp_path, MPLBACKEND="agg", OMP_NUM_THREADS="1")
     assert finished.returncode == 0, finished.stderr
 

@@ -9,7 +9,8 @@ from research.command import run_program
 
 
 def declaration(guidance="kgrl"):
-    return Declaration(skills={"passage": {"task": "NarrowPassage", "env": {"guidance": guidance}}}, attack=2000)
+    environment = {"guidance": guidance, "control_period": 0.05}  # a third of the time
+    return Declaration(skills={"passage": {"task": "NarrowPassage", "env": environment}}, attack=2000)
 
 
 def test_certificates_are_reused_if_already_computed(tmp_path, monkeypatch):

@@ -98,7 +98,7 @@ def test_a_wrong_option_gets_a_sentence(lab):
 
 
 def test_it_is_trained_resumed_and_evaluated(lab, trained):
-    guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run")
+    guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run", "--no-pictures")
     found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
     assert found["episodes"] == 2
     assert found["max_commanded_violation"] <= 1e-9
@@ -106,7 +106,7 @@ def test_it_is_trained_resumed_and_evaluated(lab, trained):
 
 def test_a_setting_of_its_learner_is_validated(lab):
     words = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
-    guiderail(lab, *words, "--set", "deviation=0.1", "--out", "careful")
+    guiderail(lab, *words, "--set", "deviation=0.1", "--out", "careful", "--no-pictures")
     assert "deviation: 0.1" in (lab.folder / "careful" / "config.yaml").read_text()
     for setting, sentence in (
         ("deviation=-1", "learner's deviation cannot be '-1'"),
@@ -121,7 +121,7 @@ def test_a_setting_of_its_learner_is_validated(lab):
 def test_the_python_api_trains_it(lab):
     code = (
         "import guiderail\n"
-        "settings = {'algorithm': 'peglab_hill_climbing', 'episodes': 2, 'width': 0.2}\n"
+        "settings = {'algorithm': 'peglab_hill_climbing', 'episodes': 2, 'width': 0.2, 'pictures': False}\n"
         "run = guiderail.train('peglab/Slot', 'kgrl', out='api', **settings)\n"
         "print(len(run.episodes), run.config.preset, run.config.environment['width'], run.policy.description['task'])"
     )
@@ -133,7 +133,7 @@ def test_the_python_api_trains_it(lab):
 def test_its_kernel_is_a_choice(lab):
     words = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
     own = ("--env", "kernel=peglab_rational_quadratic", "--env", "kernel_parameters={mixture: 2.0}")
-    guiderail(lab, *words, *own, "--out", "smoother")
+    guiderail(lab, *words, *own, "--out", "smoother", "--no-pictures")
     assert "kernel: peglab_rational_quadratic" in (lab.folder / "smoother" / "config.yaml").read_text()
 
 
@@ -195,7 +195,7 @@ def test_task_in_a_file_works_without_installation(lab):
     )
     guiderail(
         lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl",
-        "--algorithm", "peglab_hill_climbing", "--out", "mine",
+        "--algorithm", "peglab_hill_climbing", "--out", "mine", "--no-pictures",
     )  # fmt: skip
     # The run remembers what it needs, and imports it if that is trusted.
     words = ("evaluate", "mine", "--episodes", "2", "--trust-imports", "--baselines", "none", "--json")

@@ -11,9 +11,11 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.certify import _declared_start, certify_skill, verify_certificate
 from guiderail.tools.environments import check_environment
 
+COARSE = {"control_period": 0.05}  # 160 steps instead of 400: a certificate takes a third of the time
+
 
 def test_certify_skill_writes_an_accepted_certificate(tmp_path):
-    found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=2000)
+    found = certify_skill("NarrowPassage", COARSE | {"guidance": "kgrl"}, out=tmp_path, attack=2000)
     assert found["checker"] == "yes"
     assert found["always_upper"][0] <= found["while_free_upper"][0]
     assert found["steps"] >= found["constrained_steps"]
@@ -30,14 +32,14 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 800)
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))
-    environment, folder = {"guidance": "skgrl"}, tmp_path / "certificate"
+    environment, folder = COARSE | {"guidance": "skgrl"}, tmp_path / "certificate"
     assert certify_skill("NarrowPassage", environment, out=folder, key=key)["checker"] == "yes"
     assert verify_certificate("NarrowPassage", environment, folder, key=key)["checker"] == "yes"
     key.write_bytes(bytes(32))
     assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
     monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # it takes seconds
-    for other in ({"guidance": "skgrl", "action_scale": 2.0}, {"guidance": "kgrl"}):
-        verdict = verify_certificate("NarrowPassage", other, folder)["checker"]
+    for other in ({"action_scale": 2.0}, {"guidance": "kgrl"}):
+        verdict = verify_certificate("NarrowPassage", environment | other, folder)["checker"]
         assert verdict == "no: its about is not that of NarrowPassage"
     assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
     needed = SimpleNamespace(excess=np.full((2, 2), 9.0), residue=np.zeros((2, 2)))
@@ -91,9 +93,10 @@ def test_certify_skill_refuses_a_task_without_out():
     ("difficulty", "far"),
     [("standard", (755, 1950)), ("hard", (1352, 8387))],  # seeds of starts that would be farther than there are any
 )
-def test_held_out_episodes_stay_in_the_bounds(tmp_path, difficulty, far):
+def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty, far):
     """Episodes begin next to the demonstrations, and so does the history of sKGRL."""
-    environment = {"guidance": "skgrl", "difficulty": difficulty}
+    monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 10_000)
+    environment = COARSE | {"guidance": "skgrl", "difficulty": difficulty}
     found = certify_skill("NarrowPassage", environment, out=tmp_path)
     assert found["checker"] == "yes"
     assert found["start_within"] == pytest.approx([0.04, 0.04] if difficulty == "standard" else [0.12, 0.12])
@@ -155,7 +158,8 @@ def test_declared_start_refuses_the_wrong_number_of_outputs(monkeypatch, tmp_pat
 def test_via_points_move_the_motion_but_not_its_start(tmp_path):
     """A reset starts at the demonstrations, not at via-points."""
     via = [0.0, 0.36, 0.1]
-    certify_skill("NarrowPassage", {"guidance": "kgrl", "via_points": via}, out=tmp_path)
+    environment = {"guidance": "kgrl", "via_points": via, "control_period": 0.1}
+    certify_skill("NarrowPassage", environment, out=tmp_path)
     with np.load(tmp_path / "primitive.npz") as primitive:
         assert np.abs(primitive["means"][0] - via[1:]).max() < 0.01
         np.testing.assert_array_equal(primitive["start"], reference_trajectory().means[0])

@@ -3,12 +3,11 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import demo
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.visualization import replay, style
+from guiderail.tools.visualization import style
 
 
 def test_demo_prints_its_result_and_can_be_replaced(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "HELD_OUT", 1)
-    monkeypatch.setattr(replay, "EPISODES", 1)
     monkeypatch.setattr(style, "LAYOUT", "constrained")  # the layout of users, which tests replace by a faster one
     out = tmp_path / "demo"
     demo.run_demo(out, episodes=2, seed=0)

@@ -38,7 +38,7 @@ def scripted_network():
     return Policy(layers, {"format": FORMAT, "pool": 1} | spaces)
 
 
-def test_policy_of_a_gantry_run_drives_the_arm(tmp_path, monkeypatch):
+def test_policy_of_a_gantry_run_drives_the_arm(tmp_path):
     folder = RunFolder(tmp_path / "run")
     config = configure("BncConnector", {"guidance": "kgrl", "fixture_offset": "per_episode"}, episodes=1, seed=3)
     folder.create(config)
@@ -49,7 +49,6 @@ def test_policy_of_a_gantry_run_drives_the_arm(tmp_path, monkeypatch):
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
 
-    monkeypatch.setattr(replay, "EPISODES", 1)
     arm = {"station": "arm"}
     html = replay.default_page(folder.path, arm)
     replay.write_page(html, EpisodeSpec.of_policy(folder.path, arm, 1_000_003))

@@ -371,7 +371,11 @@ def test_run_is_refused_when_memory_does_not_suffice(bead_config, tmp_path, monk
 
 
 def test_resume_accepts_the_same_options_and_notes_versions(tmp_path, caplog):
-    words = {"environment": {"guidance": "kgrl", "action_dims": "0,1"}, "settings": {"net_arch": "8"}}
+    words = {
+        "environment": {"guidance": "kgrl", "action_dims": "0,1", "action_repeat": 40},
+        "settings": {"net_arch": "8", "gradient_steps": 1},
+        "pictures": False,
+    }
     out = tmp_path / "run"
     start_or_resume("NarrowPassage", out, episodes=1, **words)
     folder = RunFolder(out)
@@ -399,8 +403,8 @@ def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
     monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # no other test has this one
     kinds = "narrow_passage.task.NarrowPassage", "registry.register_task"
     file = one_more(tmp_path, "guiderail.diagrams.tasks", *kinds, "changes/Passage")
-    out = tmp_path / "run"
-    start_or_resume("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
+    out, environment = tmp_path / "run", {"guidance": "kgrl", "action_repeat": 40}
+    start_or_resume("changes/Passage", out, environment=environment, episodes=1, imports=[str(file)], pictures=False)
     config = RunFolder(out).config()
     before = episodes_file(out, "uniform_random", config, config.environment, episodes=2)
     file.write_text(file.read_text() + "# now it is another one\n")
@@ -417,7 +421,7 @@ def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
     settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
     done = start_or_resume(
         "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20},
-        algorithm="sac_of_mine", settings=settings, episodes=2, imports=[str(file)],
+        algorithm="sac_of_mine", settings=settings, episodes=2, imports=[str(file)], pictures=False,
     )  # fmt: skip
     assert done.summary["episodes"] == 2
 

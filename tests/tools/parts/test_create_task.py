@@ -17,7 +17,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
 from guiderail.tools.parts.contact import rank
 from guiderail.tools.parts.create_task import ask_unit, create_task
-from guiderail.tools.visualization import replay
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -103,8 +102,7 @@ def test_rank_prefers_seating_then_shallow_then_fast_contacts():
     assert sorted(tried, key=tried.get, reverse=True) == list(tried)
 
 
-def test_created_folder_is_a_task(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(replay, "EPISODES", 1)
+def test_created_folder_is_a_task(folder, tmp_path, capsys):
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
     call("evaluate", tmp_path / "run", "--episodes", 1, "--baselines", "none", "--json")
