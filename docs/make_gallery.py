@@ -214,7 +214,7 @@ def _created_task(name: str) -> str:
     folder, drawn = Path(SCRATCH.name) / name, PARTS[name]()
     folder.mkdir()
     turn = float(dict(zip(drawn.options[::2], drawn.options[1::2], strict=True)).get("--turn", 0.0))
-    create_task(*drawn.write(folder), folder / f"{name}_task", unit="mm", turn=turn)
+    create_task(*drawn.write(folder), folder / f"{name}_task", unit="mm", turn=turn, hard_episodes=0)
     return task_named(str(folder / f"{name}_task"))[0]
 
 
@@ -311,19 +311,9 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "parts": (
         lambda: [
-            Panel(
-                "a bayonet: demonstration",
-                partial(_created_task, "a bayonet: demonstration"),
-                _with_offset(0.0),
-                zero_policy,
-            ),
-            Panel(
-                "the same, socket 1.5 mm beside",
-                partial(_created_task, "a bayonet: demonstration"),
-                _with_offset(0.0015),
-                zero_policy,
-            ),
-            Panel("a snap-fit: demonstration", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
+            Panel("bayonet, demonstration", partial(_created_task, "bayonet"), _with_offset(0.0), zero_policy),
+            Panel("the same, socket 1.5 mm off", partial(_created_task, "bayonet"), _with_offset(0.0015), zero_policy),
+            Panel("snap-fit, demonstration", partial(_created_task, "snap_fit"), _with_offset(0.0), zero_policy),
         ],
         SQUARE,
         8,
@@ -331,7 +321,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "clamp": (
         lambda: [
             Panel("straight down", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "straight_descent")),
-            Panel("a rule that searches", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
+            Panel("scripted search", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
         ],
         SQUARE,
         3,
@@ -339,7 +329,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "pouring": (
         lambda: [
             Panel("random inputs", "Pouring", {"time_limit": 6.0}, _random(1)),
-            Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
+            Panel("scripted inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
         ],
         SQUARE,
         6,

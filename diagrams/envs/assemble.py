@@ -32,7 +32,7 @@ from guiderail.systems.episode_monitor import EpisodeMonitor
 from guiderail.systems.policy_system import PolicySystem
 from guiderail.systems.reward_system import RewardSystem
 
-HALF_TURN_MARGIN = 0.1  # [rad] how much further actions and contact can turn a motion
+HALF_TURN_MARGIN = 0.1  # [rad] margin for turns by actions and contact, in addition to the motion
 
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
@@ -105,10 +105,10 @@ class Signals:
         self._ports |= ports
 
     def get(self, name: str, user: str) -> OutputPort:
-        """Return the port of a signal; a message names the part of the task that needs it, the `user`.
+        """Return the port of a signal. The error message names the `user`, the part of the task that needs it.
 
         Raises:
-            InputError: If there is none of that name.
+            InputError: If there is no signal of this name.
         """
         held = name.removeprefix("last_")
         if name not in self._ports and held != name and held in self._ports:
@@ -123,7 +123,7 @@ class Signals:
         return self._ports[name]
 
     def connect(self, system: Any, names: Mapping[str, int], user: str) -> None:
-        """Connect a system's `get_signal_input_port` of each name to the signal of that name and of the given size.
+        """Connect the signal of each name to the system's input `get_signal_input_port(name)` of the given size.
 
         Raises:
             InputError: If a signal is missing or has another size.
@@ -254,7 +254,7 @@ def build_task_diagram(
         _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
-    displaces = GUIDANCE.get(task.config.guidance).displaces  # a symmetry of the task assumes it
+    displaces = GUIDANCE.get(task.config.guidance).displaces  # symmetries hold only for actions that displace
     return TaskDiagram(
         diagram=diagram,
         control_period=period,

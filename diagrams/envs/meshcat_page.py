@@ -148,7 +148,7 @@ def _close_port(port: int, keep: Sequence[int]) -> None:
     """
     is_closed = False
     for descriptor in map(int, os.listdir("/dev/fd")):
-        with suppress(OSError):  # closed meanwhile, such as that of the folder
+        with suppress(OSError):  # closed since they were listed, as the descriptor of the listed folder is
             if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
                 continue
             with socket.socket(fileno=os.dup(descriptor)) as one, socket.socket() as unconnected:

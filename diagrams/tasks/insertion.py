@@ -107,7 +107,7 @@ class InsertionTask(Task):
     Attributes:
         workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
         fixture: Name of the fixture's body.
-        simulated_rewards: Rewards that need more of that signal than a robot can measure.
+        simulated_rewards: Rewards that need components of this signal that a robot cannot measure.
         offsets: Sampler of the offsets; it stores the hidden values of a run.
     """
 
@@ -122,8 +122,8 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
-        On hardware `observable_success` computes it from the robot's own pose, if the task defines it. A
-        sampled force limit is a signal as well, `force_limit`, and the station's bound.
+        On hardware `observable_success` computes it from the robot's own pose, if the task defines it. A sampled force
+        limit is the signal `force_limit`, and it bounds the station's force.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -145,7 +145,7 @@ class InsertionTask(Task):
         return getattr(self.options, "force_limit_range", None)
 
     def force_limit_terms(self) -> tuple[ObservationTerm, ...]:
-        """Return the term of the observation that is the force limit, if it is sampled; no symmetry changes it."""
+        """Return the observation of a sampled force limit, or nothing; symmetry transformations leave it unchanged."""
         return () if self._force_limit_range is None else (ObservationTerm("force_limit", LIMIT_CENTER, LIMIT_SCALE),)
 
     def _add_workpiece_pose(self, builder: DiagramBuilder, station: Station) -> dict[str, OutputPort]:

@@ -1,4 +1,4 @@
-"""Pieces that Drake accepts: it throws at degenerate meshes, and at some of them it aborts its process."""
+"""Selection of contact pieces that Drake accepts: degenerate ones raise an error in Drake, or abort its process."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.pieces import Piece, piece_text
 from guiderail.models.parts.solids import require_module, to_arrays
 
-_GRIDS = (6, 5)  # digits of meters to which a refused convex piece is rounded, one after the other
-_NEGLIGIBLE = 1e-4  # part of the volume of all pieces below which a refused piece is left out
+_GRIDS = (6, 5)  # decimal places [m] to which a refused convex piece is rounded, in the order of the attempts
+_NEGLIGIBLE = 1e-4  # fraction of the volume of all pieces below which a refused piece is left out
 _SECONDS = 20  # CPU time of a check [s]
 
 

@@ -107,7 +107,11 @@ class Rotation(InputMapping):
 @register(INPUT_MAPPINGS, "tilt_towards")
 @dataclass(frozen=True)
 class TiltTowards(InputMapping):
-    """Tilt towards a frame, at the component along the bearing of the horizontal vector that two inputs give in it."""
+    """Tilt towards a frame.
+
+    Two inputs are a horizontal vector in the frame. Its component along the bearing of the end effector is the tilt's
+    speed, as a fraction of full speed.
+    """
 
     inputs: tuple[int, ...]  # numbers of two inputs, from 0
     speed_rad_per_s: float  # speed at full input

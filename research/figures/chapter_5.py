@@ -41,7 +41,7 @@ METHODS = ("kgrl", "skgrl")
 VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ [m²]
 THESIS_VARIANCE = 1e-6  # ρ of the thesis [m²]
 ACTION_REPEATS = (1, 5)  # control steps of an action: in the thesis, and here
-EPISODES = 10  # maximum number of episodes until one ends as figure 5.7 shows
+EPISODES = 10  # number of episodes in which figure 5.7 looks for a failure, and for a success
 # Position in y at the push, and displacement in x [m]. The last push of each position leads into the zone.
 PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10), (0.20, 0.15), (0.78, 0.20))
 
@@ -299,7 +299,7 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
     """Draw return, its two costs, and jerk while learning.
 
     The runs in the picture repeat one random action in each of the first ten episodes. The table also has runs with
-    a new random action at every step, with which the success of sKGRL depends on the seed.
+    a new random action at every step. In those the success of sKGRL depends on the seed.
     """
     groups = {}
     for words, preset in (
@@ -364,7 +364,7 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
 
 
 def _first(spec: EpisodeSpec, *, success: bool) -> EpisodeSpec:
-    """Return the first held-out episode with the given success. Random actions sometimes succeed as well."""
+    """Return the first held-out episode that succeeds, or the first that fails; random actions can do both."""
     env = make_environment(spec.task, spec.environment)
     env.reset(seed=spec.run_seed)
     try:
@@ -393,7 +393,7 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
                     axis.plot(time, 1e3 * row["commanded"][:, output], color=color(kind), linewidth=0.8)
                     axis.plot(time, 1e3 * row["measured"][:, output], color="0.5", linewidth=0.8)
                     axis.set(ylabel=f"{name} [mm]", xlabel="time [s]")
-                numbers = {key: row[key] for key in row if key.startswith(("jerk", "worst", "peak"))}
+                numbers = {key: row[key] for key in row if key.startswith(("jerk", "max_", "peak"))}
                 rows.append({"method": kind, **numbers})
         env.close()
         axes[0, index].set_title(f"{label(kind)}: commanded, and measured in gray")

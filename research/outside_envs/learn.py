@@ -29,7 +29,8 @@ HELD_OUT_SEED = 10_000
 SELECTION_SEED = 5_000  # of the episodes that select the best constant action
 NUM_DEMONSTRATIONS = 10
 LEARNING_STARTS = 120  # transitions with random actions
-GRADIENT_STEPS, BARE_GRADIENT_STEPS = 8, 2  # per transition; a bare environment has four times as many
+# Gradient steps per transition, with guidance and without. A bare environment has four times as many transitions.
+GRADIENT_STEPS, BARE_GRADIENT_STEPS = 8, 2
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
@@ -60,12 +61,12 @@ def add_step(row: Row, info: dict[str, Any]) -> Row:
 
 
 def evaluate(env: Any, policy: PolicyFn, episodes: int, seed: int = HELD_OUT_SEED) -> dict[str, Any]:
-    """Return the summary of held-out episodes, alternately with the goal on either side."""
+    """Return the summary of held-out episodes; the goal is on the left and on the right in turn."""
     return summarize([run_episode(env, policy, seed + i, (-1.0) ** i) for i in range(episodes)])
 
 
 def summarize(rows: list[Row]) -> dict[str, Any]:
-    """Return successes and episodes, by side too, the worst violation and forces of some episodes."""
+    """Return the numbers of successes and episodes, in all and by side, and the largest violation and forces."""
     sides = [[row["success"] for row in rows if row["side"] == side] for side in (-1.0, 1.0)]
     return {
         "episodes": len(rows),
@@ -158,7 +159,7 @@ def demonstrate_transitions(task: OutsideTask, env: Any, count: int, seed: int =
 def evaluate_baselines(task: OutsideTask, env: Any, episodes: int) -> dict[str, Any]:
     """Return the summaries of policies that learn nothing, by name.
 
-    The constant action is the best of 27 (each entry −0.7, 0 or 0.7), selected on episodes of its own.
+    The constant action is the best of 27 (each entry −0.7, 0 or 0.7), selected on other episodes.
     """
     size = env.action_space.shape[0]
     rng = np.random.default_rng(0)

@@ -45,9 +45,7 @@ def print_table(folder: Path) -> None:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    print(
-        "| task | method | seed | episodes | held out (95 % interval) | left, right | outside, worst [mm] | force [N] |"
-    )
+    print("| task | method | seed | episodes | held out (95 %) | left, right | violated, worst [mm] | force [N] |")
     print("|---|---|---|---|---|---|---|---|")
     for row in rows:
         rate, low, high = (f"{row[f'success_{name}']:.0%}" for name in ("rate", "low", "high"))

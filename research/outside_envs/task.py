@@ -12,8 +12,8 @@ from guiderail.models.primitives.bounds import compute_bounds
 from guiderail.tools.guided.guide import Guide
 
 BARE_REPEAT = 5  # steps of the bare environment for which an action is applied
-SUCCESS_REWARD, REWARD_SCALE = 5.0, 0.05  # reward of the last step, and scale of the reward before
-BOX_MARGIN, MIN_BOX_MARGIN = 0.15, 0.01  # of a segment's box: relative to the demonstrated range, and least [m]
+SUCCESS_REWARD, REWARD_SCALE = 5.0, 0.05  # reward of a success, and factor of the package's own reward before it
+BOX_MARGIN, MIN_BOX_MARGIN = 0.15, 0.01  # margin of a segment's box, as a fraction of the demonstrated range and [m]
 FLOOR = 2e-3  # standard deviation added to every covariance [unit of the output]
 
 
@@ -26,8 +26,8 @@ class Part:
         frame: Attribute of the environment with the frame's origin (O,).
         extra: Discrete output, as in `Segment`.
         dwell: Control steps for which the last point is then held.
-        source: Name of the recorded part, if it is another one's.
-        is_reversed: The recorded part is run backwards.
+        source: Name of the part whose recording is used, if not its own.
+        is_reversed: Whether that recording is run backwards.
         lower: Lower limits (O,) of the commands in the frame, where they are narrower than the demonstrated ones.
         until: (env, observation) → true to end the segment early.
     """
@@ -70,7 +70,7 @@ class OutsideTask:
         pose: (env, observation) → commanded pose (O,), at which a motion begins.
         to_action: (env, observation, command, extra) → the environment's own action.
         scripted: (env) → the scripted policy's own action, which observes what is hidden.
-        schedule: Name of the segment → a fixed action of guidance, which searches without observations.
+        schedule: Fixed action by the name of the segment; together they are a search without observations.
         action_repeat: Steps of the guided environment for which an action is applied.
     """
 

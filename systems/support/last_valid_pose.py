@@ -15,8 +15,8 @@ _TIME_TOLERANCE = 1e-6  # [s], far above the rounding error of a time of days, f
 class CommandValidity:
     """Check of a command: finite, neither stale nor in the future.
 
-    A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A time stamp further ahead is refused,
-    because the command would not time out in time; so is one that is not finite.
+    A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A time stamp that lies further in the
+    future is refused, because such a command would time out too late. A time stamp that is not finite is refused too.
 
     Args:
         desired_pose: Input port of the system, (O,).

@@ -30,9 +30,9 @@ def deploy(
 ) -> None:
     """Execute a policy on a robot.
 
-    The assumptions about the robot are printed and have to be confirmed. Then the arm is controlled where it is,
-    approaches the start slowly and executes the skill; every control step is recorded. The exit code is 0 if the skill
-    was executed to its end, and 1 if a limit, a fault or a key stopped it.
+    The assumptions about the robot are printed and have to be confirmed. Then the controller holds the arm at its
+    present pose, moves it slowly to the start and executes the skill; every control step is recorded. The exit code is
+    0 if the skill was executed to its end, and 1 if a limit, a fault or a key stopped it.
     """
     from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.executor import deploy as deploy_policy
@@ -124,8 +124,8 @@ def safety_monitor(
 ) -> None:
     """Bring a robot to rest when torque commands stop arriving, or its status is wrong.
 
-    For a driver that repeats the last torque when the program that sent it has ended. It runs next to the driver, on
-    the same machine, until it is terminated; without it, guiderail deploy moves nothing.
+    It is for drivers that repeat the last torque after the program that sent it has ended. It runs next to the driver,
+    on the same machine, until it is terminated; without it, guiderail deploy moves nothing.
     """
     from guiderail.tools.hardware.sim_driver import run_safety_monitor
 

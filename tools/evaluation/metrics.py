@@ -131,7 +131,7 @@ class Episode:
 
     @cached_property
     def statistics(self) -> dict[str, float]:
-        """Statistics of the trace; if it is empty because the simulation failed at once, violations are the start's."""
+        """Statistics of the trace; violations are those of the start if the simulation failed at the first step."""
         found = self.trace.statistics()
         if not len(self.trace):
             found["max_commanded_violation"] = self.info["constraint_violation"]
@@ -219,7 +219,7 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 
 
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
-    """Return the row of an episode of an environment of another origin: what its `info` has.
+    """Return an episode's row for an environment that is not of this package: the columns that its `info` has.
 
     Args:
         index: Number of the episode.
@@ -250,8 +250,7 @@ def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
     """Return a table of episodes that was read from `source`, unchanged.
 
     Raises:
-        InputError: If a column other than `WORDS` holds text, or a column that counts holds another number than whole
-            ones.
+        InputError: If a column other than `WORDS` holds text, or a column of `COUNTS` a number that is not whole.
     """
     words = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
     parts = [name for name in COUNTS if name in rows and name not in words and not (rows[name] % 1 == 0).all()]
@@ -350,9 +349,17 @@ _STATISTICS = (
         "largest constraint violation of any measured pose; negative is slack",
         _largest("max_measured_violation"),
     ),
-    Metric("violating_episodes", "", "episodes with a command outside", _violating("max_commanded_violation")),
     Metric(
-        "measured_violating_episodes", "", "episodes with a measured pose outside", _violating("max_measured_violation")
+        "violating_episodes",
+        "",
+        "episodes with a command outside the constraints",
+        _violating("max_commanded_violation"),
+    ),
+    Metric(
+        "measured_violating_episodes",
+        "",
+        "episodes with a measured pose outside the constraints",
+        _violating("max_measured_violation"),
     ),
     Metric("collisions", "", "collisions that began in all episodes", _total("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision, in all episodes", _total("collision_steps")),

@@ -45,7 +45,7 @@ def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets
     Args:
         task: Name of the task.
         environment: Options of its environment.
-        resample_offsets: Whether what a run hides is sampled again in every episode.
+        resample_offsets: Whether the hidden offset of the run is sampled again in every episode.
 
     Raises:
         InputError: If `resample_offsets` is True and a run of the task hides nothing.
@@ -62,7 +62,7 @@ def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets
 
 
 def hides(task: str, environment: Mapping[str, Any]) -> bool:
-    """Return True if something hidden is constant in all episodes of a run, unless `new_run` samples it again."""
+    """Return True if all episodes of a run have the same hidden offset, which only a reset with `new_run` changes."""
     return _can_hide(task) and environment.get("fixture_offset", "per_run") == "per_run"
 
 

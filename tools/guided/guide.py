@@ -123,7 +123,7 @@ class _FittedSegment:
         return self.reference.standard_deviations**2
 
     def as_constraints(self, given: Any) -> LinearConstraints:
-        """Return constraints as linear ones, phases of demonstrated bounds spread over the steps."""
+        """Return linear constraints: those given, or a box for each step's phase of demonstrated bounds."""
         if given is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(given, DemonstratedBounds):
@@ -136,7 +136,7 @@ class _FittedSegment:
         return given
 
     def primitive_for(self, constraints: LinearConstraints) -> tuple[LcNsKmp, np.ndarray]:
-        """Return the primitive under constraints, which is kept while they are the same, and the gains (O,)."""
+        """Return the primitive with these constraints, built only when they change, and the gains (O,)."""
         current = self._primitive
         same = current is not None and all(
             np.array_equal(a, b)
@@ -159,7 +159,7 @@ class _FittedSegment:
         if self.guidance == "kmp":
             return np.zeros(self.num_outputs)
         if self.guidance in ("residual", "clipped_residual"):
-            # The same in all directions and at all times: the RMS of what a null-space action reaches.
+            # One gain for all directions and times: the RMS of the displacements by a null-space action.
             gains = np.zeros(self.num_outputs)
             sigma = deviation(self.reference)
             groups = (range(3), range(3, 6)) if self.num_outputs == 6 else (range(self.num_outputs),)

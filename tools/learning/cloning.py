@@ -10,11 +10,10 @@ import torch
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import BcConfig
-from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.learner import Learner, refuse_images
 from guiderail.tools.learning.networks import export_layers
 
 
@@ -46,8 +45,7 @@ class BcLearner(Learner):
         Raises:
             InputError: If observations are images.
         """
-        if len(env.observation_space.shape or ()) != 1:
-            raise InputError("bc takes no images: give another --observation, or the algorithm tqc")
+        refuse_images(env, config.algorithm)
         self.config, self._space, self._seed = config, env.action_space, seed
         self._symmetry = symmetry if config.symmetry else None
         sizes = [*(env.observation_space.shape or ()), *config.net_arch, *(env.action_space.shape or ())]

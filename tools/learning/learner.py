@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
+import gymnasium
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -170,6 +171,12 @@ LEARNERS: Registry[Any] = Registry(
     "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners"
 )
 register_learner = LEARNERS.register
+
+
+def refuse_images(env: gymnasium.Env, algorithm: str) -> None:
+    """Raise an InputError if an environment's observations are images, which an algorithm's networks do not take."""
+    if len(env.observation_space.shape or ()) != 1:
+        raise InputError(f"{algorithm} takes no images: give another --observation, or the algorithm tqc")
 
 
 def divergence_error() -> InputError:

@@ -15,11 +15,10 @@ from stable_baselines3.common.logger import Logger
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
-from guiderail.tools.learning.learner import Learner, divergence_error
+from guiderail.tools.learning.learner import Learner, divergence_error, refuse_images
 from guiderail.tools.learning.networks import export_layers
 from guiderail.tools.learning.sb3_state import module_arrays, random_state, restore_modules, restore_random
 
@@ -55,8 +54,7 @@ class OnPolicyLearner(Learner):
         Raises:
             InputError: If observations are images.
         """
-        if len(env.observation_space.shape or ()) != 1:
-            raise InputError(f"{config.algorithm} takes no images: give another --observation, or the algorithm tqc")
+        refuse_images(env, config.algorithm)
         self.config = config
         algorithm: Any = self.algorithm
         self.model = algorithm(

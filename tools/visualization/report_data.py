@@ -133,7 +133,7 @@ class Gathered:
         return found
 
     def colors(self, task: str) -> dict[str, str]:
-        """A color for each method: its guidance's own where no two methods have the same."""
+        """Return a color for each method: that of its guidance, or of a palette if two methods share a guidance."""
         kinds = {name: str(runs[0].config.environment.get("guidance", "")) for name, runs in self.methods(task).items()}
         if len(set(kinds.values())) == len(kinds):
             return {name: color(kind) for name, kind in kinds.items()}
@@ -220,7 +220,7 @@ def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
-    """Return the counts of a run's stored held-out episodes, after evaluating `episodes` if there are not so many."""
+    """Return the counts of a run's held-out episodes; evaluate it first if fewer than `episodes` are stored."""
     if episodes:
         _evaluate(run, episodes)
     counts: dict[str, dict[str, Any]] = {}

@@ -32,9 +32,9 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-# [N] more than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm sideways, at 1500 N/m
+# [N] The cuboid allows commands 6 mm below the seat and 8 mm sideways, with which an impedance of 1500 N/m pushes less.
 COLLISION_FORCE = 35.0
-START_HEIGHT = (0.015, 0.018)  # [m] the preceding skill hands over the clamp with its tips 3 to 6 mm above the table
+START_HEIGHT = (0.015, 0.018)  # [m] the preceding skill ends with the tips of the pegs 3 to 6 mm above the table
 HEIGHTS = (0.013, 0.060)  # [m] range of start heights: above the table, and well inside the cuboid
 NOMINAL = GridClampDimensions()
 
@@ -82,9 +82,9 @@ class GridClampOptions(ForceOptions):
 HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
 """Options of difficulty="hard": little time, and a force limit of 10 N; snapping in takes 6 N.
 
-The force is bounded below the limit: an untrained policy does not end an episode by force, but may search until its
-end. On the gantry with exact sensors random actions find the holes in 10 of 14 episodes of 10 s and in 4 of 14 of 6 s,
-a scripted search in all.
+The impedance's force is bounded below the limit, so that an untrained policy cannot end an episode by its force, only
+by running out of time. On the gantry with exact sensors random actions find the holes in 10 of 14 episodes of 10 s, and
+in 4 of 14 episodes of 6 s. A scripted search finds them in all.
 """
 
 
@@ -139,11 +139,11 @@ def _collision_cost(termination: np.ndarray) -> float:
 
 
 NUM_PLACES = 6  # pick-up places of clamps
-# Parallel jaws center the clamp across the jaws, and not along them, which is x.
-ALONG_JAWS = 1.0 * MM  # half range of the six places' offsets
-ACROSS_JAWS = 0.2 * MM
+# Parallel jaws center the clamp across the jaws (y), and not along them (x).
+ALONG_JAWS = 1.0 * MM  # largest offset of a place along the jaws
+ACROSS_JAWS = 0.2 * MM  # the same across the jaws
 CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest offset of the table
-REPEATABILITY = 0.1 * MM  # of one pick-up place
+REPEATABILITY = 0.1 * MM  # largest change of the offset from one pick-up at a place to the next
 KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with "none"
 
 
@@ -279,7 +279,7 @@ class GridClamp(InsertionTask):
         super().__init__(config)
         self.offsets = GridClampUncertainty(self.options.fixture_offset)
         self.collision = Threshold("contact_force", self.options.largest_force_limit)
-        # The default is 100 actions at 10 Hz; the thesis's episodes take 140 on average.
+        # The default is 100 actions at 10 Hz; the thesis's episodes have 140 actions on average.
         self.num_steps = round(self.options.seconds / self.control_period)
         self._workcell = self.options.workcell()
 

@@ -222,6 +222,15 @@ def test_behavior_cloning_refuses_no_demonstrations():
         make_config("bc", {"demonstration_episodes": 0})
 
 
+@pytest.mark.parametrize("algorithm", ["bc", "ppo", "trpo"])
+def test_images_are_refused_without_networks_for_them(algorithm, monkeypatch):
+    config = make_config(algorithm, {"demonstration_episodes": 1} if algorithm == "bc" else {})
+    make(config)
+    monkeypatch.setattr(SpacesOnlyEnv, "observation_space", spaces.Box(0, 255, (8, 8, 3), np.uint8))
+    with pytest.raises(InputError, match=f"{algorithm} takes no images"):
+        make(config)
+
+
 def test_actions_become_certain_over_the_base_motion_steps():
     settings = {"net_arch": "8", "learning_starts": 10_000, "base_motion_steps": 2000}
     learner = LEARNERS.get("sac")(
