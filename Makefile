@@ -7,7 +7,7 @@ OUTSIDE := .venv-outside
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling fci lerobot motions outside newest clean
+.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling adversary fci lerobot motions outside newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -68,6 +68,9 @@ injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 
 scaling: $(VENV)/.ready  ## constraints in every scale against an adversary, minutes
 	$(BIN)/python tests/harness/constraint_scaling.py
+
+adversary: $(VENV)/.ready  ## spherical obstacles and limits of motion against an adversary, half an hour
+	$(BIN)/python tests/harness/motion_adversary.py
 
 fci:  ## rehearse a Franka on the simulator of its protocol, minutes
 	$(PYTHON) -m venv .venv-fci

@@ -12,7 +12,8 @@ class CommandFilter(LeafSystem):
 
         safe_pose = law(last safe_pose, desired_pose)
 
-    See `BarrierFilter` and `TangentSpaceFilter`. The last command is the measured pose at initialization.
+    See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`, which uses the last two commands. The last
+    command is the measured pose at initialization.
 
     .. pydrake_system::
 
@@ -39,9 +40,10 @@ class CommandFilter(LeafSystem):
         super().__init__()
         check_period(period)
         self._law, outputs = law, law.num_outputs
+        size = len(law.start(np.zeros(outputs)))
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
-        self._last = self.DeclareDiscreteState(outputs)
+        self._last = self.DeclareDiscreteState(size)  # begins with the command
         self._command = declare_cache(
             self,
             "command",
@@ -64,7 +66,7 @@ class CommandFilter(LeafSystem):
     get_intervention_output_port = output_getter("intervention", "flag that the law changed the command, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._pose_port.Eval(context))
+        discrete_state.set_value(self._law.start(self._pose_port.Eval(context)))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # No command has been executed at time zero.
@@ -72,13 +74,13 @@ class CommandFilter(LeafSystem):
             discrete_state.set_value(self._command.Eval(context)[:-1])
 
     def _calc_command(self, context: Context) -> np.ndarray:
-        """Return the safe command and the intervention flag, (O + 1,)."""
+        """Return the next state, which begins with the safe command, and the intervention flag."""
         last = context.get_discrete_state(self._last).value()
-        command, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
-        return np.append(command, float(is_changed))
+        state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
+        return np.append(state, float(is_changed))
 
     def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._command.Eval(context)[:-1])
+        output.SetFromVector(self._command.Eval(context)[: self._law.num_outputs])
 
     def _calc_intervention(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._command.Eval(context)[-1])

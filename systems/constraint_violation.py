@@ -2,12 +2,13 @@
 
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 class ConstraintViolation(LeafSystem):
-    """Maximum violation of linear constraints G y ≥ c by a pose y.
+    """Maximum violation of linear constraints G y ≥ c, and of shapes and states if there are any, by a pose y.
 
         violation = max(c − G y), negative if all constraints are slack
 
@@ -23,7 +24,7 @@ class ConstraintViolation(LeafSystem):
     constraint. It depends on the pose and the control step alone, so it evaluates every guidance in the same way.
 
     Args:
-        constraints: Constraints on O outputs, constant or one set per control step.
+        constraints: Constraints on O outputs, linear (constant, or one set per control step) or of a motion.
         period: Control period [s], positive.
 
     Raises:
@@ -33,7 +34,7 @@ class ConstraintViolation(LeafSystem):
     #: Violation if there is no constraint: finite, so that it can be logged.
     UNCONSTRAINED = -1e30
 
-    def __init__(self, constraints: LinearConstraints, period: float):
+    def __init__(self, constraints: LinearConstraints | MotionConstraints, period: float):
         super().__init__()
         check_period(period)
         self._constraints, self._period = constraints, period

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -25,6 +25,7 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.reference import pass_through
 from guiderail.systems.constraint_violation import ConstraintViolation
@@ -44,18 +45,20 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """
     provides = task.provides()
     skill = None
+    constraints = task.constraints() or LinearConstraints.none(station.pose_size)
     if "demonstrations" in provides:
         options = task.config.part("primitive")
         kernel = kernel_from_options(options)
         reference = pass_through(task.reference(), options.get("via_points", ()), kernel)
-        options = {name: value for name, value in options.items() if name not in (*KERNEL_OPTIONS, "via_points")}
+        options = {name: value for name, value in options.items() if name not in _NOT_PRIMITIVE}
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
             _refuse_half_turns(reference.means)
         skill = PrimitiveConfig(
             reference=reference,
             kernel=kernel,
-            constraints=task.constraints() or LinearConstraints.none(station.pose_size),
+            constraints=constraints,
+            motion=_motion_constraints(task, constraints),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,
             keep_out=task.keep_out() if "keep_out" in provides else None,
@@ -71,6 +74,27 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
     )
+
+
+_LIMITS = ("max_speed", "max_acceleration")
+_NOT_PRIMITIVE = (*KERNEL_OPTIONS, "via_points", *_LIMITS)
+
+
+def _motion_constraints(task: Task, constraints: LinearConstraints) -> MotionConstraints | None:
+    """Return a task's constraints of the motion with the limits among its options; None if there are none."""
+    motion, outputs, limits = task.motion_constraints(), constraints.num_outputs, {}
+    for name in _LIMITS:
+        given = task.config.part("primitive").get(name, ())
+        if not given:
+            continue
+        if len(given) < min(outputs, 3):
+            given = np.append(np.full(min(outputs, 3), given[0]), np.full(max(outputs - 3, 0), (*given, np.inf)[1]))
+        if len(given) != outputs:
+            raise InputError(f"{name} is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(given)}")
+        limits[name] = given
+    if motion is None:
+        return MotionConstraints(constraints, **limits) if limits else None
+    return replace(motion, **limits)
 
 
 def _check_clock(times: np.ndarray, period: float) -> None:
@@ -358,7 +382,8 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
             violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
     for name, port in poses.items():
         if name not in violations:
-            violation = builder.AddNamedSystem(name, ConstraintViolation(constraints, station.control_period))
+            every = task.motion_constraints() or constraints
+            violation = builder.AddNamedSystem(name, ConstraintViolation(every, station.control_period))
             builder.Connect(port, violation.get_pose_input_port())
             violations[name] = violation.get_violation_output_port()
     return violations

@@ -83,7 +83,20 @@ class PrimitiveOptions(Options):
     via_points: Numbers = Field(
         (), description="points of the mean: a control step and an output each, one after another"
     )
+    max_speed: Numbers = Field(
+        (),
+        description="largest speed of the command: along each axis of the position [m/s], and of each angle [rad/s] if "
+        "there are two numbers; or one number for each output",
+    )
+    max_acceleration: Numbers = Field((), description="largest acceleration of the command, like max_speed")
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
+
+    @field_validator("max_speed", "max_acceleration")
+    @classmethod
+    def _check_positive(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        if not all(value > 0.0 for value in values):
+            raise ValueError("give positive numbers")
+        return values
 
     @field_validator("kernel_parameters")
     @classmethod

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort
-from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
+from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
+from guiderail.models.control.motion_constraints import MotionConstraintFilter
+from guiderail.systems.command_filter import CommandFilter
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.history_length_schedule import HistoryLengthSchedule
@@ -45,12 +49,30 @@ class PrimitiveGuidance(Guidance):
         self._held_action = hold.get_output_port()
         return action, pose.get_output_port()
 
+    def _constrain(
+        self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
+    ) -> tuple[OutputPort, OutputPort]:
+        """Return the ports of the command and of the fallback flag, behind the constraints of the motion if any."""
+        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
+        if config.motion is None:
+            return command, fallback
+        law = MotionConstraintFilter(config.motion, config.control_period)
+        motion = builder.AddNamedSystem("motion_constraints", CommandFilter(law, config.control_period))
+        either = builder.AddNamedSystem("fallbacks", Adder(2, 1))
+        flag = builder.AddNamedSystem("fallback", Saturation(np.zeros(1), np.ones(1)))
+        builder.Connect(command, motion.get_desired_pose_input_port())
+        builder.Connect(pose, motion.get_pose_input_port())
+        builder.Connect(fallback, either.get_input_port(0))
+        builder.Connect(motion.get_intervention_output_port(), either.get_input_port(1))
+        builder.Connect(either.get_output_port(), flag.get_input_port())
+        return motion.get_safe_pose_output_port(), flag.get_output_port()
+
     def _finish(
         self, builder: DiagramBuilder, config: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
     ) -> None:
         """Export the outputs and build the diagram."""
         violation = builder.AddNamedSystem(
-            "constraint_violation", ConstraintViolation(config.constraints, config.control_period)
+            "constraint_violation", ConstraintViolation(config.motion or config.constraints, config.control_period)
         )
         builder.Connect(desired_pose, violation.get_pose_input_port())
         builder.ExportOutput(desired_pose, "desired_pose")
@@ -86,9 +108,9 @@ class KmpGuidance(PrimitiveGuidance):
     def __init__(self, prior: PriorKnowledge):
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
-        action, _ = self._export_inputs(builder, config)
+        action, pose = self._export_inputs(builder, config)
         kmp = add_demonstration(builder, config, action)
-        self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, config, *self._constrain(builder, config, kmp, pose))
 
 
 @register_guidance(
@@ -106,12 +128,13 @@ class KgrlGuidance(PrimitiveGuidance):
         """Construct the guidance; without `constrained` it is that of `residual_covariance`."""
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
-        action, _ = self._export_inputs(builder, config)
+        config = config if constrained else replace(config, motion=None)
+        action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
         gains = config.null_space_gains(primitive)
         kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period))
         builder.Connect(action, kmp.get_null_space_action_input_port())
-        self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, config, *self._constrain(builder, config, kmp, pose))
 
 
 @register_guidance(
@@ -165,10 +188,11 @@ class SkgrlGuidance(PrimitiveGuidance):
         history = builder.AddNamedSystem(
             "history", HistoryBuffer(config.num_outputs, config.history, config.control_period)
         )
-        past = kmp.get_command_output_port() if config.history_source == "commanded" else pose
+        command, fallback = self._constrain(builder, config, kmp, pose)
+        past = command if config.history_source == "commanded" else pose
         builder.Connect(action, kmp.get_null_space_action_input_port())
         builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
         builder.Connect(past, history.get_output_input_port())
         # A history of either source starts at the robot's pose: a command from elsewhere would be a jump.
         builder.Connect(pose, history.get_initial_output_input_port())
-        self._finish(builder, config, kmp.get_command_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, config, command, fallback)

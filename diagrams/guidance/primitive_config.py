@@ -7,6 +7,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
@@ -21,6 +22,7 @@ class PrimitiveConfig:
     Attributes:
         reference: Reference trajectory of the demonstrations, in steps of the control period.
         constraints: G y ≥ c on every command.
+        motion: Further constraints of the commanded motion, enforced behind the primitive; None if there are none.
         control_period: Control period [s].
         history: P, past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
@@ -59,6 +61,7 @@ class PrimitiveConfig:
     isotropic_groups: tuple[tuple[int, ...], ...] | None = None
     solver: str = "daqp"
     keep_out: KeepOut | None = None
+    motion: MotionConstraints | None = None
     wrench_size: int = 6
 
     def __post_init__(self) -> None:

@@ -22,6 +22,7 @@ from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, TIME_UNIT, Impedance, Station, whole_multiple
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
@@ -194,6 +195,13 @@ class Task(ABC):
 
     def constraints(self) -> LinearConstraints | None:
         """Return G y ≥ c on every commanded pose; None if only the guidance has constraints, such as a template's."""
+        return None
+
+    def motion_constraints(self) -> MotionConstraints | None:
+        """Return constraints of the commanded motion that are not linear, such as shapes to stay outside of.
+
+        Guidance by a primitive enforces them. Their linear part is `constraints`.
+        """
         return None
 
     # Observation, reward and termination.

@@ -21,12 +21,24 @@ class CommandLaw(Protocol):
 
     num_outputs: int
 
+    def start(self, pose: np.ndarray) -> np.ndarray:
+        """Return the state (S,) of a motion that begins at a pose (O,); its first O numbers are the last command."""
+        ...
+
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the safe command (O,), and True if it had to be changed, for the last and the desired one, (O,)."""
+        """Return the next state (S,) for the last one and a desired command (O,), and True if it was changed."""
         ...
 
 
-class BarrierFilter:
+class _LastCommand:
+    """Law whose state is the last command."""
+
+    def start(self, pose: np.ndarray) -> np.ndarray:
+        """Return the pose (O,) at which a motion begins."""
+        return pose.copy()
+
+
+class BarrierFilter(_LastCommand):
     """Discrete-time control barrier function on commands (Agrawal and Sreenath, 2017).
 
     The safe command is the nearest to the desired one for which no barrier decreases by more than a fraction γ:
@@ -70,7 +82,7 @@ class BarrierFilter:
         return _last_allowed(last, desired + move, G, np.minimum(c, G @ last)), True
 
 
-class TangentSpaceFilter:
+class TangentSpaceFilter(_LastCommand):
     """Motion of commands in the tangent space of the constraint manifold (ATACOM; Liu et al., 2022 and 2024).
 
     Each constraint has a slack s = G y − c, which changes by σ⁻¹ s per unit of its own velocity. A step v = desired −

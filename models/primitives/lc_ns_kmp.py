@@ -29,6 +29,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import StepFactor, Window
 
 if TYPE_CHECKING:
+    from guiderail.models.control.motion_constraints import MotionConstraintFilter
     from guiderail.models.primitives.stepper import PrimitiveStepper
 
 
@@ -180,6 +181,7 @@ class LcNsKmp:
         pose: ArrayLike | None = None,
         gain: ArrayLike | None = None,
         history_source: Literal["commanded", "measured"] = "commanded",
+        motion: MotionConstraintFilter | None = None,
     ) -> PrimitiveStepper:
         """Begin an episode of commands, one a control step, without a diagram.
 
@@ -188,13 +190,14 @@ class LcNsKmp:
                 mean by default.
             gain: Raw null-space action per unit of the action of `PrimitiveStepper.step`, (O,); ones by default.
             history_source: Outputs that the motion continues from.
+            motion: Filter of the commands by constraints of the motion, as in `PrimitiveStepper`.
 
         Raises:
             InputError: If an argument has the wrong shape or is not finite.
         """
         from guiderail.models.primitives.stepper import PrimitiveStepper
 
-        return PrimitiveStepper(self, pose, gain, history_source)
+        return PrimitiveStepper(self, pose, gain, history_source, motion)
 
     def predict_at(
         self,

@@ -1,7 +1,9 @@
 """Episode of a movement primitive without a diagram: history, gains and fallback, one command a control step."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +13,9 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.qp import UnsolvableError
 
+if TYPE_CHECKING:
+    from guiderail.models.control.motion_constraints import MotionConstraintFilter
+
 
 @dataclass(frozen=True)
 class Command:
@@ -18,9 +23,10 @@ class Command:
 
     Attributes:
         output: Command (O,).
-        violation: max(c − G y) of the command: negative if all constraints are slack, −inf without constraints.
+        violation: max(c − G y) of the command, and of the motion's constraints if there are any: negative if all
+            constraints are slack, −inf without constraints.
         is_fallback: True if no window within the constraints was found, and the command is the point nearest to the
-            last command within the constraints of its step.
+            last command within the constraints of its step; or if the motion's constraints leave nothing but braking.
     """
 
     output: np.ndarray
@@ -38,6 +44,8 @@ class PrimitiveStepper:
         gain: Raw null-space action per unit of the action (O,); ones by default.
         history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
             or is pushed by an operator.
+        motion: Filter of the commands by constraints of the motion; none by default. It begins at the pose, at rest or
+            with the velocity of the last two outputs.
 
     Raises:
         InputError: If an argument has the wrong shape or is not finite.
@@ -54,6 +62,7 @@ class PrimitiveStepper:
         pose: ArrayLike | None = None,
         gain: ArrayLike | None = None,
         history_source: Literal["commanded", "measured"] = "commanded",
+        motion: MotionConstraintFilter | None = None,
     ):
         if history_source not in ("commanded", "measured"):
             raise InputError(f"history_source is commanded or measured, not {brief(history_source)}")
@@ -66,6 +75,12 @@ class PrimitiveStepper:
         else:
             self._history = np.tile(first if pose is None else self._checked(pose, "pose"), (primitive.history, 1))
         self._last = primitive.constraints.nearest(first)
+        self._motion = motion
+        if motion is not None:
+            recent = np.atleast_2d(first if pose is None else np.asarray(pose, dtype=float))
+            self._state = motion.start(recent[-1])
+            if len(recent) > 1:
+                self._state[primitive.num_outputs :] = recent[-1] - recent[-2]
 
     def step(self, action: ArrayLike, pose: ArrayLike | None = None) -> Command:
         """Compute the command of the next control step.
@@ -105,7 +120,12 @@ class PrimitiveStepper:
         constraints = self.primitive.constraints
         is_fallback = output is None
         self._last = constraints.nearest(self._last, self.num_steps) if output is None else output
-        command = Command(self._last, constraints.violation(self._last, self.num_steps), is_fallback)
+        violation = constraints.violation(self._last, self.num_steps)
+        if self._motion is not None:
+            self._state, is_braking = self._motion.apply(self._state, self._last)
+            self._last = self._state[: len(self._last)]
+            violation, is_fallback = self._motion.constraints.violation(self._last), is_fallback or is_braking
+        command = Command(self._last, violation, is_fallback)
         if not self._is_measured:
             self._append(self._last)
         self.num_steps += 1

@@ -13,6 +13,7 @@ from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import Frames, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
+from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]
@@ -55,6 +56,11 @@ class TemplateState:
     def grouped_constraints(self) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
         """Active constraints in groups of consecutive ones that share a frame."""
         return group_constraints(self.active_constraints)
+
+    @cached_property
+    def has_linearized_constraints(self) -> bool:
+        """True if a constraint is linearized at the last command."""
+        return any(isinstance(constraint, Outside) for constraint in self.active_constraints)
 
 
 @dataclass(frozen=True)
@@ -138,23 +144,41 @@ class SharedControlTemplate:
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. The same is done if one constraint undoes another. From a last command inside the constraints, every
-        command is inside. A last command outside (at the start of an episode, or after an object moved) is led inside
-        at the largest speed.
+        object. The same is done if one constraint undoes another. Constraints to stay outside of a shape are linearized
+        at the last command, so that the way to the command is outside too. From a last command inside the constraints,
+        every command is inside. A last command outside (at the start of an episode, or after an object moved) is led
+        inside at the largest speed.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._load(X_WLast, X_WRequest, period_s))
+        constraints = self._constraints_at(state, X_WLast, frames)
         for _ in range(BACKTRACKS):
-            X_WE = self.project(state, between(X_WLast, X_WRequest, fraction), frames)
+            X_WE = between(X_WLast, X_WRequest, fraction)
+            for constraint in constraints:
+                X_WE = constraint.project(X_WE, frames)
             load = self._load(X_WLast, X_WE, period_s)
-            if load <= 1.0 and self._is_inside(state, X_WE, frames):
+            if load <= 1.0 and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
                 return Command(X_WE, fraction)
             fraction *= 0.98 / load if load > 1.0 else 0.5
         if self._is_inside(state, X_WLast, frames):
             return Command(X_WLast, 0.0)
-        X_WE = self.project(state, X_WLast, frames)
+        X_WE = X_WLast
+        for constraint in constraints:
+            X_WE = constraint.project(X_WE, frames)
         load = self._load(X_WLast, X_WE, period_s)
         return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)
+
+    def _constraints_at(
+        self, state: int, X_WLast: RigidTransform, frames: Frames
+    ) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
+        """Return a state's constraints of the command after X_WLast, in their order."""
+        phase = self.states[state]
+        if not phase.has_linearized_constraints:
+            return phase.grouped_constraints
+        return group_constraints(
+            constraint.at(X_WLast, frames) if isinstance(constraint, Outside) else constraint
+            for constraint in phase.active_constraints
+        )
 
     def can_enter(self, state: int, X_WLast: RigidTransform, frames: Frames, period_s: float) -> bool:
         """Return True if one period leads from the last command into a state's active constraints."""

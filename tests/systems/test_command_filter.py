@@ -5,6 +5,7 @@ from pydrake.systems.analysis import Simulator
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.command_filter import CommandFilter
 
@@ -107,3 +108,22 @@ def test_system_starts_at_the_measured_pose_and_keeps_the_last_command():
 def test_system_raises_when_the_period_is_not_positive():
     with pytest.raises(InputError):
         CommandFilter(LAWS["tangent"], 0.0)
+
+
+def test_system_keeps_the_velocity_of_a_law_that_limits_the_acceleration():
+    motion = MotionConstraints(BOX, max_speed=[0.8, 0.8], max_acceleration=[1.6, 1.6])
+    system = CommandFilter(MotionConstraintFilter(motion, PERIOD), PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    desired = system.get_desired_pose_input_port().FixValue(context, [0.5, 0.0])
+    system.get_pose_input_port().FixValue(context, [0.0, 0.0])
+    simulator.Initialize()
+    commands = []
+    for step in range(6):
+        simulator.AdvanceTo((step + 0.5) * PERIOD)
+        commands.append(system.get_safe_pose_output_port().Eval(context)[0])
+    np.testing.assert_allclose(commands, np.cumsum([0.025, 0.05, 0.075, 0.1, 0.1, 0.1]), atol=1e-9)
+    assert system.get_intervention_output_port().Eval(context)[0] == 0.0
+    desired.GetMutableData().set_value([np.nan, 0.0])
+    assert system.get_intervention_output_port().Eval(context)[0] == 1.0
+    assert system.get_safe_pose_output_port().Eval(context)[0] == pytest.approx(0.35 + 0.075)

@@ -13,6 +13,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.poses import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.bounds import DemonstratedBounds
 from guiderail.models.primitives.fit import Selection, fit
@@ -131,6 +132,8 @@ class _FittedSegment:
             if len(given.phases) == 1:
                 return LinearConstraints.box(given.lower[0], given.upper[0])
             return LinearConstraints.box(given.lower[phase], given.upper[phase])
+        if isinstance(given, MotionConstraints):
+            return given.linear
         if not isinstance(given, LinearConstraints):
             raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(given)}")
         return given
@@ -217,6 +220,7 @@ class PrimitiveGuide(Guide):
         if len(sizes) > 1:
             raise InputError(f"all segments need the same outputs, not {sorted(sizes)} of them")
         (self.num_outputs,) = sizes
+        self._period = period
         self.guidance, self.settings = guidance, settings
         self._dims = list(range(self.num_outputs)) if settings.action_dims is None else list(settings.action_dims)
         self.num_actions = len(self._dims)
@@ -236,8 +240,14 @@ class PrimitiveGuide(Guide):
         frame = segment.frame(env, observation) if segment.frame is not None else np.zeros(0)
         self.frame = frame if isinstance(frame, Frame) else Frame(frame)
         given = segment.constraints
-        self.constraints = fitted.as_constraints(given(env, observation) if callable(given) else given)
+        given = given(env, observation) if callable(given) else given
+        self.constraints = fitted.as_constraints(given)
         is_enforced = self.guidance != "residual" and self.guidance != "clipped_residual"
+        self._motion, motion_filter = given if isinstance(given, MotionConstraints) else None, None
+        if self._motion is not None and is_enforced:
+            if self._period is None:
+                raise InputError("constraints of the motion need the period of the environment [s]")
+            motion_filter = MotionConstraintFilter(self._motion, self._period)
         primitive, gains = fitted.primitive_for(
             self.constraints if is_enforced else LinearConstraints.none(self.num_outputs)
         )
@@ -245,7 +255,8 @@ class PrimitiveGuide(Guide):
         recent = self._recent[-max(primitive.history, 1) :]
         recent = [recent[0]] * (max(primitive.history, 1) - len(recent)) + recent
         past = [self.frame.to_frame(output, self.settings.orientation, near) for output in recent]
-        self._stepper: PrimitiveStepper = primitive.start(np.array(past) if primitive.history else past[-1], gains)
+        start = np.array(past) if primitive.history else past[-1]
+        self._stepper: PrimitiveStepper = primitive.start(start, gains, motion=motion_filter)
         self._last = past[-1]
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request:
@@ -279,7 +290,8 @@ class PrimitiveGuide(Guide):
         self._recent = [*self._recent, world][-max(self.settings.history, 1) :]
         extra = self._extra(self._step)
         self._step += 1
-        return GuideCommand(world, self.constraints.violation(command.output, step), command.is_fallback, extra)
+        violation = (self._motion or self.constraints).violation(command.output, step)
+        return GuideCommand(world, violation, command.is_fallback, extra)
 
     def _extra(self, step: int) -> Any:
         fitted = self.segments[self._index]

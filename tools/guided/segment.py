@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
 from guiderail.models.primitives.bounds import DemonstratedBounds
 from guiderail.models.primitives.poses import Orientation, pose_rotation
@@ -91,7 +92,7 @@ def _continued(angles: np.ndarray, near: np.ndarray, orientation: Orientation) -
     return (size + 2 * np.pi * np.round((axis @ near - size) / (2 * np.pi))) * axis
 
 
-Constraints = LinearConstraints | DemonstratedBounds
+Constraints = LinearConstraints | DemonstratedBounds | MotionConstraints
 """Constraints of a segment, in its frame."""
 
 

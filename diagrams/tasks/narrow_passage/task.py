@@ -25,6 +25,8 @@ from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task
 from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_constraints import MotionConstraints
+from guiderail.models.control.shapes import Sphere
 from guiderail.models.objects.narrow_passage import demonstrations
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
@@ -66,6 +68,9 @@ class NarrowPassageOptions(Options):
         ge=0,
         le=0.1,
         description="sampled lateral offset of the obstacles, alternately left and right [m]",
+    )
+    obstacles_constrain: bool = Field(
+        False, description="keep every command of a primitive outside of the obstacle, which must not be sampled"
     )
     obstacles_end: bool = Field(False, description="end the episode as a collision when an obstacle is touched")
     start_deviation: Number = Field(
@@ -231,6 +236,8 @@ class NarrowPassage(Task):
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
+        if self.options.obstacles_constrain and self.options.has_sampled_obstacles:
+            raise InputError("obstacles_constrain needs an obstacle that is not sampled: leave its options out")
         self._geometry = self.options.workcell()
         self.num_steps = round(demonstrations.NUM_STEPS * self.default_control_period / self.control_period)
 
@@ -252,6 +259,13 @@ class NarrowPassage(Task):
     def constraints(self) -> LinearConstraints:
         """Return the constraint that the restricted zone is not entered."""
         return self._geometry.constraints
+
+    def motion_constraints(self) -> MotionConstraints | None:
+        """Return the obstacle as a disc to stay outside of, with `obstacles_constrain`."""
+        if not self.options.obstacles_constrain:
+            return None
+        discs = [Sphere(obstacle, self._geometry.obstacle_radius) for obstacle in self._geometry.obstacles]
+        return MotionConstraints(self.constraints(), outside=discs)
 
     def keep_out(self) -> KeepOut:
         """Return the walls and the restricted zone."""

@@ -14,6 +14,8 @@ from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_constraints import MotionConstraints
+from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority
 
@@ -243,3 +245,26 @@ def test_options_bound_the_time_to_factor_a_step(option):
     assert getattr(PrimitiveOptions(**{option: 200}), option) == 200
     with pytest.raises(ValidationError, match="less than or equal to 200"):
         PrimitiveOptions(**{option: 201})
+
+
+@pytest.mark.parametrize("kind", ["kmp", "kgrl", "skgrl"])
+def test_constraints_of_the_motion_hold_behind_the_primitive(skill, kind):
+    disc = Sphere(skill.reference.means[30], 0.03)
+    motion = MotionConstraints(skill.constraints, [disc], (), [0.3, 0.3], [3.0, 3.0])
+    guidance = build(kind, replace(skill, motion=motion))
+    rng = np.random.default_rng(0)
+    commands, _ = rollout(guidance, np.repeat(rng.uniform(-1, 1, (STEPS // 5, 2)), 5, axis=0))
+    distances = [disc.distance(command) for command in commands]
+    assert 0.0 <= min(distances) < 1e-3  # the demonstrations lead through it
+    assert commands[:, 0].max() <= 0.11 + 1e-9
+    displacements = np.diff([START, *commands], axis=0)
+    assert np.abs(displacements).max() <= 0.3 * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(displacements, axis=0)).max() <= 3.0 * PERIOD**2 * (1 + 1e-6)
+
+
+def test_history_continues_from_commands_behind_the_constraints_of_the_motion(skill):
+    motion = MotionConstraints(skill.constraints, max_speed=[1e-9, 1e-9])
+    commands, _ = rollout(build("skgrl", replace(skill, motion=motion)), constant([0.0, 0.0])[:6])
+    np.testing.assert_allclose(commands, np.zeros((6, 2)), atol=1e-9)
+    free, _ = rollout(build("skgrl", skill), constant([0.0, 0.0])[:6])
+    assert np.abs(free).max() > 1e-4

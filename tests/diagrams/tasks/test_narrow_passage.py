@@ -379,3 +379,30 @@ def test_invalid_options_are_refused_in_one_sentence(arguments, message):
         make(**arguments)
     assert "\n" not in str(error.value)
     gc.collect()
+
+
+@pytest.mark.parametrize("guidance", NULL_SPACE)
+def test_commands_stay_outside_of_an_obstacle_that_constrains(guidance):
+    options = {"obstacle_radius": 0.06, "max_speed": (0.5,), "max_acceleration": (4.0,)}
+    env = make(guidance, obstacles_constrain=True, action_repeat=5, **options)
+    rng = np.random.default_rng(0)
+    _, _, infos = play(env, lambda k: np.array([0.5, rng.uniform(-1.0, 1.0)]), seed=0)
+    commands = env.trace.commanded
+    distances = np.linalg.norm(commands - WORLD.obstacle, axis=1) - 0.06
+    assert 0.0 <= distances.min() < 1e-3
+    assert max(info["constraint_violation"] for info in infos[1:]) <= 1e-9
+    displacements = np.diff(commands, axis=0) / env.task.control_period
+    assert np.abs(displacements).max() <= 0.5 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"obstacles_constrain": True, "difficulty": "hard"}, "not sampled"),
+        ({"max_speed": (0.1, 0.0)}, "positive"),
+        ({"max_acceleration": (0.1, 0.1, 0.1)}, "2 outputs"),
+    ],
+)
+def test_constraints_of_the_motion_refuse_wrong_options(options, match):
+    with pytest.raises(InputError, match=match):
+        make(**options)

@@ -10,6 +10,7 @@ from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import mappings as im
+from guiderail.models.templates import shape_constraints as sc
 from guiderail.models.templates import transitions as td
 from guiderail.models.templates.geometry import angle_between, between
 
@@ -208,3 +209,41 @@ def test_state_needs_the_frames_of_all_its_parts():
         "x", (im.TiltTowards((0, 1), 1.0, "a"),), (ac.Cylinder("b"),), td.Distance("c"), starts_at=1.0, ends_at=0.0
     )
     assert s.frame_names == {"a", "b", "c"}
+
+
+OUTSIDE = [
+    sc.OutsideSphere(frame="f", radius_m=0.02),
+    sc.OutsideCylinder(frame="f", radius_m=0.01, min_m=-0.05, max_m=0.05, margin_m=0.002),
+    sc.OutsideBox(frame="f", lower_m=(-0.02, -0.01, -0.03), upper_m=(0.02, 0.02, 0.01)),
+]
+
+
+@pytest.mark.parametrize("constraint", OUTSIDE, ids=lambda constraint: type(constraint).__name__)
+def test_way_between_commands_is_outside_of_a_shape(constraint):
+    rng, s = np.random.default_rng(0), template(state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3), constraint]))
+    frames = {"f": pose(rng, 0.01)}
+    last, nearest, touching, center = RigidTransform([0.0, 0.06, 0.0]), np.inf, 0, frames["f"].translation()
+    for k in range(600):
+        request = RigidTransform(center if k % 3 else last.translation() + 0.01 * rng.standard_normal(3))
+        command = s.command(0, last, request, frames, PERIOD).X_WE
+        p, q = (frames["f"].inverse() @ X for X in (last, command))
+        for share in np.linspace(0.0, 1.0, 9):
+            point = p.translation() + share * (q.translation() - p.translation())
+            nearest = min(nearest, constraint.shape.distance(point))
+        touching += constraint.shape.distance(q.translation()) < 1e-6
+        last = command
+    assert nearest >= 0.0
+    assert touching > 50  # or the test would show nothing
+    assert np.linalg.norm(last.translation() - center) < 0.1
+
+
+@pytest.mark.parametrize("constraint", OUTSIDE, ids=lambda constraint: type(constraint).__name__)
+def test_command_leaves_a_shape_that_moved_over_it(constraint):
+    s, last = template(state(constraints=[constraint]), speed=0.05), RigidTransform([0.001, 0.002, 0.0])
+    violations = [s.violation(0, last, F)]
+    for _ in range(60):
+        last = s.command(0, last, last, F, PERIOD).X_WE
+        violations.append(s.violation(0, last, F))
+    assert violations[0] > 0.005
+    assert violations[-1] <= 1e-9
+    assert (np.diff(violations) <= 1e-9).all()

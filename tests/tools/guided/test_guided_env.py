@@ -9,6 +9,8 @@ from guiderail import Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segm
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
 from guiderail.models.common.transforms import RigidTransform
+from guiderail.models.control.motion_constraints import MotionConstraints
+from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.bounds import compute_bounds
 
@@ -310,3 +312,28 @@ def test_gymnasium_checker_accepts_the_environment():
 
     check_env(guided(), skip_render_check=True)
     assert isinstance(guided(), gymnasium.Wrapper)
+
+
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
+def test_shapes_and_limits_hold_in_the_frame_of_a_segment(guidance):
+    ball = Sphere([-0.2, -0.03, 0.0], 0.04)
+    motion = MotionConstraints(LIMIT, [ball], (), np.full(3, 0.8), np.full(3, 8.0))
+    env = guided(guidance, constraints=motion, action_scale=5.0)
+    rng = np.random.default_rng(0)
+    env.unwrapped.commands.clear()
+    infos = episode(env, lambda k: rng.uniform(-1, 1, 3))
+    local = np.array(env.unwrapped.commands) - env.unwrapped.target
+    assert min(ball.distance(y) for y in local) >= 0.0
+    assert max(LIMIT.violation(y) for y in local) <= TOLERANCE
+    assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
+    displacements = np.diff(local, axis=0)
+    assert np.abs(displacements).max() <= 0.8 * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(displacements, axis=0)).max() <= 8.0 * PERIOD**2 * (1 + 1e-6)
+
+
+def test_constraints_of_the_motion_need_a_period():
+    segment = Segment(SHOWN, constraints=MotionConstraints(LIMIT), num_steps=40)
+    env = guided(demonstrations=[segment], constraints=None, frame=None, period=None)
+    with pytest.raises(InputError, match="period"):
+        env.reset(seed=0)
+    guided(demonstrations=[segment], constraints=None, frame=None).reset(seed=0)

@@ -1,0 +1,253 @@
+"""Constraints on a commanded motion that are not linear in the command alone: shapes, speed and acceleration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.control.shapes import CLEARANCE, ConvexShape
+from guiderail.models.primitives import LinearConstraints, UnsolvableError
+from guiderail.models.primitives.constraints import TOLERANCE
+from guiderail.models.primitives.qp import solve_least_norm
+
+# Distances from a shape, and from the plane of a linear constraint, that a QP aims at and that every command keeps: in
+# between there is room for the solver's tolerance.
+_SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
+_CUTS = 4  # linearizations of a shape to stay inside of
+_BISECTIONS = 12  # of the way from braking to the nearest command
+
+
+class StateConstraints(Protocol):
+    """Constraints that are linearized at a command and checked at the next one, such as joint limits of an arm."""
+
+    def linearize(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows G (F, O) of unit norm and c (F,) of G y ≥ c near an output (O,)."""
+        ...
+
+    def violation(self, output: np.ndarray) -> float:
+        """Return the violation of an output (O,), negative inside."""
+        ...
+
+
+@dataclass(frozen=True)
+class MotionConstraints:
+    """Constraints of a commanded motion.
+
+    Attributes:
+        linear: G y ≥ c on every command (O,), the same at every step.
+        outside: Convex shapes that the commanded positions, the first D outputs, stay outside of.
+        inside: Convex shapes that they stay inside of.
+        max_speed: Largest speed of each output, (O,) [unit/s]; infinite for none, which is the default.
+        max_acceleration: Largest acceleration of each output, (O,) [unit/s²]; infinite for none, which is the default.
+        state: Further constraints, such as joint limits.
+
+    Raises:
+        InputError: If sizes do not match, a limit is not positive, or `linear` differs from step to step.
+    """
+
+    linear: LinearConstraints
+    outside: Sequence[ConvexShape] = ()
+    inside: Sequence[ConvexShape] = ()
+    max_speed: ArrayLike | None = None
+    max_acceleration: ArrayLike | None = None
+    state: Sequence[StateConstraints] = ()
+
+    def __post_init__(self) -> None:
+        if self.linear.num_steps is not None:
+            raise InputError("shapes, speed and acceleration need linear constraints that do not change")
+        if any(shape.num_dims > self.num_outputs for shape in (*self.outside, *self.inside)):
+            raise InputError(f"a shape has more dimensions than a command has outputs, {self.num_outputs}")
+        for name in ("max_speed", "max_acceleration"):
+            given = getattr(self, name)
+            limit = np.full(self.num_outputs, np.inf) if given is None else as_numbers(given, name)
+            if limit.shape != (self.num_outputs,) or not (limit > 0.0).all():
+                raise InputError(f"{name} is {self.num_outputs} positive numbers, not {brief(given)}")
+            object.__setattr__(self, name, limit)
+
+    @property
+    def num_outputs(self) -> int:
+        """Number of outputs O."""
+        return self.linear.num_outputs
+
+    @property
+    def num_steps(self) -> None:
+        """None: the constraints are the same at every step."""
+        return None
+
+    def violation(self, output: np.ndarray, step: int = 0) -> float:
+        """Return the largest violation of a command (O,) by itself: linear, shapes and state; negative inside."""
+        shapes = [-shape.distance(output[: shape.num_dims]) for shape in self.outside]
+        shapes += [shape.distance(output[: shape.num_dims]) for shape in self.inside]
+        further = (constraint.violation(output) for constraint in self.state)
+        return max(self.linear.violation(output, step), *shapes, *further, -np.inf)
+
+
+class MotionConstraintFilter:
+    """Nearest command to the desired one within `MotionConstraints`, and from which the motion can still stop.
+
+    All constraints are linear in one step: the shapes to stay outside of are half-spaces, linearized at the last
+    command (`ConvexShape`: the true constraint holds, between two commands too), speed and acceleration are boxes
+
+        |y − p| ≤ v h        |y − 2 p + p'| ≤ a h²
+
+    for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if a motion that
+    brakes from it on a straight line at the largest deceleration stays within the constraints; otherwise the last safe
+    point of the line from braking now to that command is. Braking was verified one step earlier, so that there always
+    is a command: constraints cannot contradict each other later. If nothing but braking is left, the flag is true.
+    Without a largest acceleration braking is to repeat the last command.
+
+    A start outside of the constraints (after a push, or where the constraints moved) is led back inside; from
+    then on every command satisfies all of them.
+
+    Args:
+        constraints: Constraints.
+        period: Time between two commands h [s], positive.
+
+    Raises:
+        InputError: If the period is not positive.
+
+    Attributes:
+        num_outputs: O.
+        constraints: Argument.
+    """
+
+    def __init__(self, constraints: MotionConstraints, period: float):
+        if not 0.0 < period < math.inf:
+            raise InputError(f"the period of commands must be positive, not {period} s")
+        self.constraints, self.num_outputs = constraints, constraints.num_outputs
+        self._max_step = period * np.asarray(constraints.max_speed)
+        self._max_change = period**2 * np.asarray(constraints.max_acceleration)
+        self._has_acceleration = bool(np.isfinite(self._max_change).any())
+        self._identity = np.eye(self.num_outputs)
+
+    def start(self, pose: np.ndarray) -> np.ndarray:
+        """Return the state (2 O,) at rest at a pose (O,): the last command and its displacement in one step."""
+        return np.concatenate([pose, np.zeros(self.num_outputs)])
+
+    def apply(self, state: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the next state (2 O,), which begins with the command, and True if only braking was left.
+
+        A desired command (O,) that is not finite is one to brake.
+        """
+        last, velocity = state[: self.num_outputs], state[self.num_outputs :]
+        share, rest_share = self._braking(velocity)
+        brake, rest = last + share * velocity, last + rest_share * velocity
+        held = np.concatenate([brake, brake - last]), True
+        if not is_finite(desired):
+            return held
+        G, c = self._linearize(last, rest)
+        slack = np.minimum(G @ last, G @ rest) - c
+        is_shape = np.arange(len(c)) < len(self.constraints.outside) + len(self.constraints.inside)
+        aim, keep = (np.where(is_shape, *pair) for pair in zip(_SHAPE, _PLANE, strict=True))
+        kept = c + np.minimum(keep, slack)
+        lower = np.minimum(np.maximum(last - self._max_step, last + velocity - self._max_change), brake)
+        upper = np.maximum(np.minimum(last + self._max_step, last + velocity + self._max_change), brake)
+        goals = [c + aim]
+        if (is_outside := slack < keep).any():
+            # A constraint that does not hold yet is approached almost as fast as possible, or at least not left.
+            best = np.where(G > 0.0, G, 0.0) @ _finite(upper) + np.where(G < 0.0, G, 0.0) @ _finite(lower)
+            towards = 0.9 * np.minimum(best, c + aim) + 0.1 * (c + slack)
+            goals = [np.where(is_outside, towards, c + aim), kept]
+        attempts = (self._nearest(desired, G, goal, lower, upper) for goal in goals)
+        nearest = next((command for command in attempts if command is not None), None)
+        if nearest is None:
+            return held
+        inside = [(shape, max(-_SHAPE[1], shape.distance(rest[: shape.num_dims]))) for shape in self.constraints.inside]
+        further = [(one, max(0.0, one.violation(rest))) for one in self.constraints.state]
+
+        def is_safe(command: np.ndarray) -> bool:
+            """Return True if the constraints hold from the last command to where a motion that brakes now ends."""
+            displacement = command - last
+            end = command + self._braking(displacement)[1] * displacement
+            return (
+                bool((G @ end >= kept).all())
+                and all(shape.distance(end[: shape.num_dims]) <= bound for shape, bound in inside)
+                and all(one.violation(each) <= bound for one, bound in further for each in (command, end))
+            )
+
+        if is_safe(nearest):
+            return np.concatenate([nearest, nearest - last]), False
+        safe, unsafe = 0.0, 1.0
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (safe + unsafe)
+            safe, unsafe = (middle, unsafe) if is_safe(brake + middle * (nearest - brake)) else (safe, middle)
+        command = brake + safe * (nearest - brake)
+        return np.concatenate([command, command - last]), safe == 0.0
+
+    def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
+        """Return the shares of a displacement per step (O,) that follow when braking: of the next step, and until rest.
+
+        The displacement decreases by the same amount in each step, a share φ of what it is now, as large as the
+        acceleration of every output allows: the following ones are 1 − φ, 1 − 2 φ, … of it.
+        """
+        share = math.inf
+        if self._has_acceleration:
+            pairs = zip(self._max_change.tolist(), velocity.tolist(), strict=True)
+            share = min((change / abs(moving) for change, moving in pairs if moving), default=math.inf)
+        if share >= 1.0:
+            return 0.0, 0.0
+        steps = math.floor(1.0 / share)
+        return 1.0 - share, steps - 0.5 * share * steps * (steps + 1)
+
+    def _linearize(self, last: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows G (F, O) and c (F,) that contain the line from the last command to where braking ends."""
+        given = self.constraints
+        shapes = (*given.outside, *given.inside)
+        rows, bounds = np.zeros((len(shapes), self.num_outputs)), np.zeros(len(shapes))
+        for k, shape in enumerate(shapes):
+            sign, D = 1.0 if k < len(given.outside) else -1.0, shape.num_dims
+            half_space = shape.separate(last[:D], rest[:D]) if sign > 0.0 else shape.half_space(last[:D])
+            rows[k, :D], bounds[k] = sign * half_space[0], sign * half_space[1]
+        further = [one.linearize(last) for one in given.state]
+        G, c = zip((rows, bounds), (given.linear.G, given.linear.c), *further, strict=True)
+        return np.concatenate(G), np.concatenate(c)
+
+    def _nearest(
+        self, desired: np.ndarray, G: np.ndarray, c: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> np.ndarray | None:
+        """Return the command (O,) nearest to the desired one with G y ≥ c, in the box, and inside of the shapes."""
+        cuts_G, cuts_c, command = G, c, desired
+        for _ in range(_CUTS):
+            missing = cuts_c - cuts_G @ desired
+            below, above = lower - desired, upper - desired
+            if max(missing.max(initial=-1.0), below.max(), -above.min()) > 0.0:
+                is_box = np.isfinite(below)  # then the upper side is finite too
+                rows = np.concatenate([cuts_G, self._identity[is_box]])
+                bounds = (
+                    np.concatenate([missing, below[is_box]]),
+                    np.append(np.full(len(missing), np.inf), above[is_box]),
+                )
+                try:
+                    move, _ = solve_least_norm(rows, *bounds)
+                except UnsolvableError:
+                    return None if cuts_c is c else command
+                command = desired + move
+            cuts = self._cut(command)
+            if not cuts:
+                return command
+            cuts_G = np.concatenate([cuts_G, [row for row, _ in cuts]])
+            cuts_c = np.append(cuts_c, [bound for _, bound in cuts])
+        return command
+
+    def _cut(self, command: np.ndarray) -> list[tuple[np.ndarray, float]]:
+        """Return half-spaces that contain the shapes to stay inside of, and not the command, which is outside."""
+        cuts = []
+        for shape in self.constraints.inside:
+            distance, normal = shape.surface(command[: shape.num_dims])
+            if distance > -_SHAPE[1]:
+                row = np.zeros(self.num_outputs)
+                row[: shape.num_dims] = -normal
+                cuts.append((row, float(row @ command) + distance + CLEARANCE))
+        return cuts
+
+
+def _finite(bounds: np.ndarray) -> np.ndarray:
+    """Return bounds (O,) with large numbers in place of infinite ones, which a zero can be multiplied by."""
+    return np.nan_to_num(bounds, posinf=1e9, neginf=-1e9)

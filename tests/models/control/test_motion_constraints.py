@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+from motion_adversary import KINDS, attack, is_violated
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
+from guiderail.models.control.shapes import Box, Sphere
+from guiderail.models.primitives import LinearConstraints
+
+PERIOD = 0.02
+LINEAR = LinearConstraints.box([0.0, 0.0], [0.6, 1.0])
+OUTSIDE = (Sphere([0.5, 0.3], 0.08), Box([0.1, 0.5], [0.3, 0.6], 0.01))
+INSIDE = (Sphere([0.4, 0.4], 0.5),)
+SPEED, ACCELERATION = np.array([0.5, 0.4]), np.array([2.0, 3.0])
+LIMITS = {
+    "no limits": (None, None),
+    "speed": (SPEED, None),
+    "acceleration": (None, ACCELERATION),
+    "both": (SPEED, ACCELERATION),
+}
+
+
+def test_no_command_and_no_way_enters_a_spherical_obstacle():
+    results = attack(3000, seed=5)
+    for kind in KINDS:
+        assert not is_violated(kind, results[kind]), (kind, results[kind])
+    assert sum(result.touching for result in results.values()) > 50  # or the adversary would show nothing
+
+
+@pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
+def test_every_constraint_holds_for_any_desired_command(limits):
+    motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
+    law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
+    state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
+    worst, between, displacements = -np.inf, np.inf, [np.zeros(2)]
+    for k in range(700):
+        last = state[:2]
+        if rng.uniform() < 0.1:
+            desired = rng.uniform(-0.5, 1.5, 2)
+        if k % 11 == 0:
+            desired = OUTSIDE[0].center
+        state, _ = law.apply(state, desired)
+        worst = max(worst, motion.violation(state[:2]))
+        shares = np.linspace(0.0, 1.0, 5)
+        between = min(between, *(s.distance(last + t * (state[:2] - last)) for s in OUTSIDE for t in shares))
+        displacements.append(state[:2] - last)
+    assert -1e-4 < worst <= 1e-9  # constraints were reached, and not passed
+    assert between >= 0.0
+    moves = np.array(displacements)
+    for limit, actual in ((limits[0], moves / PERIOD), (limits[1], np.diff(moves, axis=0) / PERIOD**2)):
+        if limit is not None:
+            np.testing.assert_allclose(np.abs(actual).max(axis=0), limit, rtol=1e-6)  # reached, and not exceeded
+
+
+def test_allowed_command_is_unchanged_and_another_one_is_nearest():
+    law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE), PERIOD)
+    state = law.start(np.array([0.3, 0.3]))
+    allowed = np.array([0.41, 0.31])
+    after, is_braking = law.apply(state, allowed)
+    np.testing.assert_array_equal(after, [*allowed, *(allowed - state[:2])])
+    assert not is_braking
+    # The plane is that of the last command, at 0.42 along x.
+    np.testing.assert_allclose(law.apply(state, np.array([0.5, 0.35]))[0][:2], [0.42, 0.35], atol=2e-8)
+    np.testing.assert_allclose(law.apply(state, np.array([0.3, -0.2]))[0][:2], [0.3, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("desired", [[np.nan, 0.0], [np.inf, 0.0]])
+def test_command_that_is_not_finite_brakes(desired):
+    law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE, (), SPEED, ACCELERATION), PERIOD)
+    state = np.array([0.3, 0.3, 0.004, -0.002])
+    speeds = []
+    for _ in range(10):
+        state, is_braking = law.apply(state, np.array(desired))
+        assert is_braking
+        speeds.append(np.abs(state[2:]).max())
+    assert speeds[0] == pytest.approx(0.004 - 0.02**2 * 2.0)
+    assert speeds[-1] == 0.0
+
+
+def test_only_braking_is_left_when_a_wall_is_as_near_as_braking_takes():
+    motion = MotionConstraints(LinearConstraints.box([0.0, 0.0], [0.6, 1.0]), (), (), SPEED, ACCELERATION)
+    law = MotionConstraintFilter(motion, PERIOD)
+    displacement, change = 0.005, PERIOD**2 * 2.0
+    braking = sum(displacement - k * change for k in range(1, 7))
+    for room, is_braking in ((braking, True), (braking + 1e-5, False)):
+        state = np.array([0.6 - room, 0.3, displacement, 0.0])
+        after, flag = law.apply(state, np.array([0.7, 0.3]))
+        assert flag == is_braking
+        assert after[2] == pytest.approx(displacement - change, abs=2e-5)
+        for _ in range(30):
+            after, _ = law.apply(after, np.array([0.7, 0.3]))
+            assert after[0] <= 0.6 + 1e-9
+        assert after[0] == pytest.approx(0.6, abs=1e-6)
+
+
+def test_room_without_a_width_leaves_motion_along_it():
+    """Constraints do not contradict each other at the last command, so that there always is a next one."""
+    walls = Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.2 + 1e-9, -np.inf], [np.inf, np.inf])
+    law = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(2), walls), PERIOD)
+    state, is_braking = law.apply(law.start(np.array([0.2 + 5e-10, 0.1])), np.array([0.4, 0.3]))
+    assert not is_braking
+    np.testing.assert_allclose(state[:2], [0.2 + 5e-10, 0.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("start", [[0.52, 0.31], [0.2, 0.55], [0.7, 0.3], [-0.3, 0.5]])
+@pytest.mark.parametrize("limits", [(None, None), (SPEED, None), (SPEED, ACCELERATION)])
+def test_start_outside_the_constraints_is_led_inside(start, limits):
+    motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
+    law = MotionConstraintFilter(motion, PERIOD)
+    state, violations = law.start(np.array(start)), [motion.violation(np.array(start))]
+    assert violations[0] > 1e-3
+    for _ in range(100):
+        state, _ = law.apply(state, np.array(start))
+        violations.append(motion.violation(state[:2]))
+    assert violations[-1] <= 1e-9
+    assert (np.diff(np.maximum(violations, 0.0)) <= 1e-9).all()
+
+
+def test_limits_apply_to_outputs_without_a_position():
+    motion = MotionConstraints(LinearConstraints.none(3), OUTSIDE, (), [np.inf, np.inf, 0.1])
+    law = MotionConstraintFilter(motion, PERIOD)
+    state, _ = law.apply(law.start(np.array([0.3, 0.3, 0.0])), np.array([0.32, 0.3, 1.0]))
+    np.testing.assert_allclose(state[:3], [0.32, 0.3, 0.002], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"linear": LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2)))}, "do not change"),
+        ({"outside": [Sphere([0.0, 0.0, 0.0], 0.1)]}, "dimensions"),
+        ({"inside": [Sphere([0.0, 0.0, 0.0], 0.1)]}, "dimensions"),
+        ({"max_speed": [0.1]}, "max_speed"),
+        ({"max_speed": [0.1, 0.0]}, "max_speed"),
+        ({"max_acceleration": [0.1, np.nan]}, "max_acceleration"),
+    ],
+)
+def test_constraints_raise_when_an_argument_is_out_of_range(arguments, match):
+    with pytest.raises(InputError, match=match):
+        MotionConstraints(**{"linear": LINEAR, **arguments})
+
+
+@pytest.mark.parametrize("period", [0.0, np.nan, np.inf])
+def test_filter_raises_when_the_period_is_not_positive(period):
+    with pytest.raises(InputError, match="period"):
+        MotionConstraintFilter(MotionConstraints(LINEAR), period)
