@@ -10,6 +10,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
+from guiderail.models.control.message_sequence import RESOLUTION
 
 ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # the status itself is valid
 # The message is dropped, and the next one is compared with its predecessor. After every other fault statuses are in
@@ -153,7 +154,8 @@ class StateEstimator:
     `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
     with a model, for each joint:
 
-    - *Equal values*: a moving joint has the same position, or the same velocity, to the bit in consecutive statuses;
+    - *Equal values*: a joint that moves, by its velocity or its positions, has the same position, or the same velocity,
+      to the bit in consecutive statuses;
       or any joint has the same position, velocity and external torque while another joint moves.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
       the position tolerance.
@@ -165,8 +167,9 @@ class StateEstimator:
     A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
     One wrong source cannot move it out of the interval of the other two. While no status is accepted, the third source
-    continues alone, so that damping removes the momentum once and then ends. The accepted velocity, with which the arm
-    is controlled, is the reported one, limited to the interval of the other two and their noise.
+    continues alone, so that damping removes the momentum once and then ends; a status that is accepted in doubt can only
+    make it smaller. The accepted velocity, with which the arm is controlled, is the reported one, limited to the interval
+    of the other two and their noise.
 
     The clocks are synchronized with the first status. Afterwards the offset follows early statuses quickly and late
     ones slowly; after a fault or a timeout the clocks are synchronized again. Delays of this program are not attributed
@@ -240,8 +243,16 @@ class StateEstimator:
             others, margin = (change[self._positions] / elapsed, state.velocity), self._limits.velocity_noise
             values = values.copy()
             values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
-            velocity = np.median((velocity, *others), axis=0)
-        if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING):
+            reported, velocity = velocity, np.median((velocity, *others), axis=0)
+            if fault == Fault.INCONSISTENT:
+                # Two of the sources are of this status. It may be an old one, with the velocity of that time.
+                is_old = np.abs(np.array((reported, others[0])) - state.velocity).min(axis=0) > AGREEMENT
+                velocity = np.where(is_old, state.velocity, velocity)
+            if is_doubted:
+                # Damping by a late velocity drives the arm: the predicted one limits it.
+                size = np.minimum(np.abs(velocity), np.abs(state.velocity))
+                velocity = np.where(velocity * state.velocity > 0.0, np.sign(velocity) * size, 0.0)
+        if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING) and not is_doubted:
             is_frozen = (change[self._positions] == 0.0) | (fault == Fault.NOT_REACTING)
             missing, is_missing = self._missing_velocity(state, M)
             state = replace(state, velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
@@ -313,7 +324,9 @@ class StateEstimator:
     ) -> EstimatorState:
         speed, is_equal = np.abs(values[self._velocities]), change == 0.0
         equal_positions = is_equal[self._positions] & (speed * elapsed > MIN_MOTION)
-        equal_velocities = is_equal[self._velocities] & (speed > MIN_SPEED)
+        # A velocity can be frozen close to zero, and then the positions tell that the joint moves.
+        moved = (np.abs(change[self._positions]) - 2.0 * RESOLUTION) / elapsed
+        equal_velocities = is_equal[self._velocities] & (np.maximum(speed, moved) > MIN_SPEED)
         equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
         decay = np.exp(-elapsed / POSITION_WINDOW)
         return replace(

@@ -375,6 +375,17 @@ def test_values_of_a_slow_joint_may_be_equal(field, speed, is_fault):
     assert (found is not None) == is_fault
 
 
+@pytest.mark.parametrize(("share", "is_fault"), [(0.99, False), (1.01, True)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_velocity_frozen_near_zero_is_a_fault_when_the_position_moves(share, is_fault, sign):
+    """The position of a joint may be wrong by its resolution, in both statuses."""
+    moved_in_a_period = module.MIN_SPEED * PERIOD + 2.0 * module.RESOLUTION
+    slow = sign * share * moved_in_a_period / PERIOD
+    rig = Rig(velocity=[slow, 0.0], limits=replace(LIMITS, position_tolerance=1.0, velocity_noise=1.0)).settle()
+    found = rig.detected(lambda status: replace(status, velocities=np.array([1e-3, 0.0])), 10)
+    assert found == ((4 + 1, Fault.FROZEN) if is_fault else None)
+
+
 def test_equal_values_of_an_arm_at_rest_are_no_fault():
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     assert rig.detected(lambda status: status, 50) is None
@@ -767,6 +778,40 @@ def test_no_frozen_signal_adds_energy_to_a_stop(fields, seed):
     energy, speed = stop(rig, lambda status: replace(status, **{name: getattr(kept, name) for name in fields}))
     assert energy <= before * (1.0 + 1e-9)
     assert speed < 0.1
+
+
+@pytest.mark.parametrize("delay", [5, 13, 25])
+@pytest.mark.parametrize("seed", range(8))
+def test_no_old_values_add_energy_to_a_stop(delay, seed):
+    """All values are late, with present time stamps: damping by a late velocity drives an arm."""
+    rng = np.random.default_rng(seed)
+    rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
+    before, statuses = 0.5 * rig.v @ M @ rig.v, []
+
+    def late(status):
+        statuses.append(status)
+        return replace(statuses[max(len(statuses) - 1 - delay, 0)], time=status.time)
+
+    energy, speed = stop(rig, late, 100)
+    assert energy <= before * (1.0 + 1e-9)
+    assert speed < 0.15
+
+
+def test_old_values_without_an_interruption_leave_the_velocity_to_the_prediction():
+    rig = Rig(limits=replace(LIMITS, position_jump=1.0)).settle()
+    velocity = rig.state.velocity.copy()
+    assert rig.check(moved(positions=-0.05 * CRUISE, velocities=-2.0 * CRUISE)) == Fault.INCONSISTENT
+    np.testing.assert_allclose(rig.state.velocity, velocity, atol=0.05)
+
+
+@pytest.mark.parametrize(("reported", "expected"), [(0.05, 0.05), (-0.02, 0.0), (0.12, 0.08)])
+def test_velocity_in_doubt_is_not_beyond_the_predicted_one(reported, expected):
+    rig = Rig(velocity=[0.08, 0.0], external=np.zeros(2)).settle()
+    rig.state = replace(rig.state, doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
+    error = np.array([reported - 0.08, 0.0])
+    rig.check(moved(velocities=error, positions=PERIOD * error))
+    assert rig.estimate.is_new
+    np.testing.assert_allclose(rig.state.velocity[0], expected, atol=1e-3)
 
 
 # State and arguments.
