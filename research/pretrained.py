@@ -2,9 +2,9 @@
 
     python -m research.pretrained [NAME...] [--out runs/pretrained]
 
-The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Each is evaluated
-on 40 held-out episodes with all baseline policies. Its configuration, its weights and its evaluation are written to `tools/pretrained/NAME`. An
-interrupted training is resumed.
+The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Each is
+evaluated on 40 held-out episodes with all baseline policies. Its configuration, its weights and its evaluation are
+written to `tools/pretrained/NAME`. An interrupted training is resumed.
 """
 
 from __future__ import annotations

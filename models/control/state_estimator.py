@@ -155,8 +155,8 @@ class StateEstimator:
     with a model, for each joint:
 
     - *Equal values*: a joint that moves, by its velocity or its positions, has the same position, or the same velocity,
-      to the bit in consecutive statuses;
-      or any joint has the same position, velocity and external torque while another joint moves.
+      to the bit in consecutive statuses; or any joint has the same position, velocity and external torque while another
+      joint moves.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
       the position tolerance.
     - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay,
@@ -167,9 +167,9 @@ class StateEstimator:
     A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
     One wrong source cannot move it out of the interval of the other two. While no status is accepted, the third source
-    continues alone, so that damping removes the momentum once and then ends; a status that is accepted in doubt can only
-    make it smaller. The accepted velocity, with which the arm is controlled, is the reported one, limited to the interval
-    of the other two and their noise.
+    continues alone, so that damping removes the momentum once and then ends; a status that is accepted in doubt only
+    makes it smaller. The accepted velocity, with which the arm is controlled, is the reported one, limited to the
+    interval of the other two and their noise.
 
     The clocks are synchronized with the first status. Afterwards the offset follows early statuses quickly and late
     ones slowly; after a fault or a timeout the clocks are synchronized again. Delays of this program are not attributed
