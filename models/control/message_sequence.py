@@ -17,7 +17,8 @@ class StatusSequence:
 
     A status contradicts its predecessors if it has the time stamp of one and other values, or if a position goes to and
     fro faster than a joint can: the velocities from three consecutive statuses have opposite signs and differ by more
-    than `REVERSAL`, with `RESOLUTION` allowed for each position. The statuses of two robots alternate like this.
+    than `REVERSAL`, with `RESOLUTION` allowed for each position. Or if within two periods two of the intervals between
+    time stamps are shorter than half a period. The statuses of two robots alternate like this.
 
     Attributes:
         num_conflicts: Number of contradictions.
@@ -26,7 +27,8 @@ class StatusSequence:
     def __init__(self, period: float):
         """Construct the sequence; `period` is the nominal one [s]."""
         self.num_conflicts = 0
-        self._max_interval = MAX_MISSED_MESSAGES * period
+        self._period, self._max_interval = period, MAX_MISSED_MESSAGES * period
+        self._short_time = -np.inf  # time stamp after the last short interval [s]
         self._last: JointStatus | None = None
         self._motion: tuple[np.ndarray, float] | None = None  # velocity from the last two positions, its margin [rad/s]
 
@@ -39,6 +41,9 @@ class StatusSequence:
         elapsed = status.time - last.time
         if elapsed == 0.0:
             self.num_conflicts += not np.array_equal(status.values(), last.values())
+        if 0.0 < elapsed < 0.5 * self._period:
+            self.num_conflicts += status.time - self._short_time <= 2.0 * self._period
+            self._short_time = status.time
         if 0.0 < elapsed <= self._max_interval:
             velocity, margin = (status.positions - last.positions) / elapsed, 2.0 * RESOLUTION / elapsed
             self._motion = velocity, margin

@@ -72,8 +72,8 @@ def test_every_status_is_compared_also_if_it_is_not_read():
     pair.status(time=0.006, position=0.1)
     assert pair.status(time=0.006, position=0.2).conflicts == 1
     assert pair.status(time=0.006, position=0.2).conflicts == 1
-    pair.status(time=0.008, position=0.4)
-    assert pair.status(time=0.01, position=0.2).conflicts == 2
+    pair.status(time=0.009, position=0.4)
+    assert pair.status(time=0.012, position=0.2).conflicts == 2
     np.testing.assert_array_equal(pair.read().positions, 0.2)
 
 
