@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,12 +54,18 @@ def reference_of_file(path: Path, components: int | None, floor: tuple[float, ..
     """
     if not path.is_file():
         raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
-    return _fitted(path, path.stat().st_mtime_ns, components, floor)
+    with path.open("rb") as file:
+        key = hashlib.file_digest(file, "sha256").digest(), components, floor
+    if key not in _REFERENCES:
+        _REFERENCES[key] = _fit(path, components, floor)
+    return _REFERENCES[key]
 
 
-@cache
-def _fitted(path: Path, changed: int, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
-    """Fit the file's demonstrations; cached by path and modification time `changed` [ns]."""
+# A fit takes seconds. The key has the digest of the file: `create-task` moves its folder.
+_REFERENCES: dict[tuple[bytes, int | None, tuple[float, ...]], ReferenceTrajectory] = {}
+
+
+def _fit(path: Path, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
     demonstrations = Demonstrations.load(path)
     if demonstrations.num_outputs != POSE_SIZE:
         raise InputError(

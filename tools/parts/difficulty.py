@@ -11,9 +11,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.diagrams.tasks.part.file import PartTaskFile
+from guiderail.diagrams.tasks.offsets import reference_of_file
+from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file
 from guiderail.diagrams.tasks.part.task import IN_SOCKET, TIME, Z, load_task_folder
 from guiderail.diagrams.tasks.registry import register_task
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.common.units import MM
 from guiderail.models.parts.demonstrator import plan_search
@@ -246,10 +248,12 @@ def calibrate(
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = turn_of(None if clearance is None else clearance * MM, radius)
     try:
+        source = read_task_file(folder).demonstrations  # with the digits that the file has
+        reference_of_file(folder / source.file, source.components, source.floor)  # the child inherits the fit
         setting, score, is_hard = run_isolated(
             _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
         )
-    except IsolatedError as error:
+    except (IsolatedError, InputError) as error:
         say(f"difficulty=hard is not calibrated: {error}")
         return file
     demonstrations = Demonstrations.load(folder / file.demonstrations.file)

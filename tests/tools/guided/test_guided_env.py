@@ -13,11 +13,28 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.tools.guided import guide
 
 TOLERANCE = 1e-9
 ENFORCED = ("kgrl", "skgrl", "clipped_residual")
 SHOWN = demonstrations()
 LIMIT = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def fits_of_equal_demonstrations():
+    """Fit equal demonstrations once: fits take most of the time of these tests, and depend on nothing else."""
+    original, known = guide.fit, {}
+
+    def fit(recorded, **options):
+        key = (*(array.tobytes() for array in (*recorded.times, *recorded.outputs)), repr(options))
+        if key not in known:
+            known[key] = original(recorded, **options)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(guide, "fit", fit)
+        yield
 
 
 def at_target(env, observation):

@@ -123,7 +123,7 @@ def test_failed_calibration_keeps_the_default(monkeypatch, tmp_path):
     sentences = []
     file = SimpleNamespace(measured={"force": 5.0, "clearance_mm": None}, force_limit=35.0)
     assert calibrate(tmp_path / "missing", file, 1e-2, 2, sentences.append) is file
-    assert sentences[0].startswith("difficulty=hard is not calibrated: InputError: there is no task folder")
+    assert sentences[0].startswith("difficulty=hard is not calibrated: there is no task folder")
 
 
 @pytest.mark.parametrize("episodes", [-1, 101])
