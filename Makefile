@@ -115,7 +115,9 @@ $(OUTSIDE)/.ready: pyproject.toml research/outside_envs/requirements.txt
 	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check --no-deps robosuite==1.5.2
 	touch $@
 
+# pip would compile with one core, and the tests of other packages too. What is left out is compiled when it is imported.
 $(VENV)/.ready: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true  # some packages have templates that are no Python
 	touch $@

@@ -134,7 +134,7 @@ def test_evaluate_describes_differences_when_asked(bead_run):
 def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
     def run(processes):
         return evaluate(
-            "uniform_random", "NarrowPassage", 3, baselines=["constant", "scripted"],
+            "uniform_random", "NarrowPassage", 2, baselines=["constant", "scripted"],
             environment={"action_repeat": 40}, processes=processes, save=tmp_path / f"{processes}.npz",
         )  # fmt: skip
 
