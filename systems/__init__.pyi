@@ -35,6 +35,7 @@ from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter
 from .pose_publisher import PosePublisher as PosePublisher
 from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter
 from .pose_wrench import PoseWrench as PoseWrench
+from .progress_clock import ProgressClock as ProgressClock
 from .recorder import Recorder as Recorder
 from .recorder import Recording as Recording
 from .reference_governor import ReferenceGovernor as ReferenceGovernor

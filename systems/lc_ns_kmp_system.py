@@ -31,6 +31,7 @@ class LcNsKmpSystem(LeafSystem):
         - null_space_action
         - history (if P > 0)
         - history_length (if there are primitives with shorter histories)
+        - motion_time (optional)
         output_ports:
         - command
         - constraint_violation
@@ -44,7 +45,8 @@ class LcNsKmpSystem(LeafSystem):
     window within the constraints was found; the command is then the point nearest to the last command within the
     constraints of its step.
 
-    The step is state and counts control periods since time zero. The command is a pure function of step, action and
+    The step is state and counts control periods since time zero, unless ``motion_time`` (1,) [s] is connected
+    (`ProgressClock`), which then determines it. The command is a pure function of step, action and
     history, evaluated once per control step (see docs/concepts/rates.md). The evaluation
     raises an `InputError` if no primitive has the selected history length.
 
@@ -92,6 +94,7 @@ class LcNsKmpSystem(LeafSystem):
             self.DeclareVectorInputPort("history", primitive.history * outputs) if primitive.history else None
         )
         self._history_length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
+        self._motion_time_port = self.DeclareVectorInputPort("motion_time", 1)
         self._step = self.DeclareDiscreteState(1)
         self._initial_command = primitive.constraints.nearest(primitive.reference.means[0])
         self._last_command = self.DeclareDiscreteState(self._initial_command)
@@ -102,6 +105,7 @@ class LcNsKmpSystem(LeafSystem):
             self._null_space_action_port.ticket(),
             self.discrete_state_ticket(self._step),
             self.discrete_state_ticket(self._last_command),
+            self._motion_time_port.ticket(),
         }
         prerequisites |= {port.ticket() for port in (self._history_port, self._history_length_port) if port is not None}
         self._prediction = declare_cache(self, "prediction", self._predict, prerequisites_of_calc=prerequisites)
@@ -148,6 +152,7 @@ class LcNsKmpSystem(LeafSystem):
             raise InputError("this system has one primitive, hence no such port: give it shorter ones")
         return self._history_length_port
 
+    get_motion_time_input_port = input_getter("motion_time", "time of the motion, (1,) [s]; optional")
     get_command_output_port = output_getter("command", "command, (O,)")
     get_constraint_violation_output_port = output_getter("constraint_violation", "violation of the command, (1,)")
     get_fallback_output_port = output_getter("fallback", "flag that the command is a fallback, (1,)")
@@ -167,6 +172,8 @@ class LcNsKmpSystem(LeafSystem):
 
     def _predict(self, context: Context) -> _Prediction:
         step = int(context.get_discrete_state(self._step).value()[0])
+        if self._motion_time_port.HasValue(context):
+            step = round(self._motion_time_port.Eval(context)[0] / self._period)
         length = self._primitive.history
         if self._history_length_port is not None:
             length = self._history_length_port.Eval(context)[0]

@@ -230,8 +230,11 @@ def _make_loop(task: str, options: Mapping[str, Any], start_within: float | None
     """
     demonstrated = make_prior_knowledge(task, **options).demonstrations
     assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
-    if demonstrated.motion is not None:
-        raise InputError("a certificate covers linear constraints: leave out max_speed, max_acceleration and shapes")
+    if demonstrated.motion is not None or demonstrated.progress is not None:
+        raise InputError(
+            "a certificate covers linear constraints and the clock: leave out progress, max_speed, max_acceleration "
+            "and shapes"
+        )
     has_actions = options["guidance"] != "kmp"
     primitive = demonstrated.primitive(history=options["guidance"] == "skgrl", constrained=has_actions)
     # A reset starts at the demonstrations, not at the via-points that the primitive passes through.

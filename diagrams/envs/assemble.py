@@ -14,7 +14,7 @@ from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
-from guiderail.diagrams.envs.observation import Observation, ObservationTerm, affine
+from guiderail.diagrams.envs.observation import CLOCKS, MOTION_TIME, Observation, ObservationTerm, affine
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
@@ -27,6 +27,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives.progress import StateProgress
 from guiderail.models.primitives.reference import pass_through
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
@@ -58,7 +59,8 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
             reference=reference,
             kernel=kernel,
             constraints=constraints,
-            motion=_motion_constraints(task, constraints),
+            motion=_motion_constraints(task, constraints, station),
+            progress=_state_progress(task, station.control_period),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,
             keep_out=task.keep_out() if "keep_out" in provides else None,
@@ -77,12 +79,32 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
 
 
 _LIMITS = ("max_speed", "max_acceleration")
-_NOT_PRIMITIVE = (*KERNEL_OPTIONS, "via_points", *_LIMITS)
+_PROGRESS = ("progress", "progress_tolerance", "max_lag")
+_JOINTS = ("joint_margin", "min_singular_value")
+_NOT_PRIMITIVE = (*KERNEL_OPTIONS, "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
 
 
-def _motion_constraints(task: Task, constraints: LinearConstraints) -> MotionConstraints | None:
+def _state_progress(task: Task, period: float) -> StateProgress | None:
+    """Return the rule of progress among a task's options; None: the clock drives the motion."""
+    options = task.config.part("primitive")
+    if options.get("progress", "clock") == "clock":
+        return None
+    return StateProgress(options["progress_tolerance"], round(options["max_lag"] / period))
+
+
+def _num_steps(task: Task, period: float) -> int:
+    """Return the control steps of an episode, with those that the motion may wait."""
+    progress = _state_progress(task, period)
+    return task.num_steps + (0 if progress is None else progress.max_lag)
+
+
+def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
     """Return a task's constraints of the motion with the limits among its options; None if there are none."""
-    motion, outputs, limits = task.motion_constraints(), constraints.num_outputs, {}
+    motion, outputs = task.motion_constraints(), constraints.num_outputs
+    limits: dict[str, Any] = {}
+    margin, smallest = (task.config.part("primitive")[name] for name in _JOINTS)
+    if margin is not None:
+        limits["state"] = [station.joint_range(margin, smallest)]
     for name in _LIMITS:
         given = task.config.part("primitive").get(name, ())
         if not given:
@@ -200,11 +222,14 @@ class Loop:
     ) -> tuple[gymnasium.spaces.Box, OutputPort]:
         """Add the diagram `name` of observation terms; return the space and the port of its output."""
         user = f"the {name} of {task.name}"
-        names = [one.signal for one in terms if one.signal not in ("time", "phase")]
+        names = [one.signal for one in terms if one.signal not in CLOCKS]
         ports = {signal: self.signals.get(signal, user) for signal in names}
         duration = task.num_steps * self.station.control_period
         sizes = {signal: port.size() for signal, port in ports.items()}
-        seen = Observation(terms, sizes, duration, task.clip, task.name)
+        waits = self.guidance.HasOutputPort(MOTION_TIME) and len(names) < len(terms)
+        seen = Observation(terms, sizes, duration, task.clip, task.name, waits=waits)
+        if waits:
+            ports[MOTION_TIME] = self.guidance.GetOutputPort(MOTION_TIME)
         diagram = self.builder.AddNamedSystem(name, seen)
         for signal, port in ports.items():
             self.builder.Connect(port, diagram.GetInputPort(signal))
@@ -282,7 +307,7 @@ def build_task_diagram(
     return TaskDiagram(
         diagram=diagram,
         control_period=period,
-        num_steps=task.num_steps,
+        num_steps=_num_steps(task, period),
         observation_space=loop.space,
         reward_terms=reward.term_names,
         randomize=make_randomize(task, station, guidance),
@@ -360,7 +385,11 @@ def build_skill_diagram(
     diagram = builder.Build()
     diagram.set_name(f"{task.name.replace('/', '_')}_skill")
     return SkillDiagram(
-        diagram, station.control_period, task.num_steps, make_randomize(task, station, guidance), meshcat
+        diagram,
+        station.control_period,
+        _num_steps(task, station.control_period),
+        make_randomize(task, station, guidance),
+        meshcat,
     )
 
 

@@ -16,6 +16,8 @@ from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
 """Signals that every observation can have: time since the episode began [s], and the same from −1 to 1."""
+MOTION_TIME = "motion_time"
+"""Output of guidance whose motion waits for the robot: the clock of observations then is that of the motion [s]."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Observation(Diagram):
         name: Observation
         input_ports:
         - one per signal that is not a clock
+        - motion_time (if the motion waits for the robot)
         output_ports:
         - observation
 
@@ -50,7 +53,14 @@ class Observation(Diagram):
     """
 
     def __init__(
-        self, observed: Sequence[ObservationTerm], sizes: Mapping[str, int], duration: float, clip: float, of: str = ""
+        self,
+        observed: Sequence[ObservationTerm],
+        sizes: Mapping[str, int],
+        duration: float,
+        clip: float,
+        of: str = "",
+        *,
+        waits: bool = False,
     ):
         """Construct the diagram.
 
@@ -60,6 +70,7 @@ class Observation(Diagram):
             duration: Duration of an episode [s].
             clip: Largest absolute value, positive.
             of: Name of the task, for messages.
+            waits: True if the clocks are those of the input `motion_time`.
 
         Raises:
             InputError: If there is no entry, an index is out of range, or a center or a scale would not map finite
@@ -76,9 +87,13 @@ class Observation(Diagram):
             )
         together = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
         exported: set[str] = set()
+        if waits:
+            motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
+            builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
         for index, one in enumerate(observed):
             if one.signal in CLOCKS:
-                builder.Connect(_add_clock(builder, one.signal, duration), together.get_input_port(index))
+                clock = _add_clock(builder, one.signal, duration, motion_time if waits else None)
+                builder.Connect(clock, together.get_input_port(index))
                 continue
             if one.signal not in exported:
                 exported.add(one.signal)
@@ -114,7 +129,15 @@ def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:
     )
 
 
-def _add_clock(builder: DiagramBuilder, name: str, duration: float) -> OutputPort:
+def _add_clock(
+    builder: DiagramBuilder, name: str, duration: float, motion_time: Saturation | None = None
+) -> OutputPort:
+    """Add a clock of the simulation, or of the motion if that is given; return its port."""
+    if motion_time is not None:
+        scale, offset = (1.0, 0.0) if name == "time" else (2.0 / duration, -1.0)
+        clock = builder.AddNamedSystem(name, affine(np.array([[scale]]), [offset]))
+        builder.Connect(motion_time.get_output_port(), clock.get_input_port())
+        return clock.get_output_port()
     ends = np.array([[0.0, duration]]) if name == "time" else np.array([[-1.0, 1.0]])
     clock = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, duration], ends))
     return builder.AddNamedSystem(name, clock).get_output_port()

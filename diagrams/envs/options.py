@@ -89,9 +89,29 @@ class PrimitiveOptions(Options):
         "there are two numbers; or one number for each output",
     )
     max_acceleration: Numbers = Field((), description="largest acceleration of the command, like max_speed")
+    joint_margin: Number | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="keep the joints that a command takes this far from their limits [rad], on an arm; default: no "
+        "constraint",
+    )
+    min_singular_value: Number = Field(
+        0.0, ge=0, le=0.2, description="smallest singular value of the arm's scaled Jacobian [m], with joint_margin"
+    )
+    progress: Literal["clock", "state"] = Field(
+        "clock", description="what advances the motion: the clock, or the robot, which the motion then waits for"
+    )
+    progress_tolerance: Numbers = Field(
+        (0.0025, 0.1),
+        min_length=2,
+        max_length=2,
+        description="distance of the robot from its command [m] and of its angles [rad] at which the motion waits",
+    )
+    max_lag: Number = Field(3.0, ge=0, le=60, description="largest time for which the motion waits in total [s]")
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
 
-    @field_validator("max_speed", "max_acceleration")
+    @field_validator("max_speed", "max_acceleration", "progress_tolerance")
     @classmethod
     def _check_positive(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if not all(value > 0.0 for value in values):

@@ -18,6 +18,7 @@ from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.progress_clock import ProgressClock
 
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
@@ -52,7 +53,23 @@ class PrimitiveGuidance(Guidance):
     def _constrain(
         self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
     ) -> tuple[OutputPort, OutputPort]:
-        """Return the ports of the command and of the fallback flag, behind the constraints of the motion if any."""
+        """Return the ports of the command and of the fallback flag, behind the constraints of the motion if any.
+
+        The primitive's progress waits for the robot if the configuration has a rule for it.
+        """
+        command, fallback = self._limit_motion(builder, config, kmp, pose)
+        if config.progress is not None:
+            rule, period = config.progress, config.control_period
+            clock = builder.AddNamedSystem("progress", ProgressClock(rule, config.num_outputs, period))
+            builder.Connect(command, clock.get_command_input_port())
+            builder.Connect(pose, clock.get_pose_input_port())
+            builder.Connect(clock.get_motion_time_output_port(), kmp.get_motion_time_input_port())
+            builder.ExportOutput(clock.get_motion_time_output_port(), "motion_time")
+        return command, fallback
+
+    def _limit_motion(
+        self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
+    ) -> tuple[OutputPort, OutputPort]:
         command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
         if config.motion is None:
             return command, fallback

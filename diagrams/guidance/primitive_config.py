@@ -11,6 +11,7 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
+from guiderail.models.primitives.progress import StateProgress
 
 HISTORY_SOURCES = ("commanded", "measured")
 
@@ -41,6 +42,7 @@ class PrimitiveConfig:
             same amount. Default: one group.
         solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
         keep_out: Walls that safe residual learning stops at, if the task provides any.
+        progress: Rule by which the motion waits for the robot; None: the clock drives it.
         wrench_size: W, size of a measured wrench.
     """
 
@@ -62,6 +64,7 @@ class PrimitiveConfig:
     solver: str = "daqp"
     keep_out: KeepOut | None = None
     motion: MotionConstraints | None = None
+    progress: StateProgress | None = None
     wrench_size: int = 6
 
     def __post_init__(self) -> None:
@@ -69,6 +72,8 @@ class PrimitiveConfig:
             raise InputError(f"a history is {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
         if not (np.isfinite(self.action_scale) and self.action_scale > 0):
             raise InputError(f"action_scale must be positive, not {self.action_scale}")
+        if self.progress is not None and self.constraints.num_steps is not None:
+            raise InputError("constraints that differ from step to step need progress=clock")
         if self.history < 1:
             raise InputError(f"history must be at least 1 past output, not {self.history}")
         if self.action_dims is not None and not self.action_dims:

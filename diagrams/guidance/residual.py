@@ -18,6 +18,7 @@ from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
 from guiderail.models.control.keep_out import KeepOut
@@ -81,6 +82,8 @@ class ResidualGuidance(PrimitiveGuidance):
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
+        if config.progress is not None:
+            raise InputError("residual guidance is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
         action, pose = self._export_inputs(builder, config)
         kmp = add_demonstration(builder, config, action)
         residual = builder.AddNamedSystem("residual", Residual(config.residual_gains()))

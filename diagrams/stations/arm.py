@@ -29,6 +29,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
+from guiderail.models.robots.joint_range import JointRange
 from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import (
     DEFAULT_END_EFFECTOR,
@@ -278,6 +279,11 @@ class ArmStation(Station):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
+
+    def joint_range(self, margin: float, min_singular_value: float) -> JointRange:
+        """Return constraints on a commanded pose by the joints that it takes near the null-space posture."""
+        model = self._controller_plant
+        return JointRange(model.plant, model.target, model.tool_center, model.posture, margin, min_singular_value)
 
     def _add_wrench_estimate(self, builder: DiagramBuilder, accuracy: JointTorqueAccuracy) -> OutputPort:
         """Add joint torque sensors and the estimate of the wrench; return its port."""

@@ -24,6 +24,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.control.motion_constraints import StateConstraints
 from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance
 from guiderail.systems.wrench_tare import WrenchTare
@@ -262,6 +263,10 @@ class DisturbedStation(Station):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the robot at rest with its true tool center at `pose`, (6,); `context` is the root context."""
         self._inner.set_pose(context, pose)
+
+    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
+        """Return the constraints of the inner station's joints."""
+        return self._inner.joint_range(margin, min_singular_value)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the disturbances of an episode, and return them by name."""

@@ -50,6 +50,7 @@ from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.motion_constraints import StateConstraints
 from guiderail.models.control.wrench_bound import WrenchBound
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -203,6 +204,18 @@ class Station(Diagram):
         Raises:
             InputError: If `pose` has another shape or is not finite.
         """
+
+    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
+        """Return constraints that keep the robot's joints within their limits and away from singular postures.
+
+        Args:
+            margin: Distance from the limits [rad].
+            min_singular_value: Smallest singular value of the scaled Jacobian [m]; 0 for no constraint.
+
+        Raises:
+            InputError: If the station has no arm.
+        """
+        raise InputError("joint_margin needs the joints of an arm: choose station=arm, or leave it out")
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
         """Multiply friction and modulus of all contacts until the next reset; `context` is the root context.

@@ -6,7 +6,7 @@ LEVER = 0.25  # distance from the tool center that converts rotational to transl
 # Smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more.
 REGULAR = 0.03
 STILL = 1e-3  # desired tool speed up to which any motion is accepted [m/s]
-_SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])
+TOOL_SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])
 
 
 def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -25,16 +25,16 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
     Returns:
         The joint velocities (n,), and True if J is regular: then nothing is damped and J v = V.
     """
-    U, sigma, WT = np.linalg.svd(_SCALE[:, None] * J, full_matrices=False)
+    U, sigma, WT = np.linalg.svd(TOOL_SCALE[:, None] * J, full_matrices=False)
     inverse = sigma / np.maximum(sigma, REGULAR) ** 2
     preferred_modes = WT @ preferred
-    v = preferred + WT.T @ (inverse * (U.T @ (_SCALE * V)) - inverse * sigma * preferred_modes)
+    v = preferred + WT.T @ (inverse * (U.T @ (TOOL_SCALE * V)) - inverse * sigma * preferred_modes)
     return v, bool(sigma[-1] >= REGULAR)
 
 
 def is_following(J: np.ndarray, v: np.ndarray, V: np.ndarray) -> bool:
     """Return True if joint velocities v (n,) move the tool along V (6,): not elsewhere, and not a hundredth as fast."""
-    actual, desired = _SCALE * (J @ v), _SCALE * V
+    actual, desired = TOOL_SCALE * (J @ v), TOOL_SCALE * V
     squared = float(desired @ desired)
     if squared < STILL**2:
         return True

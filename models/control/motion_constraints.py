@@ -165,11 +165,13 @@ class MotionConstraintFilter:
         def is_safe(command: np.ndarray) -> bool:
             """Return True if the constraints hold from the last command to where a motion that brakes now ends."""
             displacement = command - last
-            end = command + self._braking(displacement)[1] * displacement
+            rest_share = self._braking(displacement)[1]
+            end = command + rest_share * displacement
+            each_state = (command, end) if rest_share else (command,)
             return (
                 bool((G @ end >= kept).all())
                 and all(shape.distance(end[: shape.num_dims]) <= bound for shape, bound in inside)
-                and all(one.violation(each) <= bound for one, bound in further for each in (command, end))
+                and all(one.violation(each) <= bound for one, bound in further for each in each_state)
             )
 
         if is_safe(nearest):

@@ -31,6 +31,7 @@ from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
 from guiderail.models.control.wrench_bound import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives.progress import StateProgress
 from guiderail.models.templates import load_template
 
 FOLDER = Path(guiderail.systems.__file__).parent
@@ -98,6 +99,7 @@ def built():
         MujocoStation(BncWorkcell()).gantry,
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.PoseWrench(),
+        systems.ProgressClock(StateProgress((1.0, 1.0), 3), 2, PERIOD),
         systems.Recorder({"u": 2}, 4, PERIOD),
         systems.ReferenceGovernor(np.ones(6), np.ones(6), 1.0, PERIOD, WrenchBound(np.ones(6), 1.0, 1.0)),
         systems.RelativePoses(plant, [body], other),

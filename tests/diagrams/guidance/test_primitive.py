@@ -18,6 +18,7 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority
+from guiderail.models.primitives.progress import StateProgress
 
 PERIOD, STEPS = 0.02, 60
 PRIMITIVE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl", "residual_covariance")
@@ -268,3 +269,31 @@ def test_history_continues_from_commands_behind_the_constraints_of_the_motion(sk
     np.testing.assert_allclose(commands, np.zeros((6, 2)), atol=1e-9)
     free, _ = rollout(build("skgrl", skill), constant([0.0, 0.0])[:6])
     assert np.abs(free).max() > 1e-4
+
+
+@pytest.mark.parametrize("kind", ["kmp", "kgrl", "skgrl"])
+def test_motion_waits_for_a_robot_that_does_not_follow(skill, kind):
+    actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, 2))
+    waiting = replace(skill, progress=StateProgress((0.02, 0.1), 20))
+    clock, _ = rollout(build(kind, skill), actions)
+    following, _ = rollout(build(kind, waiting), actions)
+    np.testing.assert_array_equal(following, clock)  # the robot is where it is commanded
+    held, _ = rollout(build(kind, waiting), constant([0.0, 0.0]), track=False)
+    free, _ = rollout(build(kind, skill), constant([0.0, 0.0]), track=False)
+    first = int(np.argmax(np.linalg.norm(held - START, axis=1) > 0.02))
+    assert 0 < first < 20
+    if kind != "skgrl":  # whose history is the motion itself
+        np.testing.assert_array_equal(held[first : first + 20], np.tile(held[first], (20, 1)))
+        np.testing.assert_array_equal(held[first + 20 :], free[first:-20])
+    assert np.linalg.norm(held[first + 19]) < 0.5 * np.linalg.norm(free[first + 19])
+
+
+def test_residual_guidance_refuses_a_motion_that_waits(skill):
+    with pytest.raises(InputError, match="clock"):
+        build("residual", replace(skill, progress=StateProgress((0.02, 0.1), 20)))
+
+
+def test_motion_that_waits_refuses_constraints_of_each_step(skill):
+    moving = LinearConstraints.box(np.full((STEPS, 2), -1.0), np.full((STEPS, 2), 1.0))
+    with pytest.raises(InputError, match="progress=clock"):
+        replace(skill, constraints=moving, progress=StateProgress((0.02, 0.1), 20))

@@ -408,3 +408,19 @@ def test_commands_stay_outside_of_an_obstacle_that_constrains(guidance):
 def test_constraints_of_the_motion_refuse_wrong_options(options, match):
     with pytest.raises(InputError, match=match):
         make(**options)
+
+
+def test_observed_phase_is_that_of_the_motion_when_it_waits_for_the_robot():
+    env = make("kgrl", progress="state", progress_tolerance=(1e-9, 0.1), max_lag=0.5, action_repeat=5)
+    clock, times = make("kgrl", action_repeat=5), []
+    assert env.task.num_steps == clock.task.num_steps + round(0.5 / env.task.control_period)
+    duration = clock.task.num_steps * env.task.control_period
+    env.reset(seed=0)
+    for _ in range(12):
+        observation, *_ = env.step(np.zeros(2))
+        times.append(env.task.diagram.GetOutputPort("motion_time").Eval(env.simulator.get_context())[0])
+        assert observation[0] == pytest.approx(2.0 * times[-1] / duration - 1.0, abs=1e-6)
+    late = 60 * env.task.control_period - np.array(times[-1])
+    assert 0.3 < late <= 0.5 + 2 * env.task.control_period  # the robot is hardly ever within a nanometer
+    with pytest.raises(InputError, match="progress_tolerance"):
+        make("kgrl", progress="state", progress_tolerance=(0.0, 0.1))

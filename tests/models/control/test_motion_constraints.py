@@ -21,7 +21,7 @@ LIMITS = {
 
 
 def test_no_command_and_no_way_enters_a_spherical_obstacle():
-    results = attack(3000, seed=5)
+    results = attack(2400, seed=5)
     for kind in KINDS:
         assert not is_violated(kind, results[kind]), (kind, results[kind])
     assert sum(result.touching for result in results.values()) > 50  # or the adversary would show nothing

@@ -1,0 +1,132 @@
+"""Joint limits of an arm, and distance from singular postures, as constraints on the commanded pose."""
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, JacobianWrtVariable
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.damped_inverse import TOOL_SCALE
+
+_ITERATIONS = 60
+_TOLERANCE = 1e-9  # of a pose, in the units of a scaled twist [m]
+_MAX_CHANGE = 0.5  # of a joint in one iteration [rad]
+_DIFFERENCE = 1e-6  # of a joint, for the derivative of a singular value [rad]
+
+
+class JointRange:
+    """Joint positions that a commanded pose takes, and constraints on them.
+
+    The joint positions of a pose are those nearest to the posture: where the null-space control of an arm at rest is.
+    Near a command y they change by q(z) ≈ q(y) + J⁺ (z − y), so that limits of the joints are linear constraints on the
+    next command. Their second-order error is not bounded in advance: `violation` computes the joint positions of the
+    command itself, and a command with a violation is not executed (`MotionConstraintFilter`).
+
+    Args:
+        plant: Finalized plant with the arm only.
+        reference: Frame of poses.
+        tool_center: Frame that is at the pose.
+        posture: Joint positions (n,) [rad] within the limits.
+        margin: Distance from the limits, not negative: what an arm under impedance control deviates [rad].
+        min_singular_value: Smallest singular value of the Jacobian whose rotations are scaled by `LEVER` [m]; 0 for no
+            constraint.
+
+    Raises:
+        InputError: If the posture is not within the limits and the margin, or an argument is negative.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        reference: Frame,
+        tool_center: Frame,
+        posture: np.ndarray,
+        margin: float = 0.0,
+        min_singular_value: float = 0.0,
+    ):
+        if not (0.0 <= margin < np.inf and 0.0 <= min_singular_value < np.inf):
+            raise InputError(f"a margin and a singular value are not negative, not {margin} and {min_singular_value}")
+        self._plant, self._reference, self._tool_center = plant, reference, tool_center
+        self._context = plant.CreateDefaultContext()
+        self._posture, self._smallest = np.array(posture, dtype=float), float(min_singular_value)
+        self._lower = plant.GetPositionLowerLimits() + margin
+        self._upper = plant.GetPositionUpperLimits() - margin
+        if not ((self._lower < self._posture) & (self._posture < self._upper)).all():
+            raise InputError(f"the posture is not within the joint limits and a margin of {margin} rad")
+
+    def solve(self, pose: np.ndarray) -> np.ndarray | None:
+        """Return the joint positions (n,) of a pose (6,), nearest to the posture; None if they are not found."""
+        X = RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
+        q = self._posture.copy()
+        for _ in range(_ITERATIONS):
+            error, J = self._error_and_jacobian(q, X)
+            U, sigma, WT = np.linalg.svd(J, full_matrices=False)
+            rest = self._posture - q
+            change = WT.T @ ((U.T @ error) * sigma / (sigma**2 + 1e-8) - WT @ rest) + rest
+            change *= min(1.0, _MAX_CHANGE / max(float(np.abs(change).max()), 1e-12))
+            q = q + change
+            if np.linalg.norm(error) < _TOLERANCE and np.abs(change).max() < 1e-7:
+                return q
+        return None
+
+    def linearize(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows G (F, 6) of unit norm and c (F,) of G y ≥ c near a pose (6,); none if it cannot be reached."""
+        q = self.solve(output)
+        if q is None:
+            return np.zeros((0, POSE_SIZE)), np.zeros(0)
+        _, J = self._error_and_jacobian(q, None)
+        inverse = np.linalg.pinv(J) @ (TOOL_SCALE[:, None] * _twist_of_change(output))
+        rows, bounds = [inverse, -inverse], [self._lower - q, q - self._upper]
+        if self._smallest:
+            value, gradient = self._singular_value(q)
+            rows.append((gradient @ inverse)[None])
+            bounds.append(np.array([self._smallest - value]))
+        G, c = np.concatenate(rows), np.concatenate(bounds)
+        norms = np.linalg.norm(G, axis=1)
+        used = norms > 1e-9  # a joint that does not move has no constraint
+        G = G[used] / norms[used, None]
+        return G, G @ output + c[used] / norms[used]
+
+    def violation(self, output: np.ndarray) -> float:
+        """Return the violation of a pose (6,) [rad], negative inside; infinite if it cannot be reached."""
+        q = self.solve(output)
+        if q is None:
+            return np.inf
+        violation = float(np.maximum(self._lower - q, q - self._upper).max())
+        return max(violation, self._smallest - self._singular_value(q)[0]) if self._smallest else violation
+
+    def _error_and_jacobian(self, q: np.ndarray, X: RigidTransform | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the scaled twist (6,) from the pose at `q` to X, rotation first, and the scaled Jacobian (6, n)."""
+        plant, context = self._plant, self._context
+        plant.SetPositions(context, q)
+        J = plant.CalcJacobianSpatialVelocity(
+            context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._reference, self._reference
+        )
+        error = np.zeros(POSE_SIZE)
+        if X is not None:
+            X_now = self._tool_center.CalcPose(context, self._reference)
+            turn = (X.rotation() @ X_now.rotation().inverse()).ToAngleAxis()
+            error = np.concatenate([turn.axis() * turn.angle(), X.translation() - X_now.translation()])
+        return TOOL_SCALE * error, TOOL_SCALE[:, None] * J
+
+    def _singular_value(self, q: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the smallest singular value of the scaled Jacobian, and its gradient (n,)."""
+        _, J = self._error_and_jacobian(q, None)
+        U, sigma, WT = np.linalg.svd(J, full_matrices=False)
+        gradient = np.zeros(len(q))
+        for joint in range(len(q)):
+            _, moved = self._error_and_jacobian(q + _DIFFERENCE * np.eye(len(q))[joint], None)
+            gradient[joint] = U[:, -1] @ ((moved - J) / _DIFFERENCE) @ WT[-1]
+        return float(sigma[-1]), gradient
+
+
+def _twist_of_change(pose: np.ndarray) -> np.ndarray:
+    """Return the matrix (6, 6) from a change of [x y z Rz Ry Rx] to the twist, rotation first."""
+    a, b = pose[3], pose[4]
+    matrix = np.zeros((6, 6))
+    matrix[3:, :3] = np.eye(3)
+    matrix[:3, 3] = [0.0, 0.0, 1.0]
+    matrix[:3, 4] = [-np.sin(a), np.cos(a), 0.0]
+    matrix[:3, 5] = [np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), -np.sin(b)]
+    return matrix

@@ -1,0 +1,57 @@
+"""Progress of a movement primitive by how the robot follows its commands."""
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from guiderail.models.primitives.progress import StateProgress
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+
+
+class ProgressClock(LeafSystem):
+    """Count the steps of a movement primitive, and wait while the robot does not follow (`StateProgress`).
+
+    .. pydrake_system::
+
+        name: ProgressClock
+        input_ports:
+        - command
+        - pose
+        output_ports:
+        - motion_time
+
+    ``command`` and ``pose`` (measured) are (O,). ``motion_time`` (1,) is the time of the motion [s], a whole multiple
+    of the period; it is state, and zero at initialization.
+
+    Args:
+        rule: Rule of the progress.
+        num_outputs: Number O of outputs.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If the period is not positive.
+    """
+
+    def __init__(self, rule: StateProgress, num_outputs: int, period: float):
+        super().__init__()
+        check_period(period)
+        self._rule, self._period = rule, period
+        self._command_port = self.DeclareVectorInputPort("command", num_outputs)
+        self._pose_port = self.DeclareVectorInputPort("pose", num_outputs)
+        self._time = self.DeclareDiscreteState(1)
+        self._motion_time_port = self.DeclareStateOutputPort("motion_time", self._time)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_command_input_port = input_getter("command", "last command, (O,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,)")
+    get_motion_time_output_port = output_getter("motion_time", "time of the motion, (1,) [s]")
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(np.zeros(1))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        clock = round(context.get_time() / self._period)
+        if clock > 0:  # no command has been executed at time zero
+            step = round(context.get_discrete_state(self._time).value()[0] / self._period)
+            command, pose = self._command_port.Eval(context), self._pose_port.Eval(context)
+            discrete_state.set_value([self._period * self._rule.next_step(step, clock, command, pose)])

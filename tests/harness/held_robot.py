@@ -1,0 +1,79 @@
+"""Robot that is held for two seconds: `python tests/harness/held_robot.py [--episodes N] [--held-from T]`.
+
+The hard connector on the gantry, guided by KGRL with the scripted policy. From a given instant on an external hold
+locks all joints of the plant for two seconds; then the robot is free again. The motion is driven by the clock or by the
+robot's state; the episodes of both have the same length and the same conditions.
+"""
+
+import argparse
+from collections import Counter
+
+import numpy as np
+
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.task_diagram import round_period
+from guiderail.diagrams.tasks.bnc_connector.task import scripted_center_of_pressure
+
+PROGRESS = {
+    # The clock in episodes as long as the others: a tolerance that no robot exceeds.
+    "clock": {"progress": "state", "progress_tolerance": (1e3, 1e3)},
+    "state": {"progress": "state"},
+}
+
+
+def set_held(env: object, is_held: bool) -> None:
+    """Lock or free all joints of the gantry."""
+    diagram = env.task.diagram
+    plant = diagram.GetSubsystemByName("station").plant
+    context = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
+    plant.SetVelocities(context, np.zeros(plant.num_velocities()))
+    for index in plant.GetJointIndices(plant.GetModelInstanceByName("gantry")):
+        joint = plant.get_joint(index)
+        if joint.num_velocities():
+            joint.Lock(context) if is_held else joint.Unlock(context)
+
+
+def run_episode(env: object, seed: int, begin: float | None, seconds: float) -> dict:
+    """Run an episode with a hold; return the last `info` with the time by which the motion was late."""
+    period = env.task.control_period
+    first = None if begin is None else round(begin / period)
+    last = None if begin is None else round((begin + seconds) / period)
+    observation, info = env.reset(seed=seed, options={"held_out": True})
+    finished = False
+    while not finished:
+        step = info["control_steps"]
+        if step in (first, last):
+            set_held(env, step == first)
+        observation, _, terminated, truncated, info = env.step(scripted_center_of_pressure(observation))
+        finished = terminated or truncated
+    port = env.task.diagram.GetOutputPort("motion_time")
+    late = round_period(period) * info["control_steps"] - float(port.Eval(env.simulator.get_context())[0])
+    return {**info, "late": late}
+
+
+def run_episodes(progress: str, begin: float | None, episodes: int, seconds: float = 2.0) -> list[dict]:
+    """Return the last infos of episodes with one kind of progress, held from an instant [s] or not at all."""
+    env = make_env("BncConnector", guidance="kgrl", difficulty="hard", **PROGRESS[progress])
+    infos = [run_episode(env, 1000 + k, begin, seconds) for k in range(episodes)]
+    env.close()
+    return infos
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--held-from", type=float, nargs="*", default=[2.0, 4.0], help="[s]; none: never held")
+    parser.add_argument("--progress", choices=PROGRESS, nargs="+", default=list(PROGRESS))
+    options = parser.parse_args()
+    print("progress | held from [s] | success | terminations | late at the end [s] | peak force [N]")
+    for begin in options.held_from or [None]:
+        for progress in options.progress:
+            infos = run_episodes(progress, begin, options.episodes)
+            reasons = dict(Counter(info["termination"] for info in infos))
+            late, force = np.mean([info["late"] for info in infos]), max(info["contact_force"] for info in infos)
+            success = f"{reasons.get('success', 0)}/{len(infos)}"
+            print(f"{progress} | {begin} | {success} | {reasons} | {late:.2f} | {force:.1f}")
+
+
+if __name__ == "__main__":
+    main()

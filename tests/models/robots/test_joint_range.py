@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.diagrams.stations.arm import ArmControllerPlant
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
+from guiderail.models.primitives import LinearConstraints
+from guiderail.models.robots.joint_range import JointRange
+from guiderail.systems.support.drake_poses import pose_to_transform
+
+POSE = np.array([0.02, 0.03, 0.1, 0.7, 0.1, -0.2])
+MARGIN, SMALLEST = 0.1, 0.05
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ArmControllerPlant(BncWorkcell())
+
+
+def joint_range(model, **arguments):
+    return JointRange(model.plant, model.target, model.tool_center, model.posture, **arguments)
+
+
+def test_solution_has_the_pose_and_is_nearest_to_the_posture(model):
+    joints = joint_range(model)
+    q = joints.solve(POSE)
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    X = model.tool_center.CalcPose(context, model.target)
+    np.testing.assert_allclose(X.GetAsMatrix4(), pose_to_transform(POSE).GetAsMatrix4(), atol=1e-8)
+    np.testing.assert_allclose(q, model.solve(POSE, model.posture), atol=1e-3)  # by another solver
+    assert joints.solve(POSE + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]) is None
+    assert joints.violation(POSE + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]) == np.inf
+
+
+def test_rows_are_the_limits_up_to_the_second_order(model):
+    joints = joint_range(model, margin=MARGIN)
+    G, c = joints.linearize(POSE)
+    lower = model.plant.GetPositionLowerLimits() + MARGIN - joints.solve(POSE)
+    assert len(G) == 14
+    errors = []
+    for size in (1e-2, 1e-3):
+        change = size * np.array([1.0, -0.5, 0.5, 1.0, -1.0, 1.0])
+        moved = joints.solve(POSE + change) - joints.solve(POSE)
+        scale = lower / (c - G @ POSE)[:7]  # of a row, in radians
+        predicted = scale * (G @ change)[:7]
+        errors.append(np.linalg.norm(joint_space_part(model, joints.solve(POSE), moved - predicted)))
+        np.testing.assert_allclose((G @ change)[7:], -(G @ change)[:7], atol=1e-12)
+    assert errors[0] < 5e-3
+    assert errors[1] < 0.02 * errors[0]
+
+
+def joint_space_part(model, q, change):
+    """Part of a change of the joints that moves the tool: the null space follows the posture."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    J = model.plant.CalcJacobianSpatialVelocity(
+        context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), model.target, model.target
+    )
+    return np.linalg.pinv(J) @ J @ change
+
+
+def test_gradient_of_the_singular_value_is_that_of_a_difference(model):
+    joints = joint_range(model, min_singular_value=SMALLEST)
+    q = joints.solve(POSE)
+    value, gradient = joints._singular_value(q)
+    step = 1e-5 * np.array([1.0, -2.0, 1.0, 0.5, -1.0, 1.0, 2.0])
+    assert joints._singular_value(q + step)[0] - value == pytest.approx(gradient @ step, rel=1e-2)
+    assert len(joints.linearize(POSE)[0]) == 15
+    assert joints.violation(POSE) == max(joint_range(model).violation(POSE), SMALLEST - value)
+
+
+@pytest.mark.parametrize("direction", [[0.6, 0.0, 0.0, 0.0, 0.0, 0.0], [-0.45, 0.0, -0.3, 0.0, 0.0, 0.0]])
+def test_no_command_takes_a_joint_beyond_its_limits(model, direction):
+    joints = joint_range(model, margin=MARGIN, min_singular_value=SMALLEST)
+    motion = MotionConstraints(LinearConstraints.none(6), max_speed=[2.0, 2.0, 2.0, 6.0, 6.0, 6.0], state=[joints])
+    law, desired = MotionConstraintFilter(motion, 0.02), POSE + np.array(direction)
+    assert joints.violation(desired) > 0.0
+    state, violations = law.start(POSE), []
+    for _ in range(15):
+        state, _ = law.apply(state, desired)
+        violations.append(joints.violation(state[:6]))
+    assert max(violations) <= 0.0
+    assert max(violations) > -0.02  # a limit was reached
+    free = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(6), max_speed=motion.max_speed), 0.02)
+    state = free.start(POSE)
+    for _ in range(15):
+        state, _ = free.apply(state, desired)
+    assert joints.violation(state[:6]) > 0.0
+
+
+def test_range_raises_when_an_argument_is_out_of_range(model):
+    for arguments in ({"margin": -0.1}, {"min_singular_value": np.nan}, {"margin": 3.0}):
+        with pytest.raises(InputError):
+            joint_range(model, **arguments)
+
+
+def test_option_needs_an_arm():
+    with pytest.raises(InputError, match="station=arm"):
+        make_prior_knowledge("BncConnector", guidance="kgrl", joint_margin=0.1)
+    config = make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", joint_margin=0.1).demonstrations
+    assert config.motion.violation(config.reference.means[0]) < 0.0

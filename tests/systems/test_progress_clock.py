@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.progress import StateProgress
+from guiderail.systems.progress_clock import ProgressClock
+
+PERIOD = 0.125
+RULE = StateProgress((0.01, 0.1), 4)
+
+
+def steps(rule, poses, command=(0.0, 0.0)):
+    step, found = 0, []
+    for k, pose in enumerate(poses):
+        step = rule.next_step(step, k + 1, np.array(command), np.array(pose))
+        found.append(step)
+    return found
+
+
+def test_progress_is_the_clock_while_the_robot_is_near():
+    assert steps(RULE, [[0.0099, 0.0]] * 5) == [1, 2, 3, 4, 5]
+    assert steps(StateProgress((0.01, 0.1), 0), [[1.0, 0.0]] * 5) == [1, 2, 3, 4, 5]
+
+
+def test_progress_waits_while_the_robot_is_not_near_and_until_the_largest_lag():
+    away, near = [0.0101, 0.0], [0.0, 0.0]
+    assert steps(RULE, [near, away, away, near, away]) == [1, 1, 1, 2, 2]
+    assert steps(RULE, [away] * 8) == [0, 0, 0, 0, 1, 2, 3, 4]  # four steps behind the clock from then on
+    assert steps(RULE, [[np.nan, 0.0]] * 3) == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("angle", "waits"), [(0.099, False), (0.101, True)])
+def test_angles_of_a_pose_have_a_tolerance_of_their_own(angle, waits):
+    command, pose = np.zeros(6), np.array([0.0, 0.009, 0.0, 2.0 * np.pi, angle, 0.0])
+    assert (RULE.next_step(3, 4, command, pose) == 3) == waits
+    assert RULE.next_step(3, 4, command, np.array([0.0, 0.0101, 0.0, 0.0, 0.0, 0.0])) == 3
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "max_lag", "match"),
+    [((0.0, 0.1), 3, "tolerance"), ((0.1, np.nan), 3, "tolerance"), ((0.1,), 3, "tolerance"), ((1.0, 1.0), -1, "lag")],
+)
+def test_rule_raises_when_an_argument_is_out_of_range(tolerance, max_lag, match):
+    with pytest.raises(InputError, match=match):
+        StateProgress(tolerance, max_lag)
+
+
+def test_motion_time_is_state_and_begins_at_zero():
+    system = ProgressClock(RULE, 2, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_command_input_port().FixValue(context, [0.0, 0.0])
+    pose = system.get_pose_input_port().FixValue(context, [0.0, 0.0])
+    times = []
+    for _ in range(2):
+        context.SetTime(0.0)
+        pose.GetMutableData().set_value([0.0, 0.0])
+        simulator.Initialize()
+        for k in range(8):
+            simulator.AdvanceTo((k + 0.5) * PERIOD)
+            times.append(system.get_motion_time_output_port().Eval(context)[0] / PERIOD)
+            pose.GetMutableData().set_value([0.02, 0.0] if 1 < k < 5 else [0.0, 0.0])
+    assert times == [0, 1, 2, 2, 2, 2, 3, 4] * 2
+
+
+def test_system_raises_when_the_period_is_not_positive():
+    with pytest.raises(InputError):
+        ProgressClock(RULE, 2, 0.0)
