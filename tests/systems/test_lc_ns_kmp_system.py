@@ -26,12 +26,12 @@ def names(system, kind):
 
 def test_ports():
     system = LcNsKmpSystem(primitive(), None, PERIOD)
-    assert names(system, "input") == ["null_space_action", "history"]
+    assert names(system, "input") == ["null_space_action", "history", "motion_time"]
     assert names(system, "output") == ["command", "constraint_violation", "fallback"]
     assert system.get_history_input_port().size() == 6
     assert system.get_command_output_port().size() == 2
     without = LcNsKmpSystem(primitive(history=0), None, PERIOD)
-    assert names(without, "input") == ["null_space_action"]
+    assert names(without, "input") == ["null_space_action", "motion_time"]
     with pytest.raises(InputError, match="history"):
         without.get_history_input_port()
 
@@ -228,7 +228,7 @@ def test_history_length_selects_the_primitive():
     longest, short = primitive(history=3), primitive(history=1)
     gains = {3: np.array([3.0, 5.0]), 1: np.array([7.0, -2.0])}
     system = LcNsKmpSystem(longest, gains[3], PERIOD, shorter=[(short, gains[1])])
-    assert names(system, "input") == ["null_space_action", "history", "history_length"]
+    assert names(system, "input") == ["null_space_action", "history", "history_length", "motion_time"]
     assert system.get_history_length_input_port().size() == 1
     past, action = longest.reference.means[2:5], np.array([0.5, -1.0])
     context = system.CreateDefaultContext()
@@ -275,3 +275,17 @@ def test_violation_is_finite_without_constraints():
 def test_constructor_refuses_arguments_out_of_range(gain, period, words):
     with pytest.raises(InputError, match=words):
         LcNsKmpSystem(primitive(), gain, period)
+
+
+def test_connected_motion_time_determines_the_step():
+    p, action = primitive(history=0), np.array([0.5, -1.0])
+    system = LcNsKmpSystem(p, None, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_null_space_action_input_port().FixValue(context, action)
+    time = system.get_motion_time_input_port().FixValue(context, [4 * PERIOD])
+    simulator.AdvanceTo(7.5 * PERIOD)
+    for step in (4, 5, 2):
+        time.GetMutableData().set_value([step * PERIOD])
+        command = system.get_command_output_port().Eval(context)
+        np.testing.assert_array_equal(command, p.predict(step, action).output)
