@@ -15,6 +15,6 @@ def test_rate_is_extrapolated_from_the_serial_part(monkeypatch, capsys):
     assert "extrapolated" in capsys.readouterr().out
 
 
-def test_vector_environment_is_timed():
+def test_vector_environment_is_timed(forkserver):
     row = many_envs._measured(1, steps=2)
     assert 0.0 < row["own_seconds"] < row["seconds"]

@@ -140,11 +140,11 @@ def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
 
 def test_supervised_run_resumes_with_its_corrections(tmp_path):
     pushes = {0: (10, 19, [0.5, 3.0]), 2: (4, 8, [-1.0, 0.0])}
-    whole = run_training(RunFolder(tmp_path / "whole"), passage(4), supervisor=Scripted(pushes))
+    whole = run_training(RunFolder(tmp_path / "whole"), passage(3), supervisor=Scripted(pushes))
     run_training(RunFolder(tmp_path / "parts"), passage(2), supervisor=Scripted(pushes))
     later = Scripted({episode - 2: push for episode, push in pushes.items()})
     folder = RunFolder(tmp_path / "parts")
-    again = run_training(folder, passage(4), resume=True, supervisor=later)
+    again = run_training(folder, passage(3), resume=True, supervisor=later)
     for one, other in zip(whole, again, strict=True):
         assert one | {"wall_time": 0} == other | {"wall_time": 0}
     assert folder.config().environment == RunFolder(tmp_path / "whole").config().environment
