@@ -102,11 +102,11 @@ def _motion_constraints(task: Task, constraints: LinearConstraints, station: Sta
     """Return a task's constraints of the motion with the limits among its options; None if there are none."""
     motion, outputs = task.motion_constraints(), constraints.num_outputs
     limits: dict[str, Any] = {}
-    margin, smallest = (task.config.part("primitive")[name] for name in _JOINTS)
-    if margin is not None:
-        limits["state"] = [station.joint_range(margin, smallest)]
+    options = task.config.part("primitive")
+    if options.get("joint_margin") is not None:
+        limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
     for name in _LIMITS:
-        given = task.config.part("primitive").get(name, ())
+        given = options.get(name, ())
         if not given:
             continue
         if len(given) < min(outputs, 3):

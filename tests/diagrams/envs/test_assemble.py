@@ -25,6 +25,7 @@ def known(turn, station, period=PERIOD):
         provides=lambda: {"demonstrations"},
         reference=lambda: reference,
         constraints=lambda: None,
+        motion_constraints=lambda: None,
         isotropic_groups=None,
         config=SimpleNamespace(part=lambda name: {}),
     )
