@@ -4,6 +4,7 @@ from .cartesian_impedance_controller import ImpedanceGains as ImpedanceGains
 from .cartesian_position_controller import CartesianPositionController as CartesianPositionController
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .center_of_pressure import CenterOfPressure as CenterOfPressure
+from .chunk_reference import ChunkReference as ChunkReference
 from .command_disturbance import CommandDisturbance as CommandDisturbance
 from .command_filter import CommandFilter as CommandFilter
 from .command_watchdog import CommandWatchdog as CommandWatchdog

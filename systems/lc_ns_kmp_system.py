@@ -32,6 +32,7 @@ class LcNsKmpSystem(LeafSystem):
         - history (if P > 0)
         - history_length (if there are primitives with shorter histories)
         - motion_time (optional)
+        - reference_window (optional)
         output_ports:
         - command
         - constraint_violation
@@ -40,10 +41,11 @@ class LcNsKmpSystem(LeafSystem):
     ``null_space_action`` is (O,), the policy's action in [−1, 1], constant during a control step. ``history`` is
     (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
     length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
-    starts at the end of the previous one. ``command`` is (O,). ``constraint_violation`` (1,) is max(c − G y) of the
-    command: negative if all constraints are slack, `UNCONSTRAINED` if there is none. ``fallback`` (1,) is 1 if no
-    window within the constraints was found; the command is then the point nearest to the last command within the
-    constraints of its step.
+    starts at the end of the previous one. ``reference_window`` is ((H+1)(O + O²),), means and covariances in place of
+    the reference's, the current step first (`ChunkReference`), if it is connected. ``command`` is (O,). ``constraint_violation`` (1,) is
+    max(c − G y) of the command: negative if all constraints are slack, `UNCONSTRAINED` if there is none. ``fallback``
+    (1,) is 1 if no window within the constraints was found; the command is then the point nearest to the last command
+    within the constraints of its step.
 
     The step is state and counts control periods since time zero, unless ``motion_time`` (1,) [s] is connected
     (`ProgressClock`), which then determines it. The command is a pure function of step, action and
@@ -95,6 +97,8 @@ class LcNsKmpSystem(LeafSystem):
         )
         self._history_length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
         self._motion_time_port = self.DeclareVectorInputPort("motion_time", 1)
+        window_size = (primitive.horizon + 1) * (outputs + outputs**2)
+        self._reference_window_port = self.DeclareVectorInputPort("reference_window", window_size)
         self._step = self.DeclareDiscreteState(1)
         self._initial_command = primitive.constraints.nearest(primitive.reference.means[0])
         self._last_command = self.DeclareDiscreteState(self._initial_command)
@@ -106,6 +110,7 @@ class LcNsKmpSystem(LeafSystem):
             self.discrete_state_ticket(self._step),
             self.discrete_state_ticket(self._last_command),
             self._motion_time_port.ticket(),
+            self._reference_window_port.ticket(),
         }
         prerequisites |= {port.ticket() for port in (self._history_port, self._history_length_port) if port is not None}
         self._prediction = declare_cache(self, "prediction", self._predict, prerequisites_of_calc=prerequisites)
@@ -153,6 +158,9 @@ class LcNsKmpSystem(LeafSystem):
         return self._history_length_port
 
     get_motion_time_input_port = input_getter("motion_time", "time of the motion, (1,) [s]; optional")
+    get_reference_window_input_port = input_getter(
+        "reference_window", "means and covariances of the window, ((H+1)(O + O²),); optional"
+    )
     get_command_output_port = output_getter("command", "command, (O,)")
     get_constraint_violation_output_port = output_getter("constraint_violation", "violation of the command, (1,)")
     get_fallback_output_port = output_getter("fallback", "flag that the command is a fallback, (1,)")
@@ -187,7 +195,15 @@ class LcNsKmpSystem(LeafSystem):
         if self._history_port is not None:
             history = self._history_port.Eval(context).reshape(-1, primitive.num_outputs)[-length:]
         try:
-            output, fallback = primitive.predict(step, action, history).output, 0.0
+            if not self._reference_window_port.HasValue(context):
+                prediction = primitive.predict(step, action, history)
+            else:
+                window = self._reference_window_port.Eval(context)
+                means, covariances = np.split(window, [(primitive.horizon + 1) * primitive.num_outputs])
+                means = means.reshape(-1, primitive.num_outputs)
+                covariances = covariances.reshape(*means.shape, primitive.num_outputs)
+                prediction = primitive.predict_window(step, means, covariances, action, history)
+            output, fallback = prediction.output, 0.0
         except UnsolvableError:
             # The constraints of this step may have changed: the last command alone might violate them.
             last_command = context.get_discrete_state(self._last_command).value()

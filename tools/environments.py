@@ -93,6 +93,10 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     if task in TASKS.names():
         from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
 
+        if isinstance(source := arguments.get("base_policy"), str) and source:
+            from guiderail.tools.evaluation.policies import add_base_policy
+
+            arguments = {**arguments, "base_policy": add_base_policy(source)}
         return EnvConfig.resolve(task, arguments).options
     options = task_options(task)
     for name, value in arguments.items():

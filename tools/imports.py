@@ -36,6 +36,11 @@ def trust_imports(trusted: bool = True) -> Iterator[None]:
         _TRUSTED.reset(token)
 
 
+def is_trusted() -> bool:
+    """Return True within a context of `trust_imports`."""
+    return _TRUSTED.get()
+
+
 def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
 

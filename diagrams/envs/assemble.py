@@ -207,6 +207,21 @@ class Loop:
             self.signals.add({"exact_wrench": station.get_wrench_output_port()})
         self.signals.add(task.signals(builder, station))
         self.space, self.observation = self._add_observation(task)
+        if guidance.HasInputPort("reference_window"):
+            self._add_reference(task)
+
+    def _add_reference(self, task: Task) -> None:
+        """Add the system that predicts the reference from the observation.
+
+        Raises:
+            InputError: If the observation is an image.
+        """
+        if self.observation.get_data_type() != PortDataType.kVectorValued:
+            raise InputError(f"a base policy of {task.name} takes no images: choose another observation")
+        guidance: Any = self.guidance
+        reference = self.builder.AddNamedSystem("reference", guidance.make_reference(self.observation.size()))
+        self.builder.Connect(self.observation, reference.GetInputPort("observation"))
+        self.builder.Connect(reference.GetOutputPort("reference_window"), guidance.GetInputPort("reference_window"))
 
     def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
         observed, station = task.observation_terms(), self.station

@@ -17,7 +17,8 @@ output                  size   meaning
 `fallback`              1      1 if a safe pose is commanded instead of the requested one
 ======================  =====  =====================================================================================
 
-Guidance may export more; a task's reward can name such a port, for example a template's `progress`.
+Guidance may export more; a task's reward can name such a port, for example a template's `progress`. Guidance around a
+base policy has the input `reference_window` too, and makes the system that it comes from (`Guidance.make_reference`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, System
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -53,6 +54,14 @@ class Guidance(Diagram):
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
         """Set the poses of objects in this episode, by name; guidance without objects does nothing."""
+
+    def make_reference(self, observation_size: int) -> System | None:
+        """Return a system from the observation (n,) to the input ``reference_window``, if the guidance has that input.
+
+        It has an input ``observation`` and an output ``reference_window``, and no direct feedthrough, because an
+        observation may contain the command.
+        """
+        return None
 
     get_action_input_port = input_getter("action", "policy's action in [−1, 1], (A,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")

@@ -99,10 +99,18 @@ class PrimitiveGuidance(Guidance):
         builder.BuildInto(self)
 
 
-def add_demonstration(builder: DiagramBuilder, config: PrimitiveConfig, action: OutputPort) -> LcNsKmpSystem:
-    """Add the primitive without actions, constraints or history, which commands the demonstrations' mean."""
+def add_demonstration(
+    builder: DiagramBuilder, config: PrimitiveConfig, action: OutputPort, *, takes_window: bool = False
+) -> LcNsKmpSystem:
+    """Add the primitive without actions, constraints or history, which commands the mean of the reference.
+
+    The reference is that of the demonstrations, or the input ``reference_window`` with `takes_window`.
+    """
     primitive = config.primitive(history=False, constrained=False)
-    kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
+    system = LcNsKmpSystem(primitive, None, config.control_period)
+    kmp = builder.AddNamedSystem("kmp", system)
+    if takes_window:
+        builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
     # Not a ConstantVectorSource: Drake assumes that it depends on time, so the primitive would be computed again at
     # every step of the plant.
     zero = builder.AddNamedSystem("no_action", MatrixGain(D=np.zeros((config.num_outputs, config.num_outputs))))
@@ -141,15 +149,24 @@ class KmpGuidance(PrimitiveGuidance):
 class KgrlGuidance(PrimitiveGuidance):
     """KGRL: actions deviate where the demonstrations did, and every command satisfies the constraints."""
 
-    def __init__(self, prior: PriorKnowledge, *, constrained: bool = True):
-        """Construct the guidance; without `constrained` it is that of `residual_covariance`."""
+    def __init__(self, prior: PriorKnowledge, *, constrained: bool = True, takes_window: bool = False):
+        """Construct the guidance.
+
+        Args:
+            prior: Prior knowledge.
+            constrained: Enforce the constraints; without, the guidance is that of `residual_covariance`.
+            takes_window: Take mean and covariance from the input ``reference_window`` in place of the demonstrations.
+        """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
         config = config if constrained else replace(config, motion=None)
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
         gains = config.null_space_gains(primitive)
-        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period))
+        system = LcNsKmpSystem(primitive, gains, config.control_period)
+        kmp = builder.AddNamedSystem("lc_ns_kmp", system)
+        if takes_window:
+            builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
         builder.Connect(action, kmp.get_null_space_action_input_port())
         self._finish(builder, config, *self._constrain(builder, config, kmp, pose))
 

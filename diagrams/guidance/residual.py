@@ -72,20 +72,27 @@ class ResidualDescent(Guidance):
 class ResidualGuidance(PrimitiveGuidance):
     """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t."""
 
-    def __init__(self, prior: PriorKnowledge, make_filter: Callable[[PrimitiveConfig, KeepOut], Any] | None = None):
+    def __init__(
+        self,
+        prior: PriorKnowledge,
+        make_filter: Callable[[PrimitiveConfig, KeepOut], Any] | None = None,
+        *,
+        takes_window: bool = False,
+    ):
         """Construct the guidance.
 
         Args:
             prior: Prior knowledge.
             make_filter: Function from the demonstrations and the walls to keep out of to a `SafetyFilter` or a
                 `CommandFilter` behind the sum, if there is one; ``fallback`` is then 1 if it changed the command.
+            takes_window: Take the motion from the input ``reference_window`` in place of the demonstrations.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
         if config.progress is not None:
             raise InputError("residual guidance is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
         action, pose = self._export_inputs(builder, config)
-        kmp = add_demonstration(builder, config, action)
+        kmp = add_demonstration(builder, config, action, takes_window=takes_window)
         residual = builder.AddNamedSystem("residual", Residual(config.residual_gains()))
         builder.Connect(kmp.get_command_output_port(), residual.get_reference_input_port())
         builder.Connect(action, residual.get_action_input_port())

@@ -226,19 +226,39 @@ class LcNsKmp:
         if self.constraints.num_steps is not None:
             raise InputError("constraints that differ from step to step need a clock: use predict")
         x = self._stack(null_space_action, history)
-        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
         inputs = np.asarray(inputs, dtype=float)
         past = inputs[:0] if history_inputs is None else np.asarray(history_inputs, dtype=float)
-        shape = (len(inputs), self.num_outputs)
-        if means.shape != shape or covariances.shape != (*shape, self.num_outputs):
-            raise InputError(f"means and covariances must have shapes {shape} and {(*shape, self.num_outputs)}")
+        window = Window.checked(means, covariances, *self.constraints.window(np.arange(len(inputs))))
         if len(past) != self.history or past.shape[1:] != inputs.shape[1:]:
             raise InputError(f"history_inputs must be {self.history} inputs like the others, not {past.shape}")
-        if not all(np.isfinite(a).all() for a in (inputs, past, means, covariances)):
+        if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
             raise InputError("inputs, means and covariances must be finite")
         features = window_features(self.kernel, past, inputs, self._history_noise)
-        G, c = self.constraints.window(np.arange(len(inputs)))
-        return self._finish(StepFactor(Window(means, covariances, G, c), features, self.lambda_, self.beta), x)
+        return self._finish(StepFactor(window, features, self.lambda_, self.beta), x)
+
+    def predict_window(
+        self,
+        step: int,
+        means: np.ndarray,
+        covariances: np.ndarray,
+        null_space_action: np.ndarray | None = None,
+        history: np.ndarray | None = None,
+    ) -> Prediction:
+        """Compute the output at a step with a window of another origin, such as a base policy; nothing is cached.
+
+        Args:
+            step: Step n ≥ 0.
+            means: Means (H+1, O), the executed point first.
+            covariances: Covariances (H+1, O, O), positive definite.
+            null_space_action: ξ̂ (O,), as in `predict`.
+            history: (P, O), as in `predict`.
+
+        Raises:
+            InputError: As `predict`, also for means and covariances. UnsolvableError: As `predict`.
+        """
+        window = Window.checked(means, covariances, *self.constraints.window(self._held(step, self.horizon)))
+        factor = StepFactor(window, self._features(step), self.lambda_, self.beta)
+        return self._finish(factor, self._stack(null_space_action, history))
 
     def _finish(self, factor: StepFactor, x: np.ndarray) -> Prediction:
         """Return the prediction of a factored window, corrected if a constraint is not slack."""
@@ -411,6 +431,7 @@ class LcNsKmp:
         factor = self._cache.get(step)
         if factor is None:
             factor = StepFactor(self._window(step, self.horizon), self._features(step), self.lambda_, self.beta)
+            factor.factor_corrections()
             self._cache[step] = factor
             self.cached_bytes += factor.nbytes
             while self.cached_bytes > self._cache_bytes and len(self._cache) > 1:
@@ -424,10 +445,13 @@ class LcNsKmp:
         return (self.lambda_ + self.beta) * self.history_variance
 
     def _window(self, step: int, horizon: int) -> Window:
-        steps = np.arange(step, step + horizon + 1)
-        held = np.minimum(steps, self.num_steps - 1)
+        held = self._held(step, horizon)
         G, c = self.constraints.window(held)
         return Window(self.reference.means[held], self.reference.covariances[held], G, c)
+
+    def _held(self, step: int, horizon: int) -> np.ndarray:
+        """Return the steps of a window (horizon+1,), at most the last one."""
+        return np.minimum(np.arange(step, step + horizon + 1), self.num_steps - 1)
 
     def _inputs(self, step: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the clock at the history (P,), and at the executed point and the horizon (horizon+1,)."""

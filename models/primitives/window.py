@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.features import WindowFeatures
 from guiderail.models.primitives.qp import Solver, UnsolvableError, solve_least_norm
@@ -29,6 +31,23 @@ class Window:
     covariances: np.ndarray
     G: np.ndarray
     c: np.ndarray
+
+    @classmethod
+    def checked(cls, means: ArrayLike, covariances: ArrayLike, G: np.ndarray, c: np.ndarray) -> "Window":
+        """Return the window of given means and covariances.
+
+        Raises:
+            InputError: If they are not finite, or of another shape than the constraints.
+        """
+        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
+        steps, _, outputs = G.shape
+        if means.shape != (steps, outputs) or covariances.shape != (steps, outputs, outputs):
+            raise InputError(
+                f"means and covariances must have shapes {(steps, outputs)} and {(steps, outputs, outputs)}"
+            )
+        if not (np.isfinite(means).all() and np.isfinite(covariances).all()):
+            raise InputError("means and covariances must be finite")
+        return cls(means, covariances, G, c)
 
 
 @dataclass(frozen=True)
@@ -107,6 +126,8 @@ class StepFactor:
             direct_map=np.einsum("jp,oi->jopi", W, eye).reshape(steps * outputs, past * outputs),
         )
 
+    _uncorrected: tuple[np.ndarray, np.ndarray] | None
+
     def _factor_constraints(self, solution: _Solution) -> None:
         window = self._window
         steps, outputs = window.means.shape
@@ -125,6 +146,13 @@ class StepFactor:
         self.lower, self.upper = ((bound.ravel() - offset) * self._scale for bound in (lower, upper))
         y_map = y_map.reshape(steps, outputs, -1)[at]
         self.constraint_map = np.ascontiguousarray(np.einsum("mo,mox,m->mx", D, y_map, self._scale))
+        self._uncorrected = A, solution.L[:outputs]
+
+    def factor_corrections(self) -> None:
+        """Factor the corrections of the window; `correct` does it at its first call."""
+        if self._uncorrected is None:
+            return
+        (A, L), self._uncorrected = self._uncorrected, None
         if len(A):
             U, s, Vt = np.linalg.svd(A, full_matrices=False)
             keep = s > _NEGLIGIBLE * s[0]
@@ -132,7 +160,7 @@ class StepFactor:
             self.constraint_rows = np.ascontiguousarray(U[:, keep] * s[keep])
         else:
             self._basis, self.constraint_rows = np.zeros((A.shape[1], 0)), A[:, :0]
-        self.correction_map = solution.L[:outputs] @ self._basis
+        self.correction_map = L @ self._basis
 
     def correct(self, free: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
         """Compute the least-norm correction of a window.
@@ -147,6 +175,7 @@ class StepFactor:
         Raises:
             UnsolvableError: If the solver finds no solution.
         """
+        self.factor_corrections()
         lower, upper = self.lower - free, self.upper - free
         try:
             return solve_least_norm(self.constraint_rows, lower, upper, solver)

@@ -92,6 +92,9 @@ def built():
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
+        systems.ChunkReference(
+            lambda seen: seen, 2, primitive(0).reference, horizon=1, replan_steps=1, covariance_floor=1.0, period=PERIOD
+        ),
         systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),

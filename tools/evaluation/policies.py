@@ -20,6 +20,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from guiderail.models.base_policy import BASE_POLICIES
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.extras import require_extra
 from guiderail.models.common.files import read_bytes
@@ -27,7 +28,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
-from guiderail.tools.imports import import_modules
+from guiderail.tools.imports import import_modules, is_trusted
 from guiderail.tools.pretrained import PRETRAINED
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
@@ -177,6 +178,22 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
         kind = "is a pickle, which can execute code when it is read" if path.suffix == ".zip" else "is a program"
         raise InputError(f"{path} {kind}: give --trust-policy if you trust its origin")
     return _load_sb3(path) if path.suffix == ".zip" else _load_torchscript(path)
+
+
+def add_base_policy(source: str) -> str:
+    """Register a base policy that is a file or `module:function`, and return the name of any base policy.
+
+    Raises:
+        InputError: If the source would execute code outside of `trust_imports`, or as `load_policy`.
+    """
+    if source in BASE_POLICIES.names() or not is_policy_file(source):
+        return source
+    name = source if _function_of(source) is not None else str(Path(source).resolve())
+    if name not in BASE_POLICIES.names():
+        if Path(source).suffix != ".onnx" and not is_trusted():
+            raise InputError(f"the base policy {source} can execute code: give --trust-imports if you trust its origin")
+        BASE_POLICIES.register(name, load_policy(source, trust_policy=True))
+    return name
 
 
 def _function_of(source: str) -> tuple[str, str] | None:

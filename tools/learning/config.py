@@ -161,12 +161,28 @@ class BcConfig(LearnerConfig):
             raise InputError("bc learns from demonstrations: give --set demonstration_episodes=... of at least 1")
 
 
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class ChunkConfig(BcConfig):
+    """Settings of chunk cloning, which trains a base policy."""
+
+    algorithm: str = "chunk"
+    demonstration_episodes: NonNegative = 30  # first episodes in which the demonstrator acts, at least 1
+    gradient_steps: Positive = 3000  # of each network, after the last demonstration
+    net_arch: NetArch = (64, 64)  # units of the hidden layers of each network
+    members: Annotated[Positive, Field(le=50)] = 5  # E, networks of the ensemble
+    chunk_steps: Annotated[Positive, Field(le=1000)] = 16  # K, control steps of a chunk
+    observation_noise: Annotated[float, Field(ge=0, le=10)] = (
+        0.1  # standard deviation added to observations in training
+    )
+
+
 register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
 register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
 register_learner("td3", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "Td3Learner", Td3Config))
 register_learner("crossq", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "CrossQLearner", CrossQConfig))
 register_learner("ppo", DeferredLearner("guiderail.tools.learning.on_policy", "PpoLearner", PpoConfig))
 register_learner("trpo", DeferredLearner("guiderail.tools.learning.on_policy", "TrpoLearner", TrpoConfig))
+register_learner("chunk", DeferredLearner("guiderail.tools.learning.chunking", "ChunkLearner", ChunkConfig))
 register_learner("bc", DeferredLearner("guiderail.tools.learning.cloning", "BcLearner", BcConfig))
 
 _TABLE_4_1 = OffPolicyConfig(

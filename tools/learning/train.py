@@ -69,10 +69,9 @@ class Run:
         rows = self.episodes
         statistics = summary(rows, SUMMARY)
         recent = min(len(rows), 10)
-        note = (
-            f"{statistics['success_rate_last_10']:.2f} of the last {recent}, with exploration; evaluate the "
-            f"deterministic policy with guiderail evaluate {self.path}"
-        )
+        rate = statistics["success_rate_last_10"]
+        note = "there are only demonstrations" if rate is None else f"{rate:.2f} of the last {recent}, with exploration"
+        note += f"; evaluate the deterministic policy with guiderail evaluate {self.path}"
         return {"run": str(self.path), **statistics, "success_in_training": note, **self.pictures}
 
 

@@ -11,9 +11,10 @@ from onnx_file import linear_policy
 from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
+from guiderail.models.base_policy import BASE_POLICIES, chunk_samples, find_base_policy
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import make_environment
+from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (
     PredictPolicy,
@@ -23,6 +24,7 @@ from guiderail.tools.evaluation.policies import (
     load_policy,
 )
 from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.imports import trust_imports
 from guiderail.tools.pretrained import find_run
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
@@ -86,6 +88,30 @@ def test_onnx_acts_as_its_network(batch, env, tmp_path):
     np.testing.assert_allclose(act(OBSERVATION), np.tanh(OBSERVATION @ weight + bias), rtol=1e-6)
     one, two = (evaluate(file, "Bead", 3, baselines=(), processes=processes) for processes in (1, 2))
     assert one == two
+
+
+@pytest.fixture
+def base_policies(monkeypatch):
+    monkeypatch.setattr(BASE_POLICIES, "_entries", {})
+    monkeypatch.setattr(BASE_POLICIES, "_origins", {})
+    return BASE_POLICIES
+
+
+def test_base_policy_of_a_file_needs_trust_if_it_executes(tmp_path, monkeypatch, base_policies):
+    (tmp_path / "policy.onnx").write_bytes(linear_policy(np.zeros((3, 4), np.float32), np.zeros(4, np.float32), 1))
+    torch.jit.trace(Script(), torch.zeros(1, 3)).save(tmp_path / "policy.pt")
+    (tmp_path / "base_of_mine.py").write_text("raise RuntimeError\n")
+    monkeypatch.chdir(tmp_path)
+    environment = {"guidance": "kgrl_base_policy", "base_policy": "policy.onnx"}
+    resolved = check_environment("NarrowPassage", environment)["base_policy"]
+    assert resolved == str(tmp_path / "policy.onnx")
+    assert chunk_samples(find_base_policy(resolved), np.zeros(3, np.float32), 2).shape == (1, 2, 2)
+    for source in ("policy.pt", "base_of_mine.py:chunk"):
+        with pytest.raises(InputError, match="give --trust-imports"):
+            check_environment("NarrowPassage", environment | {"base_policy": source})
+    with trust_imports():
+        check_environment("NarrowPassage", environment | {"base_policy": "policy.pt"})
+    assert str(tmp_path / "policy.pt") in base_policies.names()
 
 
 def test_function_of_a_file_is_a_policy(env, tmp_path):

@@ -1,0 +1,37 @@
+"""Base policy of the study `connector_hard_base_policy`: a search that works about half of the time."""
+
+import numpy as np
+
+from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTER, POSE_SCALE
+from guiderail.diagrams.tasks.bnc_connector.task import (
+    CENTER_OF_PRESSURE,
+    COMMAND,
+    HOLD_UNTIL,
+    MAY_PRESS,
+    ON_RIM,
+    TIME,
+    Z,
+    reference_trajectory,
+)
+from guiderail.models.base_policy import register_base_policy
+from guiderail.models.common.units import MM
+from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
+
+CHUNK_STEPS = 40  # K
+STEP = 0.35 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm
+
+
+@register_base_policy("connector_slow_search")
+def slow_search(observation: np.ndarray) -> np.ndarray:
+    """Return a chunk (K, 6): the demonstrations' mean, displaced towards the center of pressure in small steps."""
+    reference = reference_trajectory("search")
+    step = round(0.5 * (float(observation[TIME]) + 1.0) * reference.num_steps)
+    at = np.minimum(step + np.arange(CHUNK_STEPS), reference.num_steps - 1)
+    chunk = reference.means[at].copy()
+    searching = (reference.times[at] > MAY_PRESS) & (reference.times[at] < HOLD_UNTIL)
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+    length = float(np.linalg.norm(lever))
+    if observation[Z] * POSE_SCALE[2] + POSE_CENTER[2] > ON_RIM and length > 0.0:
+        command = command + STEP * lever / max(length, MM)
+    chunk[searching, :2] = command
+    return chunk

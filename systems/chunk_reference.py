@@ -1,0 +1,118 @@
+"""Chunks of a base policy as the reference window of a movement primitive."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from guiderail.models.base_policy import BasePolicy, chunk_samples, mean_and_variance
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import ReferenceTrajectory
+from guiderail.systems.policy_system import PolicyError
+from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+
+
+class ChunkReference(LeafSystem):
+    """Predict the reference window of the next H+1 control steps by a base policy.
+
+        mean = mean of the chunks;  covariance = diag(variance of the chunks) + covariance_floor · Σ_n
+
+    Every ``replan_steps`` control steps the policy predicts chunks from the observation just before that instant; in
+    between, the window advances along them. Σ_n are the covariances of a reference trajectory, whose window is the
+    output until the first prediction.
+
+    .. pydrake_system::
+
+        name: ChunkReference
+        input_ports:
+        - observation
+        output_ports:
+        - reference_window
+
+    ``observation`` is (n,). ``reference_window`` is ((H+1)(O + O²),): means (H+1, O) and covariances (H+1, O, O),
+    row-major, in the units of the outputs; the first point is the current control step. It is a function of state, so
+    an observation of the command is not an algebraic loop.
+
+    Args:
+        policy: Base policy (`models.base_policy`), a pure function.
+        observation_size: n, at least 1.
+        reference: Reference trajectory in control steps, for Σ_n and the first window.
+        horizon: H, not negative.
+        replan_steps: Control steps between two predictions, at least 1.
+        covariance_floor: Share of Σ_n that is added, positive.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        policy: BasePolicy,
+        observation_size: int,
+        reference: ReferenceTrajectory,
+        *,
+        horizon: int,
+        replan_steps: int,
+        covariance_floor: float,
+        period: float,
+    ):
+        super().__init__()
+        check_period(period)
+        if observation_size < 1 or horizon < 0 or replan_steps < 1:
+            raise InputError(
+                f"observation_size and replan_steps are at least 1 and horizon at least 0, not {observation_size}, "
+                f"{replan_steps} and {horizon}"
+            )
+        if not (np.isfinite(covariance_floor) and covariance_floor > 0):
+            raise InputError(f"covariance_floor must be positive, not {covariance_floor}")
+        self._policy, self._reference, self._horizon = policy, reference, horizon
+        self._replan_steps, self._floor = replan_steps, covariance_floor
+        self._num_points, outputs = horizon + replan_steps, reference.num_outputs
+        self._observation_port = self.DeclareVectorInputPort("observation", observation_size)
+        # [means and variances of the chunk (2, H + replan_steps, O); control steps since the start: −1 before it]
+        self._state = self.DeclareDiscreteState(np.append(np.zeros(2 * self._num_points * outputs), -1.0))
+        self._window = declare_cache(
+            self, "window", self._calc_window, prerequisites_of_calc={self.discrete_state_ticket(self._state)}
+        )
+        self._reference_window_port = self.DeclareVectorOutputPort(
+            "reference_window",
+            (horizon + 1) * (outputs + outputs**2),
+            self._calc_reference_window,
+            prerequisites_of_calc={self._window.ticket()},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_observation_input_port = input_getter("observation", "observation of the base policy, (n,)")
+    get_reference_window_output_port = output_getter("reference_window", "means and covariances, ((H+1)(O + O²),)")
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        """Advance by a control step.
+
+        Raises:
+            PolicyError: If the base policy does not return chunks.
+        """
+        state = context.get_discrete_state(self._state).value().copy()
+        state[-1] += 1.0
+        if state[-1] % self._replan_steps == 0:
+            observation = self._observation_port.Eval(context).astype(np.float32)
+            try:
+                samples = chunk_samples(self._policy, observation, self._reference.num_outputs)
+            except (TypeError, ValueError) as error:
+                raise PolicyError(f"{error}: the robot must stop") from None
+            state[:-1] = np.concatenate(mean_and_variance(samples, self._num_points)).ravel()
+        discrete_state.set_value(self._state, state)
+
+    def _calc_window(self, context: Context) -> np.ndarray:
+        state = context.get_discrete_state(self._state).value()
+        step, outputs = int(state[-1]), self._reference.num_outputs
+        at = np.minimum(max(step, 0) + np.arange(self._horizon + 1), self._reference.num_steps - 1)
+        if step < 0:
+            means, covariances = self._reference.means[at], self._reference.covariances[at]
+        else:
+            first = step % self._replan_steps
+            chunk = state[:-1].reshape(2, self._num_points, outputs)[:, first : first + self._horizon + 1]
+            means = chunk[0]
+            covariances = self._floor * self._reference.covariances[at] + chunk[1][:, :, None] * np.eye(outputs)
+        return np.concatenate([means.ravel(), covariances.ravel()])
+
+    def _calc_reference_window(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._window.Eval(context))

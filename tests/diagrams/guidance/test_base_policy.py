@@ -1,0 +1,91 @@
+"""Guidance around a base policy: its reference, constraints, and the same numbers as without one by default."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.envs.make import make_env
+from guiderail.models.base_policy import BASE_POLICIES
+from guiderail.models.common.errors import InputError
+
+KINDS = ("kgrl_base_policy", "residual_base_policy")
+
+
+def run(env, actions, seed=0):
+    env.reset(seed=seed)
+    for action in actions:
+        *_, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            break
+    return env.unwrapped.trace
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Register base policies for the test only."""
+    monkeypatch.setattr(BASE_POLICIES, "_entries", {})
+    monkeypatch.setattr(BASE_POLICIES, "_origins", {})
+    return BASE_POLICIES.register
+
+
+@pytest.mark.parametrize(("kind", "plain"), [*zip(KINDS, ("kgrl", "residual"), strict=True)])
+def test_guidance_without_a_base_policy_is_the_plain_one(kind, plain):
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 2))
+    traces = [run(make_env("NarrowPassage", guidance=name, action_repeat=5), actions) for name in (kind, plain)]
+    assert (traces[0].commanded == traces[1].commanded).all()
+    assert (traces[0].measured == traces[1].measured).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_command_follows_the_chunk_of_the_observation(kind, registered):
+    seen = []
+
+    def hold(observation):
+        seen.append(observation.copy())
+        return np.tile([[0.05, 0.02]], (3, 1)) + np.outer(np.arange(3), [1e-3, 0.0])
+
+    registered("hold", hold)
+    env = make_env("NarrowPassage", guidance=kind, base_policy="hold", action_repeat=5)
+    observation, _ = env.reset(seed=0)
+    env.step(np.zeros(2))
+    assert (seen[0] == observation).all()  # what the policy on top observes
+    assert len(seen) == 1
+    env.step(np.zeros(2))
+    assert len(seen) == 2
+    assert np.allclose(env.unwrapped.trace.commanded[-1], [0.052, 0.02], atol=3e-3)
+
+
+def test_no_command_violates_a_constraint_whatever_base_policy_and_actions(registered):
+    random = np.random.default_rng(1)
+    registered("wild", lambda observation: random.uniform(-1.0, 1.0, (3, 8, 2)))
+    env = make_env("NarrowPassage", guidance="kgrl_base_policy", base_policy="wild", action_repeat=1)
+    trace = run(env, random.choice([-1.0, 1.0], (60, 2)))
+    assert len(trace) == 60
+    assert trace.signals["commanded_violation"].max() <= 1e-9
+    worst = -np.inf
+    for index, corner in enumerate([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)]):
+        registered(f"corner{index}", lambda observation, corner=corner: np.tile(corner, (8, 1)))
+        free = make_env("NarrowPassage", guidance="residual_base_policy", base_policy=f"corner{index}")
+        worst = max(worst, run(free, np.zeros((1, 2))).signals["commanded_violation"].max())
+    assert worst > 0.1  # a residual is not constrained
+
+
+def test_base_policy_is_refused_when_nothing_has_its_name():
+    with pytest.raises(InputError, match="no base policy 'nothing'"):
+        make_env("NarrowPassage", guidance="kgrl_base_policy", base_policy="nothing")
+
+
+def test_base_policy_is_refused_when_the_observation_is_an_image(registered):
+    registered("hold", lambda observation: np.zeros((2, 2)))
+    with pytest.raises(InputError, match="takes no images"):
+        make_env("NarrowPassage", guidance="kgrl_base_policy", base_policy="hold", observation="image")
+
+
+def test_spread_of_the_chunks_widens_what_an_action_reaches(registered):
+    reached = {}
+    for name, spread in (("agree", 0.0), ("disagree", 0.02)):
+        chunks = np.tile([[0.05, 0.0]], (2, 6, 1)) + np.array([[[spread, 0.0]], [[-spread, 0.0]]])
+        registered(name, lambda observation, chunks=chunks: chunks)
+        env = make_env("NarrowPassage", guidance="kgrl_base_policy", base_policy=name, horizon=5, covariance_floor=0.1)
+        commands = [run(env, np.tile([action, 0.0], (3, 1))).commanded[-1, 0] for action in (0.0, 1.0)]
+        reached[name] = commands[1] - commands[0]
+    assert reached["disagree"] > reached["agree"] + 0.01

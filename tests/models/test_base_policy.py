@@ -1,0 +1,64 @@
+"""Base policies: what they may return, the window of their chunks, and how they are found."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.base_policy import BASE_POLICIES, chunk_samples, find_base_policy, mean_and_variance
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import FORMAT, Policy
+
+
+def chunk_policy(ensemble=2, points=3, outputs=2, seed=0):
+    size, random = ensemble * points * outputs, np.random.default_rng(seed)
+    layers = [(random.normal(size=(size, 4)).astype(np.float32), np.zeros(size, np.float32))]
+    description = {"observation_shape": [4], "action_low": [-9.0] * size, "action_high": [9.0] * size}
+    return Policy(layers, description | {"format": FORMAT, "squash": "clip", "chunk": [ensemble, points, outputs]})
+
+
+def test_samples_of_an_array_of_any_accepted_shape_agree():
+    chunks = np.arange(12.0).reshape(2, 3, 2)
+    for returned in (chunks, chunks[None], chunks.tolist()):
+        assert (chunk_samples(lambda observation, r=returned: r, np.zeros(4), 2) == chunks).all()
+    for returned in (chunks[0], chunks[0].ravel()):
+        assert (chunk_samples(lambda observation, r=returned: r, np.zeros(4), 2) == chunks[:1]).all()
+
+
+@pytest.mark.parametrize(
+    "returned", [np.zeros((3, 3)), np.zeros(5), np.full((1, 3, 2), np.nan), np.zeros((0, 3, 2)), 1.0]
+)
+def test_samples_are_refused_when_they_are_no_finite_chunks(returned):
+    with pytest.raises(ValueError, match="finite chunks"):
+        chunk_samples(lambda observation: returned, np.zeros(4), 2)
+
+
+def test_window_repeats_the_last_point_of_a_short_chunk():
+    samples = np.arange(12.0).reshape(2, 3, 2)
+    mean, variance = mean_and_variance(samples, 5)
+    assert (mean == samples.mean(axis=0)[[0, 1, 2, 2, 2]]).all()
+    assert np.allclose(variance, 18.0)  # of two samples that differ by 6
+    assert (mean_and_variance(samples[:1], 2)[1] == 0.0).all()
+
+
+def test_folder_of_a_chunk_policy_is_a_base_policy(tmp_path):
+    policy, observation = chunk_policy(), np.ones(4, np.float32)
+    policy.save(tmp_path)
+    samples = chunk_samples(find_base_policy(str(tmp_path)), observation, 2)
+    assert samples.shape == (2, 3, 2)
+    assert (samples.ravel() == policy(observation)).all()
+
+
+def test_source_is_refused_when_it_predicts_no_chunks(tmp_path):
+    policy = chunk_policy()
+    del policy.description["chunk"]
+    policy.save(tmp_path)
+    with pytest.raises(InputError, match="predicts no chunks"):
+        find_base_policy(str(tmp_path))
+    with pytest.raises(InputError, match="no base policy"):
+        find_base_policy("nothing")
+
+
+def test_registered_function_is_found_by_its_name(monkeypatch):
+    monkeypatch.setattr(BASE_POLICIES, "_entries", {})
+    monkeypatch.setattr(BASE_POLICIES, "_origins", {})
+    function = BASE_POLICIES.register("still", lambda observation: np.zeros((1, 2, 6)))
+    assert find_base_policy("still") is function

@@ -1,0 +1,51 @@
+"""Chunk cloning: a base policy from demonstrations, its export as one network, and runs that are resumed."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.base_policy import chunk_samples, find_base_policy
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.learning.chunking import ChunkLearner
+from guiderail.tools.learning.config import ChunkConfig
+from guiderail.tools.learning.train import train
+
+SETTINGS = {"demonstration_episodes": 4, "gradient_steps": 400, "members": 3, "chunk_steps": 4, "net_arch": (16,)}
+SETTINGS |= {"learning_rate": 1e-2, "observation_noise": 0.01}
+OPTIONS = {"action_repeat": 10, "difficulty": "hard"}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("chunk") / "run"
+    arguments = {"episodes": 4, "seed": 3, "algorithm": "chunk", "settings": SETTINGS, "pictures": False}
+    return train("NarrowPassage", "kgrl", out=out, **arguments, **OPTIONS), arguments
+
+
+def test_chunks_follow_the_commands_of_the_demonstrations(trained):
+    run, _ = trained
+    env = make_environment("NarrowPassage", {"guidance": "kgrl", **OPTIONS})
+    observation, _ = env.reset(seed=3)  # both sides of the obstacle were demonstrated
+    samples = chunk_samples(find_base_policy(str(run.path)), observation, 2)
+    assert samples.shape == (3, 4, 2)
+    env.step(make_baseline("NarrowPassage", "scripted")(env)(observation))
+    commanded = env.unwrapped.trace.commanded[:4]
+    assert np.abs(samples.mean(axis=0) - commanded).max() < 0.05
+    assert samples.std(axis=0).max() > 0.0
+    assert run.summary["success_in_training"].startswith("there are only demonstrations")
+
+
+def test_same_seed_gives_the_same_policy_also_when_resumed(trained, tmp_path):
+    run, arguments = trained
+    again = train("NarrowPassage", "kgrl", out=tmp_path / "again", **arguments, **OPTIONS)
+    for path in ("policy.safetensors", "policy.json"):
+        assert (run.path / path).read_bytes() == (again.path / path).read_bytes()
+    resumed = train("NarrowPassage", out=again.path, resume=True, episodes=5, pictures=False)
+    assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
+
+
+def test_learner_is_refused_when_the_commands_are_in_another_process():
+    env = make_environment("NarrowPassage", {"guidance": "kgrl"})
+    with pytest.raises(InputError, match="pipelined"):
+        ChunkLearner(ChunkConfig(pipelined=True), env, action_repeat=1, seed=0, max_transitions=10)

@@ -1,0 +1,176 @@
+"""Chunk cloning: an ensemble that is regressed on the commanded poses that follow an observation (ACT's objective)."""
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from scipy.linalg import block_diag
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import FORMAT, Policy
+from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.cloning import BcLearner
+from guiderail.tools.learning.config import ChunkConfig
+
+MIN_SCALE = 1e-6  # smallest scale of an output; one that never changes has no spread
+
+
+class ChunkLearner(BcLearner):
+    """Learner of a base policy: from an observation to the next K commanded poses, mean squared error, by Adam.
+
+    The policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations, whose spread is
+    the uncertainty of the chunk (Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", RSS
+    2023; Lakshminarayanan et al., 2017). They are exported as one network with block-diagonal layers. The learner does
+    not act: after the demonstrations its action is zero.
+    """
+
+    Config = ChunkConfig
+    config: ChunkConfig
+
+    def __init__(self, config: ChunkConfig, env: gymnasium.Env, **arguments: Any):
+        """Construct the learner; `Learner` describes the arguments.
+
+        Raises:
+            InputError: If observations are images, or the environment is not one of a task's diagram.
+        """
+        super().__init__(config, env, **arguments)
+        if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
+            raise InputError("chunk reads the commands of its own environment: leave pipelined and num_envs out")
+        base: Any = env.unwrapped
+        self._env = base
+        dims = self._env.task.declaration.config.options.get("action_dims")
+        self._dims = slice(None) if dims is None else list(dims)
+        self._seen: list[np.ndarray] = []  # observations of the episode
+        self._starts: list[int] = []  # and their control steps
+        self._groups: list[int] = []  # demonstration of each observation
+        self._center, self._scale = np.zeros(1), np.ones(1)
+        self.network = torch.nn.Sequential()
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return zero: a chunk is a reference and no action."""
+        return np.zeros(self._space.shape or (), np.float32)
+
+    def on_episode_start(self) -> None:
+        """Count the episode."""
+        super().on_episode_start()
+        self._seen, self._starts, self._step = [], [], 0
+
+    def on_step(self, transition: Transition) -> None:
+        """Store the observation of a demonstration."""
+        if self.episodes <= self.config.demonstration_episodes:
+            self._seen.append(np.asarray(transition.observation, np.float32))
+            self._starts.append(self._step)
+        self._step = len(self._env.trace)
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Cut the commands into chunks, add their symmetric copies, and train after the last demonstration."""
+        if self.episodes <= self.config.demonstration_episodes:
+            commanded = self._env.trace.commanded
+            self._num_outputs = commanded.shape[1]
+            at = np.array(self._starts)[:, None] + np.arange(self.config.chunk_steps)
+            self._add(np.array(self._seen), commanded[np.minimum(at, len(commanded) - 1)])
+        return super().on_episode_end(row)
+
+    def _add(self, observations: np.ndarray, chunks: np.ndarray) -> None:
+        """Store observations (n, …) and chunks (n, K, O); a symmetry moves explored outputs as it does actions."""
+        symmetries = [(np.eye(observations.shape[1]), None)]
+        if self._symmetry is not None:
+            symmetries += [*zip(self._symmetry.observations, self._symmetry.actions, strict=True)]
+        for observed, moved in symmetries:
+            copies = chunks.copy()
+            if moved is not None:
+                copies[:, :, self._dims] = chunks[:, :, self._dims] @ moved.T
+            self._observations.extend((observations @ observed.T).astype(np.float32))
+            self._actions.extend(copies.reshape(len(chunks), -1))
+            self._groups.extend([self.episodes] * len(chunks))
+
+    def _train(self) -> None:
+        observations, chunks = np.array(self._observations), np.array(self._actions)
+        self._center, self._scale = chunks.mean(axis=0), np.maximum(chunks.std(axis=0), MIN_SCALE)
+        seen, targets = torch.from_numpy(observations), torch.from_numpy((chunks - self._center) / self._scale).float()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._seed)
+            sizes = [observations.shape[1], *self.config.net_arch, chunks.shape[1]]
+            members = [_perceptron(sizes) for _ in range(self.config.members)]
+        groups, losses = np.array(self._groups), []
+        for index, network in enumerate(members):
+            random = np.random.default_rng([self._seed, index])
+            generator = torch.Generator().manual_seed(int(random.integers(2**62)))
+            drawn = random.integers(1, self.episodes + 1, size=self.episodes)  # bootstrap sample of demonstrations
+            rows = np.concatenate([np.flatnonzero(groups == one) for one in drawn])
+            optimizer = torch.optim.Adam(network.parameters(), lr=self.config.learning_rate)
+            for _ in range(self.config.gradient_steps):
+                batch = rows[random.integers(len(rows), size=self.config.batch_size)]
+                # Without noise an observed command is copied, and errors of the command add up (Ke et al., 2021).
+                noise = torch.randn(seen[batch].shape, generator=generator)
+                noisy = seen[batch] + self.config.observation_noise * noise
+                loss = torch.nn.functional.mse_loss(network(noisy), targets[batch])
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+            losses.append(loss.item())
+        self.network, self._loss = torch.nn.Sequential(*members), float(np.mean(losses))
+
+    def policy(self, description: Mapping[str, Any]) -> Policy:
+        """Return the base policy: the ensemble as one network, whose output is limited to the demonstrated range."""
+        if not len(self.network):
+            raise InputError(
+                f"chunk learns after {self.config.demonstration_episodes} demonstrations: give as many --episodes"
+            )
+        members: list[Any] = [
+            [one for one in member.children() if hasattr(one, "weight")] for member in self.network.children()
+        ]
+        layers = []
+        for depth in range(len(members[0])):
+            weights = [member[depth].weight.detach().numpy().astype(float) for member in members]
+            biases = [member[depth].bias.detach().numpy().astype(float) for member in members]
+            if depth == len(members[0]) - 1:
+                weights = [self._scale[:, None] * weight for weight in weights]
+                biases = [self._scale * bias + self._center for bias in biases]
+            weight = np.concatenate(weights) if depth == 0 else block_diag(*weights)
+            layers.append((weight.astype(np.float32), np.concatenate(biases).astype(np.float32)))
+        chunks = np.array(self._actions)
+        low, high = chunks.min(axis=0) - MIN_SCALE, chunks.max(axis=0) + MIN_SCALE
+        ensemble = self.config.members
+        return Policy(
+            layers,
+            {
+                "format": FORMAT,
+                "pool": 1,
+                "activation": "relu",
+                "squash": "clip",
+                "action_low": np.tile(low, ensemble).tolist(),
+                "action_high": np.tile(high, ensemble).tolist(),
+                "chunk": [ensemble, self.config.chunk_steps, self._num_outputs],
+                **description,
+            },
+        )
+
+    def has_diverged(self) -> bool:
+        """Return True if a parameter is NaN or infinite."""
+        return not all(bool(torch.isfinite(one).all()) for one in self.network.parameters())
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return everything that the rest of a run depends on: the demonstrations."""
+        arrays = {"observations": np.array(self._observations), "actions": np.array(self._actions)}
+        return arrays | {"groups": np.array(self._groups)}, {
+            "episodes": self.episodes,
+            "num_outputs": self._num_outputs,
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Set the state to what `state` returned; raise KeyError if it does not fit."""
+        self._observations, self._actions = [*arrays["observations"]], [*arrays["actions"]]
+        self._groups = arrays["groups"].tolist()
+        self.episodes, self._num_outputs = values["episodes"], values["num_outputs"]
+        if self.episodes >= self.config.demonstration_episodes:
+            self._train()
+
+
+def _perceptron(sizes: list[int]) -> torch.nn.Sequential:
+    """Return linear layers with rectifiers between them."""
+    layers = [layer for into, out in pairwise(sizes) for layer in (torch.nn.Linear(into, out), torch.nn.ReLU())]
+    return torch.nn.Sequential(*layers[:-1])
