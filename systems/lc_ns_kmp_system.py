@@ -42,10 +42,10 @@ class LcNsKmpSystem(LeafSystem):
     (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
     length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
     starts at the end of the previous one. ``reference_window`` is ((H+1)(O + O²),), means and covariances in place of
-    the reference's, the current step first (`ChunkReference`), if it is connected. ``command`` is (O,). ``constraint_violation`` (1,) is
-    max(c − G y) of the command: negative if all constraints are slack, `UNCONSTRAINED` if there is none. ``fallback``
-    (1,) is 1 if no window within the constraints was found; the command is then the point nearest to the last command
-    within the constraints of its step.
+    the reference's, the current step first (`ChunkReference`), if it is connected. ``command`` is (O,).
+    ``constraint_violation`` (1,) is max(c − G y) of the command: negative if all constraints are slack, `UNCONSTRAINED`
+    if there is none. ``fallback`` (1,) is 1 if no window within the constraints was found; the command is then the
+    point nearest to the last command within the constraints of its step.
 
     The step is state and counts control periods since time zero, unless ``motion_time`` (1,) [s] is connected
     (`ProgressClock`), which then determines it. The command is a pure function of step, action and

@@ -107,8 +107,7 @@ def add_demonstration(
     The reference is that of the demonstrations, or the input ``reference_window`` with `takes_window`.
     """
     primitive = config.primitive(history=False, constrained=False)
-    system = LcNsKmpSystem(primitive, None, config.control_period)
-    kmp = builder.AddNamedSystem("kmp", system)
+    kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
     if takes_window:
         builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
     # Not a ConstantVectorSource: Drake assumes that it depends on time, so the primitive would be computed again at
@@ -163,8 +162,7 @@ class KgrlGuidance(PrimitiveGuidance):
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
         gains = config.null_space_gains(primitive)
-        system = LcNsKmpSystem(primitive, gains, config.control_period)
-        kmp = builder.AddNamedSystem("lc_ns_kmp", system)
+        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period))
         if takes_window:
             builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
         builder.Connect(action, kmp.get_null_space_action_input_port())

@@ -239,22 +239,15 @@ class LcNsKmp:
     def predict_window(
         self,
         step: int,
-        means: np.ndarray,
-        covariances: np.ndarray,
+        means: ArrayLike,
+        covariances: ArrayLike,
         null_space_action: np.ndarray | None = None,
         history: np.ndarray | None = None,
     ) -> Prediction:
         """Compute the output at a step with a window of another origin, such as a base policy; nothing is cached.
 
-        Args:
-            step: Step n ≥ 0.
-            means: Means (H+1, O), the executed point first.
-            covariances: Covariances (H+1, O, O), positive definite.
-            null_space_action: ξ̂ (O,), as in `predict`.
-            history: (P, O), as in `predict`.
-
-        Raises:
-            InputError: As `predict`, also for means and covariances. UnsolvableError: As `predict`.
+        Arguments are those of `predict`, and the window's `means` (H+1, O) and `covariances` (H+1, O, O), positive definite,
+        the executed point first. Errors are those of `predict`.
         """
         window = Window.checked(means, covariances, *self.constraints.window(self._held(step, self.horizon)))
         factor = StepFactor(window, self._features(step), self.lambda_, self.beta)
