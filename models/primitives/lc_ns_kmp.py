@@ -246,8 +246,8 @@ class LcNsKmp:
     ) -> Prediction:
         """Compute the output at a step with a window of another origin, such as a base policy; nothing is cached.
 
-        Arguments are those of `predict`, and the window's `means` (H+1, O) and `covariances` (H+1, O, O), positive definite,
-        the executed point first. Errors are those of `predict`.
+        Arguments are those of `predict`, and the window's `means` (H+1, O) and positive definite `covariances`
+        (H+1, O, O), the executed point first. Errors are those of `predict`.
         """
         window = Window.checked(means, covariances, *self.constraints.window(self._held(step, self.horizon)))
         factor = StepFactor(window, self._features(step), self.lambda_, self.beta)

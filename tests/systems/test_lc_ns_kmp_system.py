@@ -26,12 +26,12 @@ def names(system, kind):
 
 def test_ports():
     system = LcNsKmpSystem(primitive(), None, PERIOD)
-    assert names(system, "input") == ["null_space_action", "history", "motion_time"]
+    assert names(system, "input") == ["null_space_action", "history", "motion_time", "reference_window"]
     assert names(system, "output") == ["command", "constraint_violation", "fallback"]
     assert system.get_history_input_port().size() == 6
     assert system.get_command_output_port().size() == 2
     without = LcNsKmpSystem(primitive(history=0), None, PERIOD)
-    assert names(without, "input") == ["null_space_action", "motion_time"]
+    assert names(without, "input") == ["null_space_action", "motion_time", "reference_window"]
     with pytest.raises(InputError, match="history"):
         without.get_history_input_port()
 
@@ -228,7 +228,8 @@ def test_history_length_selects_the_primitive():
     longest, short = primitive(history=3), primitive(history=1)
     gains = {3: np.array([3.0, 5.0]), 1: np.array([7.0, -2.0])}
     system = LcNsKmpSystem(longest, gains[3], PERIOD, shorter=[(short, gains[1])])
-    assert names(system, "input") == ["null_space_action", "history", "history_length", "motion_time"]
+    inputs = ["null_space_action", "history", "history_length", "motion_time", "reference_window"]
+    assert names(system, "input") == inputs
     assert system.get_history_length_input_port().size() == 1
     past, action = longest.reference.means[2:5], np.array([0.5, -1.0])
     context = system.CreateDefaultContext()

