@@ -39,7 +39,7 @@ def trained(bead_run):
         (["train", "--out", "new"], "name a task"),
         (["train", "Pooring", "--out", "new"], "did you mean Pouring?"),
         (["train", "Bead", "--out", "new", "--guidance", "magic"], "kmp or skgrl"),
-        (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, residual_cbf"),
+        (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, "),
         (["train", "Bead", "--out", "new", "--algorithm", "dqn"], "sac, td3, tqc"),
         (["train", "Bead", "--out", "new", "--preset", "tqc_contct"], "did you mean tqc_contact?"),
         (["train", "Bead", "--out", "new", "--fixture-offset", "per_episode"], "no option 'fixture_offset'"),
