@@ -18,7 +18,7 @@ from guiderail.models.common.units import MM
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 
 CHUNK_STEPS = 40  # K
-STEP = 0.35 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm
+STEP = 0.26 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm
 
 
 @register_base_policy("connector_slow_search")

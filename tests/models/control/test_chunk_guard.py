@@ -1,0 +1,70 @@
+"""Guard of chunks: limits at every commanded step for any chunk, and the chunk itself where it is within them."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.chunk_guard import ChunkGuard
+from guiderail.models.primitives import LinearConstraints
+
+PERIOD, STEPS = 0.02, 12
+VELOCITY, JERK = np.array([0.1, 0.2]), np.array([50.0, 100.0])
+BOUND = np.array([0.05, 0.03])
+
+
+def make(**arguments):
+    box = LinearConstraints.box(-BOUND, BOUND)
+    return ChunkGuard(box, VELOCITY, JERK, **({"period": PERIOD, "start": np.zeros(2)} | arguments))
+
+
+def executed(guard, chunks, number=4):
+    """Return the executed outputs (n, 2) from rest on, and the results."""
+    results = [guard.guard(chunk, number) for chunk in chunks]
+    return np.concatenate([np.zeros((3, 2)), *(one.outputs[:number] for one in results)]), results
+
+
+@pytest.mark.parametrize("mode", ["projection", "slowdown"])
+def test_every_step_is_within_the_limits_for_any_chunks(mode):
+    random = np.random.default_rng(0)
+    noise = random.normal(size=(30, STEPS, 2)) * np.array([0.0, 1e-3, 0.1])[np.arange(30) % 3, None, None]
+    jumps = random.uniform(-0.2, 0.2, (30, 1, 2)) + noise
+    motion, results = executed(make(mode=mode), jumps)
+    assert (np.abs(np.diff(motion, axis=0)) <= VELOCITY * PERIOD).all()
+    assert (np.abs(np.diff(motion, n=3, axis=0)) <= JERK * PERIOD**3).all()
+    assert (np.abs(motion) <= BOUND).all()
+    assert not all(one.is_fallback for one in results)
+    assert np.ptp(motion, axis=0).min() > 0.005  # it moves
+
+
+@pytest.mark.parametrize("mode", ["projection", "slowdown"])
+def test_chunk_within_the_limits_is_hardly_changed(mode):
+    phase = np.minimum(np.arange(1, 31) / 28, 1.0)[:, None]
+    smooth = (10 * phase**3 - 15 * phase**4 + 6 * phase**5) * [0.02, -0.01]
+    smooth[-3:] = smooth[-1]
+    result = make(mode=mode).guard(smooth)
+    assert result.rate == 1.0
+    assert not result.is_fallback
+    np.testing.assert_allclose(result.outputs, smooth, atol=1e-6)
+
+
+def test_slowdown_preserves_the_path_of_a_fast_chunk():
+    line = np.outer(np.minimum(np.arange(1, 31) / 10, 1.0), [0.04, 0.02])
+    slow, straight = (make(mode=mode).guard(line) for mode in ("slowdown", "projection"))
+    across = lambda outputs: np.abs(outputs @ [0.02, -0.04] / np.hypot(0.02, 0.04)).max()  # noqa: E731
+    assert slow.rate < 1.0
+    assert across(slow.outputs) <= 1e-3
+    assert across(slow.outputs) < across(straight.outputs) + 1e-9
+
+
+def test_guard_is_refused_when_an_argument_is_out_of_range():
+    wrong = [{"start": np.array([0.06, 0.0])}, {"mode": "brake"}, {"period": 0.0}]
+    for argument in wrong:
+        with pytest.raises(InputError):
+            make(**argument)
+    make(start=np.array([0.05, 0.0]))
+    with pytest.raises(InputError, match="positive"):
+        ChunkGuard(LinearConstraints.none(2), [0.0, 1.0], JERK, period=PERIOD, start=np.zeros(2))
+    for chunk in (np.zeros((3, 2)), np.zeros((4, 3)), np.full((4, 2), np.nan)):
+        with pytest.raises(InputError, match="chunk"):
+            make().guard(chunk)
+    make().guard(np.zeros((4, 2)))
