@@ -69,8 +69,9 @@ injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 scaling: $(VENV)/.ready  ## constraints in every scale against an adversary, minutes
 	$(BIN)/python tests/harness/constraint_scaling.py
 
-adversary: $(VENV)/.ready  ## spherical obstacles and limits of motion against an adversary, half an hour
+adversary: $(VENV)/.ready  ## obstacles, limits of motion and of joints against an adversary, an hour
 	$(BIN)/python tests/harness/motion_adversary.py
+	$(BIN)/python tests/harness/joint_adversary.py
 
 fci:  ## rehearse a Franka on the simulator of its protocol, minutes
 	$(PYTHON) -m venv .venv-fci
