@@ -9,8 +9,10 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import (
     MALFORMED_STATUS,
     MAX_MISSED_MESSAGES,
+    MAX_SENDERS,
     STATUS_FAULTS,
     Fault,
+    Heartbeat,
     JointStatus,
     LastStatus,
     StatusLimits,
@@ -43,7 +45,9 @@ def test_missing_and_malformed_statuses_are_faults():
     assert check_status(None, LAST, 116.0, LIMITS) == Fault.NO_STATUS
     assert check_status(MALFORMED_STATUS, LAST, 116.0, LIMITS) == Fault.MALFORMED
     assert not MALFORMED_STATUS.is_readable
+    assert not MALFORMED_STATUS.values().size
     assert status().is_readable
+    assert not status(time=np.inf).is_readable
 
 
 @pytest.mark.parametrize("part", ["positions", "velocities", "external"])
@@ -58,8 +62,9 @@ def test_one_value_that_is_not_finite_is_a_fault(part, value):
     assert check(**{part: (0.25, value)}) == Fault.NOT_FINITE
 
 
-def test_first_status_is_compared_with_nothing():
-    first = replace(LAST, time=np.nan)
+@pytest.mark.parametrize("time", [np.nan, np.inf])
+def test_first_status_is_compared_with_nothing(time):
+    first = replace(LAST, time=time)
     assert check(now=0.0, last=first, positions=(9.0, 9.0), velocities=(9.0, 9.0)) == Fault.NONE
     assert check(now=0.0, last=first, positions=(9.0, np.nan)) == Fault.NOT_FINITE
 
@@ -100,6 +105,16 @@ def test_jumps_are_checked_at_their_limits(joint, sign):
     assert check(velocities=moved((0.25, -0.25), 1.5)) == Fault.NONE
     assert check(velocities=moved((0.25, -0.25), 1.5 + EPSILON)) == Fault.VELOCITY_JUMP
     assert check(external=moved((3.0, 4.0), 1000.0)) == Fault.NONE
+
+
+def test_position_has_its_own_limit():
+    limits = replace(LIMITS, position_jump=4.0)
+    assert check_status(status(positions=(3.5, -0.5)), LAST, 116.0 + ELAPSED, limits) == Fault.NONE
+
+
+def test_messages_count_from_zero():
+    assert (status().conflicts, status().foreign_commands, Heartbeat(1, False).sender) == (0, 0, 0)
+    assert MAX_SENDERS == 8
 
 
 def test_values_are_positions_velocities_and_external_torques():
