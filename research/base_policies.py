@@ -1,4 +1,4 @@
-"""Base policy of the study `connector_hard_base_policy`: a search that works about half of the time."""
+"""Base policy of the study `connector_hard_base_policy`: a search that works part of the time (docs/experiments.md)."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from guiderail.models.common.units import MM
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 
 CHUNK_STEPS = 40  # K
-STEP = 0.26 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm
+STEP = 0.28 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm
 
 
 @register_base_policy("connector_slow_search")
