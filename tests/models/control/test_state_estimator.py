@@ -75,6 +75,17 @@ class Rig:
         return None
 
 
+def test_thresholds_have_their_documented_values():
+    assert (module.FRESH_FRACTION, module.AGREEMENT, module.MAX_PREDICTION_TIME) == (0.5, 0.1, 0.1)
+    assert (module.EARLY_FRACTION, module.EARLY_WINDOW, module.MAX_EARLY) == (0.2, 0.5, 1.0 / 3.0)
+    assert (module.POSITION_WINDOW, module.REACTION_WINDOW, module.MOMENTUM_WINDOW) == (0.1, 0.02, 0.1)
+    assert (module.MIN_MOTION, module.MIN_SPEED) == (1e-4, 0.02)
+    assert (module.MAX_EQUAL_POSITIONS, module.MAX_EQUAL_VELOCITIES, module.MAX_EQUAL_STATUSES) == (2, 4, 4)
+    assert (module.MODEL_ERROR, module.SENSOR_ERROR, module.EXTERNAL_STEP) == (0.3, 0.1, 2.0)
+    assert (module.LAG, module.DELAY, module.REACTION) == (1.0, 2.0, 1.5)
+    assert (module.MAX_BIAS, module.BIAS_TIME, module.REST_BIAS_TIME) == (6.0, 1.0, 0.05)
+
+
 def test_valid_status_is_accepted_at_once():
     rig = Rig().settle()
     assert rig.check() == Fault.NONE
