@@ -1,6 +1,6 @@
 """Train and evaluate the policies that come with the package: `make pretrained`, an hour or two on two cores.
 
-    python -m research.pretrained [NAME...] [--out runs/pretrained]
+    python -m research.pretrained [NAME...] [--out runs/pretrained] [--episodes 40]
 
 The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Each is
 evaluated on 40 held-out episodes with all baseline policies. Its configuration, its weights and its evaluation are
@@ -21,7 +21,14 @@ from guiderail.tools.pretrained import PRETRAINED_FOLDER
 
 ARM = {"station": "arm", "sensing": "robot", "difficulty": "hard", "reward": "aligned"}
 POLICIES: dict[str, dict[str, Any]] = {
-    "passage": {"task": "NarrowPassage", "guidance": "skgrl", "episodes": 60},
+    "passage": {
+        "task": "NarrowPassage", "guidance": "skgrl", "episodes": 120, "seed": 180, "difficulty": "hard",
+        "reward": "shaped", "preset": "tqc_contact",
+        "settings": {
+            "demonstration_episodes": 10, "constant_episodes": 0, "greedy_episode_fraction": 0.5, "gamma": 0.998,
+            "ez_greedy": 0.02, "ez_greedy_longest": 30,
+        },
+    },
     "connector": {
         "task": "BncConnector", "guidance": "kgrl", "episodes": 80, "seed": 2200001, **ARM,
         "demonstrations": "firm_search", "settings": {"symmetry": "near", "privileged_critic": True},
@@ -32,19 +39,20 @@ POLICIES: dict[str, dict[str, Any]] = {
     },
     "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100, "difficulty": "hard"},
 }  # fmt: skip
-"""Arguments of `guiderail.train` by the name of the policy; connector and clamp are the first seeds of the studies
-connector_robot_sensing and grid_clamp_robot_sensing."""
+"""Arguments of `guiderail.train` by the name of the policy; passage, connector and clamp are the first seeds of the
+studies narrow_passage_hard, connector_robot_sensing and grid_clamp_robot_sensing."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
 MAX_SIZE = 200_000  # of the files of one policy [bytes]
 EPISODES = 40  # held-out episodes of the policy and of each baseline policy
 
 
-def make(name: str, out: Path) -> guiderail.Evaluation:
+def make(name: str, out: Path, episodes: int = EPISODES) -> guiderail.Evaluation:
     """Train and evaluate a policy, and write its files into the package.
 
     Args:
         name: Key of `POLICIES`.
         out: Folder of the runs.
+        episodes: Held-out episodes.
     """
     folder = out / name
     arguments = dict(POLICIES[name])
@@ -52,7 +60,7 @@ def make(name: str, out: Path) -> guiderail.Evaluation:
         run = guiderail.train(arguments["task"], out=folder, resume=True)
     else:
         run = guiderail.train(arguments.pop("task"), out=folder, **arguments)
-    evaluation = guiderail.evaluate(run.path, episodes=EPISODES)
+    evaluation = guiderail.evaluate(run.path, episodes=episodes)
     text = json.dumps(json.loads(to_json({"sentence": evaluation.sentence, **evaluation})), indent=1)
     (folder / "evaluation.json").write_text(text + "\n", encoding="utf-8")
     size = sum((folder / file).stat().st_size for file in FILES)
@@ -69,9 +77,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[*POLICIES, []], help="Policies; all by default.")
     parser.add_argument("--out", type=Path, default=Path("runs/pretrained"), help="Folder of the runs.")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="Held-out episodes of each policy.")
     given = parser.parse_args()
     for name in given.names or POLICIES:
-        print(f"{name}: {make(name, given.out).sentence}", flush=True)
+        print(f"{name}: {make(name, given.out, given.episodes).sentence}", flush=True)
 
 
 if __name__ == "__main__":
