@@ -213,7 +213,8 @@ def test_impossible_guidance_is_refused_with_alternatives(skill, kind, message):
 
 def test_safe_residual_is_not_offered_without_walls(skill):
     with pytest.raises(
-        InputError, match=r"walls to keep out of, .*BncConnector.*kmp, residual, residual_covariance, skgrl"
+        InputError,
+        match=r"walls to keep out of, .*BncConnector.*kmp, residual, residual_base_policy, residual_covariance, skgrl",
     ):
         build("safe_residual", replace(skill, keep_out=None), "BncConnector")
     assert check_guidance("kmp", ("demonstrations",)).label == "demonstration alone"
