@@ -277,6 +277,8 @@ def _spike(size: float) -> Callable[[float, float], float]:
 NEXT, TWO, FEW = 2 * PERIOD, 3 * PERIOD, 6 * PERIOD
 TIMEOUT, HEARTBEAT, SLOW = 8 * PERIOD, 14 * PERIOD, 24 * PERIOD
 UNDETECTED = float("nan")
+# Errors that are proportional to the velocity have the bound of an error of 0.05 rad/s: they count from there on, and
+# how fast they grow depends on the motion.
 KINDS = (
     Kind("all values frozen", FEW, _frozen(FIELDS, one=False)),
     Kind("one joint frozen", FEW, _frozen((Q, V, T), one=True)),
