@@ -42,7 +42,7 @@ class PoseRateLimiter(LeafSystem):
         super().__init__()
         check_period(period)
         if not 0.0 < speed < np.inf or not 0.0 < angular_speed < np.inf:
-            raise InputError(f"a desired pose's speeds must be positive, not {speed} m/s and {angular_speed} rad/s")
+            raise InputError(f"the speed limits must be positive and finite, not {speed} m/s and {angular_speed} rad/s")
         self._step, self._angular_step = speed * period, angular_speed * period
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)

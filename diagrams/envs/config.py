@@ -60,8 +60,8 @@ class EnvConfig:
 
         Args:
             task: Name of the task, or path of a task folder.
-            options: Options by name, as `gymnasium.make` takes them. Later ones override earlier ones: the task's
-                defaults, those of the difficulty, these.
+            options: Options by name, as `gymnasium.make` takes them. They override the
+                options of the difficulty, which override the task's defaults.
 
         Raises:
             InputError: If a task, an option or a choice is unknown, a value is out of range, or two are incompatible.
@@ -211,7 +211,8 @@ def _check_declared_options(task: type[Task], known: set[str]) -> None:
             }
             if option not in anywhere:
                 raise InputError(
-                    f"{context} of {task.name} sets no option {brief(option)}: {did_you_mean(option, anywhere)}"
+                    f"{context} of {task.name} sets the unknown option {brief(option)}: "
+                    f"{did_you_mean(option, anywhere)}"
                 )
 
 

@@ -113,7 +113,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     release = partial(_IDLE[key].append, built)
     try:
         return DiagramEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
-    except BaseException:  # such as a browser view that finds no port
+    except BaseException:  # for example if the browser view finds no free port
         release()
         raise
 
@@ -163,7 +163,7 @@ def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
         return EnvConfig.resolve(task, options)
     if options:
         raise InputError(
-            f"a configuration holds all options, so {', '.join(options)} must be given where it is resolved"
+            f"a configuration holds all options, so {', '.join(options)} must be given to EnvConfig.resolve"
         )
     return task
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from pydrake.common import FindResourceOrThrow
 from pydrake.geometry import Meshcat, MeshcatParams
 
-END_TIMEOUT = 5.0  # of the gateway [s]
+END_TIMEOUT = 5.0  # longest wait for the gateway to exit before it is killed [s]
 
 
 class MeshcatPage(Meshcat):
@@ -137,7 +137,7 @@ class _Gateway:
 def _close_port(port: int, keep: Sequence[int]) -> None:
     """Replace this process's listening socket of a port by an unconnected one, and end its connections.
 
-    Drake has no interface for it. The descriptor keeps its number, so that Drake can close it at its end.
+    Drake has no function for this. The descriptor keeps its number, so that Drake can close it at its end.
 
     Args:
         port: Port of the listening socket.

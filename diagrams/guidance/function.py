@@ -13,7 +13,7 @@ from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, G
 class FunctionGuidance(Guidance):
     """Guidance that commands law(action, pose, wrench) once a control step; see `FunctionGuidanceSystem`.
 
-    The function is not constrained: ``constraint_violation`` is the violation of the task's constraints by its command.
+    The command is not constrained; ``constraint_violation`` is its violation of the task's constraints.
     """
 
     def __init__(self, prior: PriorKnowledge, law: GuidanceFunction, action_size: int):

@@ -28,7 +28,7 @@ class MonitorState(IntEnum):
     RESTING = 3
 
 
-MAX_REPEATS = 2  # times that the monitor repeats its torque between two checks
+MAX_REPEATS = 2  # largest number of repetitions of the monitor's torque between two checks
 
 STOP_FAULTS = frozenset({*STATUS_FAULTS, Fault.SECOND_COMMANDER} - {Fault.NO_STATUS})
 
@@ -98,7 +98,7 @@ class SafetyMonitor:
             return
         self._checked_at, self._num_repeats = now, 0
         if status is not None:
-            # To the driver the commands of every other program are foreign.
+            # The driver counts every other program's commands as foreign; here only contradictory ones count.
             status = replace(status, foreign_commands=self._commands.num_conflicts)
         self._plant.SetPositions(self._context, self._estimated.accepted_values[: self._plant.num_positions()])
         self._plant.SetVelocities(self._context, self._estimated.velocity)
@@ -107,7 +107,7 @@ class SafetyMonitor:
         self.fault = estimate.fault
         self._update_state(now)
         is_stopping = self._is_stopping
-        # Sent before a command, so that the commanding program attributes that to this monitor.
+        # The heartbeat precedes the torque, so that the commanding program attributes the torque to this monitor.
         self._num_heartbeats += 1
         self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
         if self._is_holding:
@@ -134,7 +134,8 @@ class SafetyMonitor:
         if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
             self._commands.add(torque, command_time, self._commanded_at)  # else it may be another monitor's
         if self._is_stopping and self._command is not None and not self._is_holding:
-            # The robot obeys the last command. Two monitors must not answer each other without end.
+            # The robot executes the last command, so the torque is sent again, up to a limit: two monitors could
+            # answer each other endlessly.
             if self._num_repeats < MAX_REPEATS:
                 self._num_repeats += 1
                 self._driver.write(self._command, self._commanded_at)

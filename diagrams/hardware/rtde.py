@@ -2,7 +2,7 @@
 
 The client is ur-rtde (MIT license). Of its commands, `servoL` bounds no force, and `directTorque` would leave the loop
 of 500 Hz to Python and needs PolyScope 5.26. Force mode bounds the force by the commanded wrench, in the controller's
-own loop, and runs on every e-Series. Never run on a robot.
+own loop, and runs on every e-Series. This driver has not been tested on a real robot.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from guiderail.models.robots.robot import find_robot
 
 logger = logging.getLogger(__name__)
 
-EXTERNAL_TORQUE_LIMITS = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # of external joint torques [Nm]
+EXTERNAL_TORQUE_LIMITS = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # external joint torques for `torque_reflex_limits` [Nm]
 # Defaults of URScript's movel: 0.25 m/s, 1.2 m/s², 1.05 rad/s, 1.4 rad/s²; each acceleration is reached in 0.1 s.
 # Universal Robots publishes no limits of a commanded jerk.
 UR_MOTION_LIMITS = MotionLimits((0.25, 1.2, 12.0), (1.05, 1.4, 14.0))
 WATCHDOG_FREQUENCY = 10.0  # the controller ends its program when commands arrive less often [Hz]
 MAX_ZEROED_FORCE = 15.0  # largest force that a drifted sensor may show before it is zeroed [N]
-MAX_POSE_DIFFERENCE = 0.02  # between the robot's tool center and the model's, by its own calibration [m]
-NO_TRANSFORM = 2  # type of force mode whose frame is fixed
+MAX_POSE_DIFFERENCE = 0.02  # largest distance of the robot's calibrated tool center from the model's [m]
+NO_TRANSFORM = 2  # argument `type` of forceMode: the force frame is not transformed
 RECOVERY_TIME = 2.0  # longest wait for the status after a recovery [s]
-NUM_ATTEMPTS = 10  # to read the values of one message
-# The frame "base" of the controller is turned against that of the model, which stretches the arm along x at zero.
+NUM_ATTEMPTS = 10  # attempts to read values that belong to one message
+# The controller's frame "base" is rotated by 180° about z from the model's, where the arm points along +x at zero.
 X_ControllerBase = RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0.0, 0.0, 0.0])
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "actual_TCP_force", "actual_TCP_pose", "safety_status_bits"]
 
@@ -60,7 +60,7 @@ class RtdeDriver(PoseDriver):
     name = "ur5e"
     torque_reflex_limits = EXTERNAL_TORQUE_LIMITS
     has_command_timeout = True
-    hold_off = 0.25  # the robot needs none; statuses are watched before the arm is taken over
+    hold_off = 0.25  # statuses are checked for this time before the first command [s]
     motion_limits = UR_MOTION_LIMITS
 
     def __init__(self, url: str = "", *, client: Any = None):
@@ -94,7 +94,8 @@ class RtdeDriver(PoseDriver):
         """Set tool center and payload, zero the force sensor and start the controller's program; nothing moves.
 
         Raises:
-            InputError: If the robot refuses them, its tool is loaded, or its kinematics are not the model's.
+            InputError: If the robot cannot be connected or refuses a setting, or if its force sensor measures more than
+                `MAX_ZEROED_FORCE`.
         """
         self._impedance, self._X_FlangeTool = impedance, impedance.X_FlangeTool
         if self._is_active:
@@ -103,7 +104,7 @@ class RtdeDriver(PoseDriver):
             try:
                 self._control = self._client.RTDEControlInterface(self.url)
             except Exception as error:  # the client raises RuntimeError and its own types
-                raise InputError(f"the robot at {self.url} starts no program: {error}") from None
+                raise InputError(f"the robot at {self.url} cannot start the control program: {error}") from None
         inertia = impedance.inertia
         order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
         self._check(
@@ -119,7 +120,7 @@ class RtdeDriver(PoseDriver):
         self._check(self._control.zeroFtSensor(), "zeroing of the force sensor")
 
     def read(self) -> JointStatus | None:
-        """Return the newest status, None while no robot answers."""
+        """Return the newest status, or None if none has been read yet."""
         if self._is_lost:
             return MALFORMED_STATUS
         if self._receiver is None:
@@ -173,7 +174,11 @@ class RtdeDriver(PoseDriver):
             ),
             Check("force sensor", "zeroed: the tool must have been free"),
             Check("motion", f"commands up to {speed:.2f} m/s, {acceleration:.1f} m/s² and {jerk:.0f} m/s³"),
-            Check("untested", "this driver has never moved a robot: start with half the force, and a hand on the stop"),
+            Check(
+                "untested",
+                "this driver has not been tested on a robot: start with half the force limit and a hand on the "
+                "emergency stop",
+            ),
         ]
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
@@ -215,7 +220,7 @@ class RtdeDriver(PoseDriver):
         """
         self._is_active = False
         if self._is_lost:
-            raise InputError(f"the connection to the robot at {self.url} is lost: start the program again")
+            raise InputError(f"the connection to the robot at {self.url} is lost: restart guiderail")
         self._finish_stop()
         if self._receiver.isProtectiveStopped():
             dashboard = self._client.DashboardClient(self.url)
@@ -251,7 +256,7 @@ class RtdeDriver(PoseDriver):
         """Compare the tool center of the robot with that of the model.
 
         Raises:
-            InputError: If they differ by more than the calibration of a robot.
+            InputError: If they differ by more than `MAX_POSE_DIFFERENCE`.
         """
         distance = self._kinematic_distance()
         if distance > MAX_POSE_DIFFERENCE:
@@ -292,7 +297,7 @@ def _import_client() -> Any:
 
 
 def _turn(wrench: np.ndarray) -> np.ndarray:
-    """Return a wrench (6,) in the axes of the model's base for one in the controller's, and the other way round."""
+    """Convert a wrench (6,) from the controller's base axes to the model's, or back."""
     return np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0]) * wrench
 
 

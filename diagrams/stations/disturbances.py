@@ -31,7 +31,7 @@ from guiderail.systems.wrench_tare import WrenchTare
 
 MAX_FACTOR = 100.0
 """Largest factor of a disturbance; its inverse is the smallest."""
-MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; more was probably meant in millimetres or degrees
+MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; a larger one is probably in millimetres or degrees
 
 
 def _factors(quantity: str) -> Any:
@@ -85,7 +85,7 @@ class Disturbances(Options):
     lost_commands: Number = Field(0.0, ge=0, lt=1, description="probability that a command is lost")
     late_commands: Integer = Field(0, ge=0, le=50, description="delay of a command in control steps")
     clock_factor: Number = Field(
-        1.0, gt=0, le=MAX_FACTOR, description="factor of the time between commands; the motion is slower by it"
+        1.0, gt=0, le=MAX_FACTOR, description="factor of the control period; the motion is slower by this factor"
     )
     stiffness_factor: Number = Field(1.0, gt=0, le=MAX_FACTOR, description="factor of the impedance's stiffness")
     payload: Number = Field(
@@ -169,7 +169,7 @@ class DisturbedStation(Station):
         """Construct the station; the inner one becomes part of it.
 
         Raises:
-            InputError: If the station does not have such a disturbance.
+            InputError: If the station does not support one of the disturbances.
         """
         super().__init__()
         d = self._disturbances = disturbances
@@ -221,7 +221,7 @@ class DisturbedStation(Station):
         return total.get_output_port()
 
     def _add_wrench(self, builder: DiagramBuilder, wrench: OutputPort, pose: OutputPort) -> OutputPort:
-        """Add errors, tare and delay of the wrench; return the port of what is measured.
+        """Add errors, tare and delay of the wrench; return the port of the measured wrench.
 
         A robot tares its own sensor; the delay is that of the way to the policy.
         """
@@ -359,7 +359,7 @@ def disturbed(
     if not disturbances.any:
         return build(**arguments)
     if not is_simulated and disturbances.is_named_only:
-        # A robot has its own errors; what the setting adds to it is the tare.
+        # A real robot has its own sensor errors; of the setting only the tare applies.
         can_tare = "tare" in inspect.signature(build).parameters
         return build(**arguments, **({"tare": True} if can_tare and disturbances.errors.tare else {}))
     if not is_simulated:

@@ -105,8 +105,8 @@ def test_declaration_of_the_wrong_type_is_refused(attributes, says):
             {"of": Ignorant, "workcell_kind": "plane"},
             "no guidance can be built for lab/Own: write its reference",
         ),
-        ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets no option 'gapp'"),
-        ({"defaults": {"histroy": 5}}, "defaults of lab/Own sets no option 'histroy': did you mean history"),
+        ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets the unknown option 'gapp'"),
+        ({"defaults": {"histroy": 5}}, "defaults of lab/Own sets the unknown option 'histroy': did you mean history"),
     ],
 )
 def test_task_without_a_possible_environment_is_refused(attributes, says):
@@ -251,7 +251,7 @@ def test_scope_is_training_without_held_out_conditions():
     assert "conditions as in training" in evaluation_scope("lab/Own", {}, resample_offsets=False)
     words = describe_task_options("lab/Own")
     assert words["reset: held_out"].startswith("no effect")
-    assert words["reward"] == "reward of the task, which has one unnamed reward"
+    assert words["reward"] == "the task has a single reward without a name"
     declare(has_held_out_distribution=True)
     assert evaluation_scope("lab/Own", {}, resample_offsets=False) == "held-out starts"
     assert describe_task_options("lab/Own")["reset: held_out"].startswith("sample held-out conditions")

@@ -101,7 +101,7 @@ def describe_task_options(name: str) -> dict[str, str]:
             pairs = ", ".join(f"{key}={_format_value(value)}" for key, value in settings.items())
             texts[f"difficulty={difficulty}"] = f"is the same as {pairs}"
     if declared.rewards is Task.rewards:
-        texts["reward"] = "reward of the task, which has one unnamed reward"
+        texts["reward"] = "the task has a single reward without a name"
     reset = {f"reset: {row['name']}": row["description"] for row in describe_options(declared.Reset)}
     if not declared.has_held_out_distribution:
         reset["reset: held_out"] = "no effect: the task declares no held-out conditions"

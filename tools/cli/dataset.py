@@ -20,7 +20,7 @@ def import_(
         Path, argument("LeRobot v3 dataset, ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
     ],
     out: cli.DemonstrationsOut,
-    signal: Annotated[str | None, option("Topic or feature to import.  [default: the only candidate]")] = None,
+    signal: Annotated[str | None, option("Topic or feature to import.  [default: the only suitable one]")] = None,
     target: Annotated[
         str | None, option(f"{POSE}: pose of the task's target in the recording's frame [m, degrees].")
     ] = None,
@@ -35,7 +35,8 @@ def import_(
 ) -> None:
     """Import demonstrations from another format.
 
-    The assumptions made are printed. If a file does not state a unit or a frame, the option to give is named.
+    The assumptions made are printed. If a file does not state a unit or a frame, the error message
+    names the option that sets it.
     """
     from guiderail.tools.datasets.convert import import_recording
 
@@ -125,7 +126,7 @@ def create_task(
     axis: Annotated[str, option("Direction in which the plug is removed: +x, -x, +y, -y, +z or -z.")] = "+z",
     center: Annotated[str | None, option("x,y,z of a point on the axis.  [default: the plug's center of mass]")] = None,
     turn: Annotated[
-        float, option("Rotation of the plug at the bottom [degrees]; its mesh is drawn in the turned pose.")
+        float, option("Rotation of the plug at the bottom [degrees]; its mesh must be in the rotated pose.")
     ] = 0.0,
     shrink: Annotated[float, option("Distance by which the plug's surface is moved inwards [mm].")] = 0.0,
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,

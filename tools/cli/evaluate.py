@@ -19,7 +19,7 @@ def evaluate(
     subject: cli.Shown,
     episodes: Annotated[int | None, option("Number of held-out episodes.  [default: 100]")] = None,
     quick: Annotated[
-        bool, option(f"Evaluate {QUICK} episodes: a wide interval, in a fifth of the time.", "--quick")
+        bool, option(f"Evaluate {QUICK} episodes: a fifth of the default, with a wider interval.", "--quick")
     ] = False,
     seed: cli.Seed = 1_000_000,
     task: cli.PolicyTask = None,
@@ -27,7 +27,9 @@ def evaluate(
     processes: cli.Processes = None,
     policy: Annotated[
         str | None,
-        option("Policy that is evaluated in a TASK, or on hardware instead of the run's: scripted, {baselines}."),
+        option(
+            "Policy to evaluate in a TASK, or on hardware instead of the run's: scripted, {baselines}."
+        ),
     ] = None,
     env: cli.Env = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
@@ -61,7 +63,7 @@ def evaluate(
     evaluation_scope of the table states what the result is valid for, and the last line is the result in one sentence.
     """
     if quick and episodes is not None:
-        raise InputError("--quick is a number of episodes: leave --episodes out")
+        raise InputError("--quick sets the number of episodes: leave --episodes out")
     episodes = QUICK if quick else 100 if episodes is None else episodes
     environment = cli.parse_environment(env, station=station, robot=robot, robot_url=robot_url, driver=driver)
     if cli.is_hardware(environment.get("station")):
@@ -171,7 +173,7 @@ def robustness(
     """Evaluate policies under friction, stiffness, sensor, command and timing errors.
 
     One quantity is changed at a time; one table and one picture compare all runs. Evaluated episodes are stored: the
-    same command resumes an interrupted evaluation, and an additional run costs only its own episodes.
+    same command resumes an interrupted evaluation, and for an additional run only its own episodes are evaluated.
     """
     from guiderail.tools.evaluation.robustness import robustness as evaluate_robustness
     from guiderail.tools.evaluation.robustness import values_below
@@ -213,7 +215,9 @@ def certify(
     ] = None,
     attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
     verify: Annotated[Path | None, option("Folder of a certificate: check it and compare it with the skill.")] = None,
-    key: Annotated[Path | None, option("Key file: signs the certificate, or checks its signature.")] = None,
+    key: Annotated[
+        Path | None, option("Key that signs the certificate or, with --verify, checks it.")
+    ] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
@@ -227,7 +231,7 @@ def certify(
 
     task, environment = cli.find_task(subject, imports)[0], cli.parse_environment(env)
     if verify is not None and (out is not None or attack):
-        raise InputError("--verify writes nothing and attacks nothing: give it without --out and --attack")
+        raise InputError("--verify only checks a certificate: give it without --out and --attack")
     if verify is not None:
         result = verify_certificate(task, environment, verify, start_within=start_within, key=key)
     else:

@@ -1,6 +1,6 @@
 """On-policy learners: PPO of Stable-Baselines3 and TRPO of sb3-contrib, trained by their own steps.
 
-They learn from the transitions since the last training only. A checkpoint holds those that wait for the next one.
+An update uses only the transitions since the last update. A checkpoint stores those collected for the next update.
 """
 
 from collections.abc import Mapping
@@ -88,13 +88,13 @@ class OnPolicyLearner(Learner):
         return np.clip(self._sampled[0][0].numpy(), space.low, space.high)
 
     def on_step(self, transition: Transition) -> None:
-        """Store a transition and train if the buffer is full; one in which the simulation failed is left out."""
+        """Store a transition and train if the buffer is full; one with a failed simulation is dropped."""
         if "simulation_failure" in transition.info or self._sampled is None:
             self._is_start = True
             return
         action, value, log_prob = self._sampled
         reward = transition.reward
-        if transition.truncated and not transition.terminated:  # bootstrapped, as a time limit does not end the task
+        if transition.truncated and not transition.terminated:  # bootstrapped, because truncation is not termination
             reward += self.model.gamma * float(self._value(transition.next_observation))
         buffer = self.model.rollout_buffer
         starts = np.array([self._is_start])
@@ -122,7 +122,7 @@ class OnPolicyLearner(Learner):
         return recorded
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of the most probable actions; `description` holds further entries of its description."""
+        """Return the policy of the most probable action; `description` has further entries of its description."""
         network = self.model.policy
         layers = [*network.mlp_extractor.policy_net, network.action_net]
         return export_layers(layers, network.action_space, {"squash": "clip", **description})

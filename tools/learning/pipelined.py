@@ -30,7 +30,7 @@ from guiderail.tools.learning.off_policy import OffPolicyLearner
 class PipelinedLearner(Learner):
     """Learner that acts in this process and trains in a second one, on each episode during the next.
 
-    Episode k is acted with the weights learned from the episodes before k − 1, so training on an episode may take as
+    Episode k uses the weights learned from the episodes before k − 1, so training on an episode may take as
     long as an episode. With `waits`, an episode waits for these weights, so that the same seed gives the same run
     whatever the durations. Without `waits`, an episode starts at once with the newest weights.
 
@@ -73,7 +73,7 @@ class PipelinedLearner(Learner):
         self._metrics: dict[str, float] = {}
         self.known = self.submitted = self.late = 0
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([__name__])  # a study imports once, not for every run
+        context.set_forkserver_preload([__name__])  # the fork server imports this module once for all runs of a study
         self._pipe, child_pipe = context.Pipe()
         child_arguments = (child_pipe, niceness, tuple(imports), *arguments)
         self._process = context.Process(target=_serve, args=child_arguments, daemon=True)
@@ -150,7 +150,7 @@ class PipelinedLearner(Learner):
         self._process.join()
 
     def metrics(self) -> Mapping[str, float]:
-        """Return what the training process recorded for the newest weights."""
+        """Return the metrics that the training process recorded for the newest weights."""
         metrics, self._metrics = self._metrics, {}
         return metrics
 
@@ -242,7 +242,7 @@ def _serve(
     os.nice(niceness)
     torch.set_num_threads(1)
     requests: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
-    # Read at once: two processes that write into full pipes would deadlock, and a robot must not wait.
+    # Requests are read at once: two processes that write into full pipes would deadlock, and a robot must not wait.
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     if imports:
         from guiderail.tools.imports import import_modules  # Drake takes a second

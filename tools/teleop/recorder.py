@@ -113,7 +113,9 @@ KEEP, DISCARD, UNDO, SLOW, END = (
     "end (Escape)",
 )
 BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END: "Escape"}
-MAX_SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])  # of the command, per second
+MAX_SPEED = np.array(
+    [20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE]
+)  # of the command [m/s], [rad/s]
 SLOW_RATE = 0.25  # of real time, in slow motion
 UNDO_TIME = 1.0  # motion that one undo takes back [s]
 MAX_UNDOS = 60  # consecutive undos: each needs a copy of the simulation's state
@@ -128,11 +130,11 @@ class _Snapshot:
 
     Attributes:
         context: Copy of the root context.
-        steps: Control steps of the simulation.
+        steps: Number of simulated control steps.
         command: Commanded pose, (6,).
         offset: Offset of the sliders, (6,).
-        samples: Recorded commands.
-        resting: Control steps of the present rest.
+        samples: Number of recorded commands.
+        resting: Number of control steps for which the command has not changed.
     """
 
     context: Context
@@ -196,7 +198,7 @@ class DemonstrationRecorder:
             raise InputError(f"{out} must end in .npz or .csv")
         self.task, self.out = EnvConfig.resolve(task, environment).make_task(), out
         if self.task.workcell_kind != "workcell":
-            raise InputError(f"{task} has no tool that can be led: demonstrate a task that inserts a part")
+            raise InputError(f"{task} has no tool that an operator can move: demonstrate a task that inserts a part")
         kind = self.task.config.station_kind
         if not kind.is_simulated:
             raise InputError(f"demonstrations are recorded in simulation: leave station={kind.name} out")
@@ -229,7 +231,7 @@ class DemonstrationRecorder:
         self.panel.reset()
 
     def run(self, log: Callable[[str], None], real_time: bool = True, max_steps: int = 10**9) -> None:
-        """Follow the page until its end button; write each demonstration when it is kept.
+        """Run the simulation until the page's end button is pressed; write each demonstration when it is kept.
 
         With `real_time` it runs in real time, or in slow motion; otherwise as fast as possible.
         """
@@ -265,7 +267,7 @@ class DemonstrationRecorder:
     def undo(self) -> None:
         """Take back the last second of motion: robot, parts, command and sliders.
 
-        Rests before it stay. At most `MAX_UNDOS` seconds can be taken back.
+        A pause before this motion is kept. At most `MAX_UNDOS` seconds can be taken back.
         """
         snapshots = self.recording.snapshots
         if not snapshots:
@@ -350,7 +352,7 @@ class DemonstrationRecorder:
         """Set the target rate relative to real time."""
         if rate != self.simulator.get_target_realtime_rate():
             self.simulator.set_target_realtime_rate(rate)
-            # Without this Drake would speed up or wait until the new rate held for the whole time since the start.
+            # Without this, Drake would run faster or wait until the average rate since the start equals the new rate.
             self.simulator.ResetStatistics()
 
     def _press(self, button: str, log: Callable[[str], None]) -> None:

@@ -19,27 +19,28 @@ from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 from guiderail.models.objects.insertion import COLLISION_FORCE
 
-# Least and largest offset of the jack.
+# Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {
     "per_run": (1.0 * MM, 1.5 * MM),
     "per_episode": (0.0, 1.5 * MM),
     "none": (0.0, 0.3 * MM),
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool
-LARGEST_GRASP_ANGLE = 2.0  # [degrees] a larger tilt would be a fault of the gripper
+LARGEST_GRASP_ANGLE = 2.0  # [degrees] largest accepted `grasp_angle`; a larger tilt would be a faulty grasp
 
 
 class BncUncertainty(HiddenOffsets):
     """Sampler of the offsets of jack and plug; `HiddenOffsets` has the options of a reset.
 
-    - "per_run": the jack is off by 1.0 to 1.5 mm in one direction, the same for a whole run; the plug is within 0.3 mm
-      of its place in the tool, sampled each episode. This is the thesis's case.
+    - "per_run": the jack is offset by 1.0 to 1.5 mm in a random direction, sampled once per run; the plug is within
+      0.3 mm of its nominal position in the tool, sampled each episode. The dissertation uses this setting.
     - "per_episode": the jack is anywhere within 1.5 mm, sampled each episode.
     - "none": the jack is within 0.3 mm, sampled each episode.
 
-    The plug may also be tilted in the tool, sampled each episode: its offset then has two angles [rad] about x and y
-    after x and y. The jack may be turned about its axis, sampled with its position: its offset then has an angle [rad]
-    after x and y. The option `offset` sets the jack's position, with an upright plug in its place.
+    With `grasp_angle` the plug is also tilted in the tool, sampled each episode; its offset is then [x, y, angle about
+    x, angle about y] in m and rad. With `jack_turn` the jack is also rotated about its axis; its offset is then
+    [x, y, angle]. The reset option `offset` sets the jack's position; the jack is then not rotated, and the plug
+    neither tilted nor offset.
     """
 
     def __init__(
@@ -163,10 +164,11 @@ HARD: dict[str, Any] = {
     "force_limit": 20.0,
     "mouth_chamfer": 0.1 * MM,
 }
-"""Options of difficulty="hard": the jack is elsewhere in every episode, farther off than a chamfer catches, and the
-force limit is less than pressing on the rim takes.
+"""Options of difficulty="hard": the jack's offset is sampled in every episode and is larger than the chamfer can
+correct. Without `bounded_force`, pressing on the rim exceeds the force limit.
 
-The search is short, and the jack as far off as an action reaches: a policy that moves over the rim at random is mostly
-closer to its middle, and a policy that feels on which side of the rim the plug stands arrives. The action scale does
-not change until the plug drops in, because otherwise a constant action would sweep across the rim.
+The search is short, and the jack's offset is close to the largest displacement by an action. Random actions mostly
+displace the plug less and miss the jack; a policy that observes on which side of the rim the contact is can reach it.
+The demonstrations' covariance in x and y, and so the effect of an action, is constant during the search; otherwise a
+constant action would sweep the plug across the rim.
 """
