@@ -8,7 +8,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail import load_template
 from guiderail.diagrams.guidance.sct import SctGuidance
-from guiderail.models.common.poses import transform_to_pose
+from guiderail.models.common.transforms import transform_to_pose
 
 PERIOD = 0.02
 template = load_template("pouring", mug_radius_m=0.05)  # a wider mug than the file's own

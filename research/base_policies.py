@@ -13,9 +13,9 @@ from guiderail.diagrams.tasks.bnc_connector.task import (
     Z,
     reference_trajectory,
 )
-from guiderail.models.base_policy import register_base_policy
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
+from guiderail.models.policy import register_base_policy
 
 CHUNK_STEPS = 40  # K
 STEP = 0.28 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm

@@ -14,7 +14,7 @@ from typing import Any
 from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.tools.learning.config import PRESETS, OffPolicyConfig, action_gamma
 from guiderail.tools.learning.run_folder import RunConfig

@@ -6,7 +6,7 @@ All systems and the types of their constructor arguments are exported: `from gui
 
 import lazy_loader
 
-from guiderail.models.common.extras import require_extra
+from guiderail.models.common.errors import require_extra
 
 require_extra("pydrake")
 

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames

@@ -9,9 +9,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
-from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support.declarations import declare_cache, declare_plant_context, input_getter, output_getter
-from guiderail.systems.support.drake_poses import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
 

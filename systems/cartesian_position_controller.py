@@ -16,7 +16,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
-from guiderail.systems.support.drake_poses import pose_to_transform, transform_to_pose
+from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import CommandValidity
 
 

@@ -3,7 +3,7 @@
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import WRENCH_SIZE
+from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.systems.support.declarations import input_getter, output_getter
 

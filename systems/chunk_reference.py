@@ -3,8 +3,8 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.base_policy import BasePolicy, chunk_samples, mean_and_variance
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import BasePolicy, chunk_samples, mean_and_variance
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.policy_system import PolicyError
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
@@ -32,7 +32,7 @@ class ChunkReference(LeafSystem):
     an observation of the command is not an algebraic loop.
 
     Args:
-        policy: Base policy (`models.base_policy`), a pure function.
+        policy: Base policy (`models.policy`), a pure function.
         observation_size: n, at least 1.
         reference: Reference trajectory in control steps, for Σ_n and the first window.
         horizon: H, not negative.

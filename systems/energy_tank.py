@@ -7,9 +7,9 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE, pose_difference
+from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.control.energy_tank import admissible_share, spring_energy
-from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
 _WRENCH_ORDER = [0, 1, 2, 5, 4, 3]  # coordinates of a wrench among those of a pose

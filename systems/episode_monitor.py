@@ -7,8 +7,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, declare_cache, output_getter
-from guiderail.systems.support.signal_ports import SignalPorts, check_takes
+from guiderail.systems.support.declarations import SignalPorts, check_period, check_takes, declare_cache, output_getter
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.

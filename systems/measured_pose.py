@@ -6,7 +6,7 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_poses import transform_to_pose
+from guiderail.systems.support.drake_multibody import transform_to_pose
 
 
 class MeasuredPose(LeafSystem):

@@ -14,9 +14,9 @@ from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 if TYPE_CHECKING:
     import mujoco

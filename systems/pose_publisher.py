@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.systems.support.declarations import check_period, input_getter
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.systems.torque_safety_limiter import ArmState
 
 

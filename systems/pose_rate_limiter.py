@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_difference
+from guiderail.models.common.transforms import pose_difference
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 

@@ -2,7 +2,7 @@
 
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
+from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 

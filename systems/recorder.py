@@ -7,8 +7,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, output_getter
-from guiderail.systems.support.signal_ports import SignalPorts
+from guiderail.systems.support.declarations import SignalPorts, check_period, output_getter
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE, WrenchBound, governed_error
+from guiderail.models.common.transforms import POSE_SIZE
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound, governed_error
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 

@@ -8,8 +8,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.support.declarations import declare_cache, output_getter
-from guiderail.systems.support.signal_ports import SignalPorts, check_takes
+from guiderail.systems.support.declarations import SignalPorts, check_takes, declare_cache, output_getter
 
 
 @dataclass(frozen=True)

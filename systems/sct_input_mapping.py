@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.common.transforms import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames

@@ -17,7 +17,7 @@ from guiderail.systems.support.declarations import (
     input_getter,
     output_getter,
 )
-from guiderail.systems.support.joint_dynamics import JointDynamics
+from guiderail.systems.support.drake_multibody import JointDynamics
 
 
 class StatusWatchdog(LeafSystem):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from guiderail.models.common.extras import EXTRAS
+from guiderail.models.common.errors import EXTRAS
 
 BLOCK = f"""
 import sys
@@ -114,6 +114,6 @@ def test_train_without_torch_exits_with_2_and_names_the_extra(tmp_path):
 
 def test_other_missing_module_is_not_explained():
     printed = run_light(
-        "from guiderail.models.common.extras import require_extra; require_extra('absent')", exit_code=1
+        "from guiderail.models.common.errors import require_extra; require_extra('absent')", exit_code=1
     )
     assert "ModuleNotFoundError: No module named 'absent'" in printed

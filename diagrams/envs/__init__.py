@@ -1,5 +1,5 @@
 """Gymnasium environments built from task, guidance and station."""
 
-from guiderail.models.common.extras import require_extra
+from guiderail.models.common.errors import require_extra
 
 require_extra("pydrake")

@@ -12,7 +12,7 @@ from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.recorder import Recorder, Recording
 
 SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_force": 1, "saturation": 1}

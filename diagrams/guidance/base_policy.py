@@ -13,7 +13,7 @@ from guiderail.diagrams.guidance.primitive import KgrlGuidance, primitive_config
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
-from guiderail.models.base_policy import BASE_POLICIES, find_base_policy
+from guiderail.models.policy import BASE_POLICIES, find_base_policy
 from guiderail.systems.chunk_reference import ChunkReference
 
 

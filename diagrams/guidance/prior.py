@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
-from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import LinearConstraints
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.systems.command_filter import CommandFilter

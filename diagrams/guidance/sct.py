@@ -12,7 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOr
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
-from guiderail.models.common.poses import WRENCH_SIZE
+from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 from guiderail.systems.sct_input_mapping import SctInputMapping

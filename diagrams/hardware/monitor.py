@@ -15,7 +15,7 @@ from guiderail.diagrams.hardware.driver import Driver, status_limits, torque_tol
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, STATUS_FAULTS, Fault, Heartbeat, damping_torque
 from guiderail.models.control.message_sequence import CommandSequence
 from guiderail.models.control.state_estimator import Estimate, EstimatorState, StateEstimator
-from guiderail.systems.support.joint_dynamics import JointDynamics
+from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
 
 

@@ -23,7 +23,7 @@ from guiderail.diagrams.stations.station import (
     tare_steps,
 )
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.control.motion_constraints import StateConstraints
 from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance

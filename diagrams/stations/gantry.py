@@ -37,7 +37,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.pose_wrench import PoseWrench
 
 GANTRY_JOINTS = (

@@ -26,7 +26,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
 from guiderail.systems.mujoco_gantry import MovedBodies, MujocoGantry, mujoco_engine
 

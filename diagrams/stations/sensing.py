@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 
 Sensing = Literal["exact", "wrist", "robot"]
 

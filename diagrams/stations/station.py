@@ -49,12 +49,12 @@ from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.models.control.wrench_bound import WrenchBound
+from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 Robot = TypeVar("Robot")
 

@@ -16,10 +16,9 @@ from guiderail.diagrams.envs.options import Number, Numbers, Options, ResetOptio
 from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.control.wrench_bound import MAX_WRENCH_SIZE
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE
 from guiderail.models.objects.insertion import COLLISION_FORCE, MIN_CONTACT_FORCE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.center_of_pressure import CenterOfPressure

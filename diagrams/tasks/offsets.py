@@ -13,8 +13,7 @@ from pydantic import Field, field_validator
 from guiderail.diagrams.envs.options import Numbers, Options
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket

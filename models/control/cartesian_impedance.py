@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from guiderail.models.common.arrays import cross
-from guiderail.models.control.wrench_bound import WrenchBound, bounded_wrench
+from guiderail.models.control.wrench import WrenchBound, bounded_wrench
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 

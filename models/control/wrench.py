@@ -1,8 +1,196 @@
-"""External wrench on a tool from the wrist's reaction and the tool's motion, and its center of pressure."""
+"""Wrenches in contact: measured on a tool, and bounded so that neither a push nor an impact exceeds a force.
+
+Vectors of six of the bound are [translational, rotational], in its axes. See `docs/concepts/forces.md`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from guiderail.models.common.arrays import cross
+from guiderail.models.common.errors import InputError
+
+_POSE_ORDER = [0, 1, 2, 5, 4, 3]  # coordinates [x y z Rz Ry Rx] of a pose among those of a wrench
+
+MAX_WRENCH_SIZE = 8
+"""Numbers of a bound as a signal: six along and about the axes, and the norms of force and torque."""
+
+
+@dataclass(frozen=True, eq=False)  # arrays do not compare to one truth value
+class WrenchBound:
+    """Largest wrench of an impedance, per axis and as norms, and the stiffness of the contacts that it expects.
+
+    Attributes:
+        axes: Limits (6,) along and about the axes [N, Nm], not negative.
+        force: Limit of the norm of the force [N], not negative.
+        torque: Limit of the norm of the torque [Nm], not negative.
+        contact_stiffness: Stiffness of workpiece, grasp and fixture in an impact [N/m], not negative. 0: the approach
+            speed is not limited.
+    """
+
+    axes: np.ndarray
+    force: float
+    torque: float
+    contact_stiffness: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = (*np.ravel(self.axes), self.force, self.torque, self.contact_stiffness)
+        if np.shape(self.axes) != (6,) or not all(number >= 0.0 for number in numbers):
+            raise InputError(
+                "the bound of a wrench is six limits, two norms and a stiffness, none negative, not "
+                f"{self.axes}, {self.force}, {self.torque} and {self.contact_stiffness}"
+            )
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The bound as a signal, (8,): `axes`, `force` and `torque`."""
+        return np.array([*self.axes, self.force, self.torque])
+
+    @cached_property
+    def in_pose_order(self) -> WrenchBound:
+        """The bound with its axes in the order of a pose, [x y z Rz Ry Rx]."""
+        return replace(self, axes=self.axes[_POSE_ORDER])
+
+    def lowered_to(self, max_wrench: np.ndarray) -> WrenchBound:
+        """Return the smaller one of this bound and another, (8,), in each number; a negative or NaN number counts as 0.
+
+        A bound that arrives at run time can therefore only lower the one that a robot was configured with.
+        """
+        return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=16)  # several systems ask for the same bound at every step of a plant
+def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
+    requested = np.frombuffer(max_wrench)
+    lowest = np.minimum(bound.numbers, np.where(requested > 0.0, requested, 0.0))
+    lowest.setflags(write=False)
+    return replace(bound, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))
+
+
+def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: float) -> np.ndarray:
+    """Clip a wrench (6,) to limits per axis (6,), then scale force and torque to the limits of their norms."""
+    clipped = np.minimum(np.maximum(wrench, -axes), axes)
+    for block, limit in ((clipped[:3], force), (clipped[3:], torque)):
+        norm = float(np.sqrt(block @ block))
+        if norm > limit:
+            block *= limit / norm
+    return clipped
+
+
+def slow_down(
+    spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, impedance: float, force: float
+) -> np.ndarray:
+    """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates to at most F / √(k m).
+
+    d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is that of `approach_impedance`. Only a force
+    that does positive work is reduced, so that no energy is added: while it moves to its rest position, the spring
+    returns at most what it stored.
+
+    Args:
+        spring: Force of the spring [N], (3,).
+        damping: Force of the damper D v [N], (3,).
+        velocity: Velocity v [m/s], (3,).
+        impedance: √(k m) of contact and moving mass [N s/m].
+        force: Limit F of the norm of the force [N].
+    """
+    speed = float(np.sqrt(velocity @ velocity))
+    if speed == 0.0 or spring @ velocity <= 0.0:
+        return spring
+    limit = max(0.0, force - max(0.0, impedance * speed - float(damping @ velocity) / speed))
+    magnitude = float(np.sqrt(spring @ spring))
+    return spring if magnitude <= limit else spring * (limit / magnitude)
+
+
+def approach_impedance(contact_stiffness: float, mass: float) -> float:
+    """Return √(k m) [N s/m]: a mass m [kg] at speed v hits a stiffness k [N/m] with the peak force v √(k m)."""
+    return float(np.sqrt(contact_stiffness * mass))
+
+
+def bounded_wrench(
+    spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, mass: float, bound: WrenchBound
+) -> np.ndarray:
+    """Compute s − β D v, with the clipped spring s and the largest share β ≤ 1 of the damper that the bound allows.
+
+    The clipped spring has a potential, and the damper only dissipates, whatever its share: for a constant bound and
+    rest position the law is passive.
+
+    Args:
+        spring: Wrench of the spring (6,).
+        damping: Wrench of the damper D V (6,).
+        velocity: Translational velocity (3,) [m/s].
+        mass: Moving mass in the direction of the velocity [kg].
+        bound: Bound.
+    """
+    s = clip_wrench(spring, bound.axes, bound.force, bound.torque)
+    impedance = approach_impedance(bound.contact_stiffness, mass)
+    s[:3] = slow_down(s[:3], damping[:3], velocity, impedance, bound.force)
+    return s - damping_share(s, damping, bound) * damping
+
+
+def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -> float:
+    """Return the largest β from 0 to 1 with s − β d inside the bound, for a spring's wrench s inside it.
+
+    Args:
+        spring: s (6,).
+        damping: d (6,).
+        bound: Bound.
+    """
+    wrench = spring - damping
+    f, t = wrench[:3], wrench[3:]
+    if (np.abs(wrench) <= bound.axes).all() and f @ f <= bound.force**2 and t @ t <= bound.torque**2:
+        return 1.0
+    # Distance to the limit in the direction of −d, per axis.
+    towards = np.where(damping > 0.0, bound.axes + spring, bound.axes - spring)
+    shares = np.divide(towards, np.abs(damping), out=np.full(6, np.inf), where=damping != 0.0)
+    share = min(1.0, float(shares.min()))
+    for block, limit in ((slice(0, 3), bound.force), (slice(3, 6), bound.torque)):
+        s, d = spring[block], damping[block]
+        dd, sd, slack = float(d @ d), float(s @ d), limit**2 - float(s @ s)
+        if dd > 0.0 and np.isfinite(slack):
+            # ‖s − β d‖² = limit² at its larger root.
+            share = min(share, (sd + float(np.sqrt(max(sd * sd + dd * slack, 0.0)))) / dd)
+    return max(share, 0.0)
+
+
+def governed_error(
+    stiffness: np.ndarray,
+    damping: np.ndarray,
+    error: np.ndarray,
+    velocity: np.ndarray,
+    mass: float,
+    step: float,
+    bound: WrenchBound,
+) -> np.ndarray:
+    """Compute the pose error (6,) that a spring and damper may be commanded for one step of a simulation.
+
+    The damper belongs to the plant, which solves it implicitly: its force in the step is K e − (K h + D) v₁ with the
+    velocity v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, the force is inside the bound if the spring's K e is,
+    reduced by (K h + D) |v₀|.
+
+    Args:
+        stiffness: Stiffness (6,) K of each coordinate.
+        damping: Damping (6,) D of each coordinate.
+        error: Pose error (6,) e.
+        velocity: Velocity (6,) v₀ before the step.
+        mass: Moving mass [kg].
+        step: Time step h [s].
+        bound: Bound, with axes in the order of the coordinates.
+    """
+    implicit = (stiffness * step + damping) * np.abs(velocity)
+    force, torque = (float(np.sqrt(block @ block)) for block in (implicit[:3], implicit[3:]))
+    spring = clip_wrench(stiffness * error, bound.axes, bound.force, bound.torque)
+    impedance = approach_impedance(bound.contact_stiffness, mass)
+    spring[:3] = slow_down(spring[:3], damping[:3] * velocity[:3], velocity[:3], impedance, bound.force)
+    spring = clip_wrench(
+        spring,
+        np.maximum(bound.axes - implicit, 0.0),
+        max(bound.force - force, 0.0),
+        max(bound.torque - torque, 0.0),
+    )
+    return spring / stiffness
 
 
 def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Constants that all insertion tasks share."""
 
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 
 COLLISION_FORCE = 35.0  # contact force above which an episode ends [N]
 MIN_CONTACT_FORCE = 0.5  # smallest force of a plug in contact [N]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 
 # A seam between convex pieces that only meet would catch a sliding body, because the shortest way out of a piece is
 # sideways there. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, which makes

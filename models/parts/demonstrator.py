@@ -6,8 +6,7 @@ under impedance control the difference is the push.
 
 import numpy as np
 
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import random_curves
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]

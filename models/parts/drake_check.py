@@ -1,9 +1,9 @@
-"""Selection of contact pieces that Drake accepts: degenerate ones raise an error in Drake, or abort its process."""
+"""Contact pieces of a compliant part that Drake accepts: degenerate ones raise an error, or abort its process."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,8 +11,32 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.pieces import Piece, piece_text
+from guiderail.models.parts.mesh_file import obj_text
 from guiderail.models.parts.solids import require_module, to_arrays
+from guiderail.models.parts.tetrahedra import vtk_text
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Piece of a compliant part.
+
+    Attributes:
+        body: Index of its body in `ContactSurface.bodies`.
+        suffix: ".obj" of a convex surface, or ".vtk" of tetrahedra.
+        points: Points (P, 3) [m].
+        cells: Triangles (T, 3) or tetrahedra (N, 4).
+    """
+
+    body: int
+    suffix: str
+    points: np.ndarray
+    cells: np.ndarray
+
+
+def piece_text(piece: Piece) -> str:
+    """Return the file of a piece."""
+    return (obj_text if piece.suffix == ".obj" else vtk_text)(piece.points, piece.cells)
+
 
 _GRIDS = (6, 5)  # decimal places [m] to which a refused convex piece is rounded, in the order of the attempts
 _NEGLIGIBLE = 1e-4  # fraction of the volume of all pieces below which a refused piece is left out

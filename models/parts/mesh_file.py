@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.objects.sdf import ContactMaterial, at, collision, convex_mesh, mesh, model, visual
-from guiderail.models.objects.triangle_mesh import TriangleMesh
+from guiderail.models.objects.sdf import ContactMaterial, TriangleMesh, at, collision, convex_mesh, mesh, model, visual
 from guiderail.models.parts.repair import Repair, close_surface
 from guiderail.models.parts.solids import require_module, to_manifold
 

@@ -11,12 +11,10 @@ import numpy as np
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids
 from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
-from guiderail.models.parts.drake_check import accepted_pieces
+from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
-from guiderail.models.parts.pieces import Piece
 from guiderail.models.parts.simplification import as_hull_if_near, count_simplified, crop_to_contact, simplify
-from guiderail.models.parts.solids import require_module, to_arrays
-from guiderail.models.parts.surface_distance import SurfaceLocator, measure_deviation
+from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, require_module, to_arrays
 from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]

@@ -10,8 +10,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.solids import require_module, to_arrays, to_manifold
-from guiderail.models.parts.surface_distance import measure_distance
+from guiderail.models.parts.solids import measure_distance, require_module, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
 MAX_MOVED = 1e-4  # largest distance by which a repair may move a surface, beyond which it closes a real hole [m]

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.parts.solids import require_module, to_arrays
-from guiderail.models.parts.surface_distance import measure_deviation
+from guiderail.models.parts.solids import measure_deviation, require_module, to_arrays
 
 _SLABS = 8  # slabs along z in which a part is cropped
 _HULL = 0.5  # fraction of the tolerance by which a part may differ from its hull

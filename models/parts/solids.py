@@ -1,4 +1,6 @@
-"""Solids of `manifold3d`, in millimeters, and their vertices and triangles in meters."""
+"""Solids of `manifold3d`, in millimeters, and distances between triangle surfaces in meters (libigl)."""
+
+from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
@@ -34,3 +36,64 @@ def to_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and triangles (T, 3) of a solid."""
     mesh = solid.to_mesh64()
     return np.asarray(mesh.vert_properties)[:, :3] / _SCALE, np.asarray(mesh.tri_verts).astype(int)
+
+
+NUM_SAMPLES = 2000  # default number of points sampled on a surface
+
+
+class SurfaceLocator:
+    """Nearest points on a triangle surface."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
+        """Construct the hierarchy.
+
+        Args:
+            vertices: Vertices (V, 3).
+            triangles: Indices of the corners (T, 3), T at least 1.
+        """
+        self._vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+        self._triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        self._tree: Any = require_module("igl").AABB()
+        self._tree.init(self._vertices, self._triangles)
+
+    def find_nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the nearest points (P, 3) to `points` (P, 3), their distances (P,) and triangles (P,)."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if not len(points):
+            return points, np.empty(0), np.empty(0, int)
+        squared, faces, nearest = self._tree.squared_distance(self._vertices, self._triangles, points)
+        distances = np.sqrt(np.maximum(squared, 0.0))
+        return np.asarray(nearest).reshape(-1, 3), np.atleast_1d(distances), np.atleast_1d(faces)
+
+
+def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (P, 3) of a surface and their triangles (P,): `count` uniform samples, and up to as many corners.
+
+    The samples are the same in every call.
+    """
+    corners = vertices[triangles]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    cumulative = np.cumsum(areas)
+    rng = np.random.default_rng(0)
+    chosen = np.searchsorted(cumulative, rng.uniform(0.0, cumulative[-1], count)).clip(0, len(triangles) - 1)
+    u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    weights = np.column_stack([1.0 - u, u * (1.0 - v), u * v])
+    inner = np.einsum("pi,pij->pj", weights, corners[chosen])
+    every = max(1, 3 * len(triangles) // count)
+    owners = np.repeat(np.arange(len(triangles)), 3)[::every]
+    return np.concatenate([inner, corners.reshape(-1, 3)[::every]]), np.concatenate([chosen, owners])
+
+
+def measure_distance(
+    points_of: tuple[np.ndarray, np.ndarray], surface: tuple[np.ndarray, np.ndarray], count: int = NUM_SAMPLES
+) -> float:
+    """Return the largest sampled distance of the points of one surface (V, 3), (T, 3) from another."""
+    points, _ = sample_surface(*points_of, count)
+    return float(SurfaceLocator(*surface).find_nearest(points)[1].max())
+
+
+def measure_deviation(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray], count: int = NUM_SAMPLES
+) -> float:
+    """Return the sampled Hausdorff distance of two surfaces, each as vertices (V, 3) and triangles (T, 3)."""
+    return max(measure_distance(first, second, count), measure_distance(second, first, count))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.poses import POSE_SIZE, pose_difference
+from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 
 
 @dataclass(frozen=True)

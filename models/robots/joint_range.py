@@ -6,7 +6,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.damped_inverse import TOOL_SCALE
 
 _ITERATIONS = 60

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring.task import scripted_pour
-from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.evaluation.baselines import BaselineFactory, bang_bang, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn

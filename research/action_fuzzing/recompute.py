@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.tasks.task import Task
-from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.evaluation.rollout import EnvCallback
 
 # From the values sampled at a reset to the poses of a template's objects.

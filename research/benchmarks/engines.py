@@ -14,7 +14,7 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions

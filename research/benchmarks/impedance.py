@@ -19,8 +19,7 @@ from guiderail.diagrams.envs.recording import DrivenStation, along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_policy

@@ -22,7 +22,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
-from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.cartesian_position_controller import CartesianPositionController

@@ -16,7 +16,7 @@ import yaml
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.overlap import MAX_SHRINK, OverlapError
+from guiderail.models.parts.assembly_check import MAX_SHRINK, OverlapError
 from guiderail.tools.parts.create_task import create_task
 from research.parts.pairs import Pair
 

@@ -11,7 +11,7 @@ from importlib.metadata import version
 import lazy_loader
 
 from guiderail.diagrams.tasks.registry import register_envs
-from guiderail.models.common.extras import explain_missing
+from guiderail.models.common.errors import explain_missing
 
 __version__ = version("guiderail")
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

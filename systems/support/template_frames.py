@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.declarations import declare_cache
 

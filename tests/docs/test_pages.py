@@ -118,7 +118,7 @@ def test_robot_page_has_the_limits_of_the_code():
     from guiderail.diagrams.hardware.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE
     from guiderail.diagrams.hardware.station import HardwareStation
     from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-    from guiderail.models.common.units import MM
+    from guiderail.models.common.transforms import MM
     from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
     from guiderail.models.objects.insertion import COLLISION_FORCE
     from guiderail.tools.hardware.sim_driver import START

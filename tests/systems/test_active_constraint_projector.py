@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.common.transforms import pose_to_transform
 from guiderail.models.templates import parse_template
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 

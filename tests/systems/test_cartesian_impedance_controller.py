@@ -22,7 +22,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import damping_matrix, spring_wrench
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
-from guiderail.systems.support.drake_poses import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 
 STIFFNESS = np.diag([1500.0, 1000.0, 800.0, 40.0, 30.0, 30.0])
 LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])

@@ -9,7 +9,7 @@ from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems import cartesian_position_controller
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
-from guiderail.systems.support.drake_poses import pose_to_transform, transform_to_pose
+from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_pose
 
 READY_POSTURE = np.array(IIWA14.home)
 START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])

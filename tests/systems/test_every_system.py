@@ -29,7 +29,7 @@ from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
-from guiderail.models.control.wrench_bound import WrenchBound
+from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.progress import StateProgress
 from guiderail.models.templates import load_template

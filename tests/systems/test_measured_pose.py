@@ -4,7 +4,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
 from guiderail.systems.measured_pose import MeasuredPose
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 X_WT = RigidTransform(RotationMatrix.MakeYRotation(0.2), [0.1, 0.2, 0.3])
 X_WP = RigidTransform(RotationMatrix.MakeXRotation(-2.1), [0.0, 0.3, 0.0])

@@ -11,7 +11,7 @@ from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.systems import MovedBodies, MujocoGantry
 
 FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # far above the jack

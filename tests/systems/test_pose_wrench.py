@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.systems import PoseWrench
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 STEP = 1e-6
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.wrench_bound import WrenchBound
+from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems import ReferenceGovernor
 
 STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(3, 95.0), np.full(3, 0.5)]

@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates import load_template
 from guiderail.systems.sct_input_mapping import SctInputMapping
 

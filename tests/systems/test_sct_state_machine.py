@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import transform_to_pose
+from guiderail.models.common.transforms import transform_to_pose
 from guiderail.models.templates import load_template
 from guiderail.systems.sct_state_machine import SctStateMachine
 

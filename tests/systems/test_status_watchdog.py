@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, StatusLimits
 from guiderail.systems.status_watchdog import StatusWatchdog
-from guiderail.systems.support.joint_dynamics import JointDynamics
+from guiderail.systems.support.drake_multibody import JointDynamics
 
 PERIOD = 1.0 / 256.0
 LIMITS = StatusLimits(velocity=(1.0, 1.0))

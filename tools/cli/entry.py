@@ -2,7 +2,7 @@
 
 import sys
 
-from guiderail.models.common.extras import explain_missing
+from guiderail.models.common.errors import explain_missing
 
 
 def main() -> None:

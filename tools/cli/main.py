@@ -10,8 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from guiderail.models.common.errors import InputError, RunsFailedError
-from guiderail.models.common.extras import explain_missing
+from guiderail.models.common.errors import InputError, RunsFailedError, explain_missing
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app
 from guiderail.tools.cli.output import print_message

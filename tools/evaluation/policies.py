@@ -20,12 +20,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.models.base_policy import BASE_POLICIES
-from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.extras import require_extra
+from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
+from guiderail.models.policy import BASE_POLICIES, MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
 from guiderail.tools.imports import import_modules, is_trusted

@@ -15,7 +15,7 @@ import pandas as pd
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import POLICY

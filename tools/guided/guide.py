@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.poses import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.bounds import DemonstratedBounds

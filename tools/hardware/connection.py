@@ -17,7 +17,7 @@ from guiderail.diagrams.hardware.lcm.driver import LcmDriver
 from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.tools.hardware.scenario import load_scenario
 

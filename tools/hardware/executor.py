@@ -24,7 +24,7 @@ from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState

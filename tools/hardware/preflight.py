@@ -12,7 +12,7 @@ from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.driver import Check
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.tools.hardware.operator import confirm
 from guiderail.tools.hardware.slow_motion import pose_distance
 

@@ -17,7 +17,7 @@ from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.control.joint_status import Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.connection import Log

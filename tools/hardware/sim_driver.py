@@ -20,7 +20,7 @@ from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.tools.hardware.part_randomization import subscribe_part_offsets
 from guiderail.tools.hardware.scenario import load_scenario
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from guiderail.models.common.poses import pose_difference
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM, pose_difference
 
 SPEED, ANGULAR_SPEED = 0.02, 0.1  # of a slow approach [m/s], [rad/s]
 MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum on the return path; slower segments are skipped [m/s], [rad/s]

@@ -20,8 +20,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.extras import require_extra
+from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Callback

@@ -13,9 +13,9 @@ import numpy as np
 from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
+from guiderail.models.parts.drake_check import Piece, piece_text
 from guiderail.models.parts.mesh_file import obj_text
-from guiderail.models.parts.pieces import Piece, piece_text
 from guiderail.models.parts.preparation import KINDS, ContactSurface, join_bodies, make_compliant
 
 MODULUS = 2e9  # first modulus of the compliant part [Pa]

@@ -12,19 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.models.parts.assembly_check import (
     MAX_RESTING_OVERLAP,
+    MAX_SHRINK,
     InsertionMotion,
+    check_target,
     compute_center_of_mass,
     find_obstructions,
     measure_side_clearance,
     plan_motion,
 )
+from guiderail.models.parts.assembly_check import shrink as shrink_part
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
-from guiderail.models.parts.overlap import MAX_SHRINK, check_target
-from guiderail.models.parts.overlap import shrink as shrink_part
 from guiderail.models.parts.preparation import ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.datasets.paths import check_new

@@ -17,7 +17,7 @@ from guiderail.diagrams.tasks.part.task import IN_SOCKET, TIME, Z, load_task_fol
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.parts.demonstrator import plan_search
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment

@@ -30,10 +30,10 @@ from guiderail.models.parts.demonstrator import (
     plan_search,
     plan_straight_insertion,
 )
-from guiderail.models.parts.surface_distance import SurfaceLocator
+from guiderail.models.parts.solids import SurfaceLocator
 from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 _VERTICES = 8  # number of vertices of a contact surface, those of the highest pressure, for which depth is measured
 _AT_REST = 1.0  # time at the end of a motion in which the plug does not move [s]

@@ -25,8 +25,7 @@ from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.envs.scene import Viewpoint
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.bounds import compute_bounds

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.geometry import Role
 from pydrake.systems.framework import Context, EventStatus
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.tools.evaluation.metrics import VIOLATION

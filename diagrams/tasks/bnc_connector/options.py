@@ -14,7 +14,7 @@ from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, in_ring
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 from guiderail.models.objects.insertion import COLLISION_FORCE

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, HALF_TURN_OF_WRENCH
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.reward_system import RewardTerm

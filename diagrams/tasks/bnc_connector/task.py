@@ -32,8 +32,7 @@ from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector import demonstrations as inserting
 from guiderail.models.objects.bnc_connector import search_demonstrations as searching
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS, RIM

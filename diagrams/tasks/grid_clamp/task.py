@@ -21,8 +21,7 @@ from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions, Inser
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION
 from guiderail.models.templates import SharedControlTemplate, load_template

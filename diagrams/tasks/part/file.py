@@ -16,9 +16,8 @@ from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_o
 from guiderail.diagrams.stations.station import ContactOptions
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
-from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATABILITY_STD
 from guiderail.models.parts.symmetry import SYMMETRIES

@@ -31,8 +31,7 @@ from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
-from guiderail.models.common.poses import POSE_SIZE
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.insertion import HISTORY_VARIANCE, LEVER_SCALE
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES

@@ -35,7 +35,7 @@ from guiderail.diagrams.tasks.pouring.rewards import AIM, reward_terms
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, Threshold
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import transform_to_pose
+from guiderail.models.common.transforms import transform_to_pose
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 

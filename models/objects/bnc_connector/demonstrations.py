@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.primitives import Demonstrations
 
 PATH = Path(__file__).with_name("bnc_connector.npz")

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.common.units import MM
-from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, equal_area_radius, lathe, strip
+from guiderail.models.common.transforms import MM
+from guiderail.models.objects.sdf import TriangleMesh, cylindrical, equal_area_radius, lathe, strip
 
 FOLDER = Path(__file__).parent
 JACK_SDF = FOLDER / "bnc_jack.sdf"

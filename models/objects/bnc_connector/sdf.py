@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions, bore_mesh, ring_mesh, slot_mesh
 from guiderail.models.objects.sdf import (
     ContactMaterial,
@@ -13,12 +13,12 @@ from guiderail.models.objects.sdf import (
     box,
     collision,
     cylinder,
+    equal_area_radius,
     generate_assets,
     mesh,
     model,
     visual,
 )
-from guiderail.models.objects.triangle_mesh import equal_area_radius
 
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.demonstrations import (
     CLEAR,
     LOCK_COMMAND,

@@ -6,8 +6,8 @@ import numpy as np
 
 from guiderail.models.objects.bnc_connector.geometry import BORE_SIDES, BncDimensions, slot_columns
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, PAD
+from guiderail.models.objects.sdf import cylindrical
 from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
-from guiderail.models.objects.triangle_mesh import cylindrical
 
 MAX_ANGLE = np.deg2rad(6.0)  # of a prism about the axis; its flat face is then 7 µm inside the circle
 # A rigid disc on a spring models the gasket, with the force of Drake's pad within 15 % up to 0.6 mm.

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.common.units import MM
-from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, lathe, strip
+from guiderail.models.common.transforms import MM
+from guiderail.models.objects.sdf import TriangleMesh, cylindrical, lathe, strip
 
 FOLDER = Path(__file__).parent
 CLAMP_SDF = FOLDER / "grid_clamp.sdf"

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.grid_clamp.geometry import (
     CLAMP_SDF,
     FOLDER,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions, peg_mesh
 from guiderail.models.objects.grid_clamp.sdf import BEAD, FRICTION
 from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_hulls

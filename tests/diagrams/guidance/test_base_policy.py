@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.models.base_policy import BASE_POLICIES
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import BASE_POLICIES
 
 KINDS = ("kgrl_base_policy", "residual_base_policy")
 

@@ -11,7 +11,7 @@ from guiderail.diagrams.hardware.monitor import MAX_REPEATS, MonitorState, Safet
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
-from guiderail.systems.support.joint_dynamics import JointDynamics
+from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME
 
 PERIOD = IiwaDriver.period

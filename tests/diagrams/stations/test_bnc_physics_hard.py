@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 

@@ -7,7 +7,7 @@ from guiderail import InputError, make_env
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 
 DOWN = np.array([0.0, 0.0, -1.0])
 CLAMP = {"fixture_offset": "none", "action_repeat": 25}  # without other random effects

@@ -9,7 +9,7 @@ from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 
 WORKCELL = GridClampWorkcell()
 SURFACE = WORKCELL.dimensions.peg_length  # height of the tips on the table, in T

@@ -11,7 +11,7 @@ from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 
 pytest.importorskip("mujoco")

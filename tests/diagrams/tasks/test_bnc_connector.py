@@ -13,7 +13,7 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import ALIGNMENT_REWARD, DEP
 from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, reference_trajectory, scripted_torque_search
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy

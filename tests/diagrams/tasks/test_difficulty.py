@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.grid_clamp import task as grid_clamp_options
 from guiderail.diagrams.tasks.grid_clamp.task import scripted_gentle_search, straight_descent
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.tools.evaluation.baselines import zero_policy

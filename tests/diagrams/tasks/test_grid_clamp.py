@@ -21,7 +21,7 @@ from guiderail.diagrams.tasks.grid_clamp.task import (
 )
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own

@@ -16,7 +16,7 @@ from guiderail.diagrams.tasks.part.file import Bounds, read_task_file
 from guiderail.diagrams.tasks.part.task import load_task_folder
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.triangle_mesh import lathe
+from guiderail.models.objects.sdf import lathe
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.imports import import_modules
 

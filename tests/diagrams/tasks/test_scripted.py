@@ -11,7 +11,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import (
 )
 from guiderail.diagrams.tasks.grid_clamp.task import CENTER, LANE_ENDS, LANES, SCALE, scripted_search
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import RIM
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 

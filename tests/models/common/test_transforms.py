@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform as DrakeTransform
 from pydrake.math import RollPitchYaw
 from pydrake.math import RotationMatrix as DrakeRotation
 
-from guiderail.models.common import poses
+from guiderail.models.common import transforms
 from guiderail.models.common.transforms import (
     RigidTransform,
     RotationMatrix,
@@ -17,7 +17,7 @@ from guiderail.models.common.transforms import (
     rpy_angles,
     rpy_rotation,
 )
-from guiderail.systems.support import drake_poses
+from guiderail.systems.support import drake_multibody
 
 same = np.testing.assert_array_equal
 
@@ -49,9 +49,11 @@ def test_rotations_equal_drakes_bit_by_bit():
 def test_poses_equal_drakes_bit_by_bit():
     for a, b in pairs():
         pose = np.concatenate([b, a])
-        same(poses.pose_to_transform(pose).GetAsMatrix34(), drake_poses.pose_to_transform(pose).GetAsMatrix34())
-        X = drake_poses.pose_to_transform(pose)
-        same(poses.transform_to_pose(X), drake_poses.transform_to_pose(X))
+        same(
+            transforms.pose_to_transform(pose).GetAsMatrix34(), drake_multibody.pose_to_transform(pose).GetAsMatrix34()
+        )
+        X = drake_multibody.pose_to_transform(pose)
+        same(transforms.transform_to_pose(X), drake_multibody.transform_to_pose(X))
 
 
 def test_transforms_compose_and_invert_as_drakes():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.wrench_bound import (
+from guiderail.models.control.wrench import (
     WrenchBound,
     approach_impedance,
     bounded_wrench,

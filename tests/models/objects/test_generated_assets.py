@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import sdf as bnc_sdf
 from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION

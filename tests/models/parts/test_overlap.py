@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from guiderail.models.parts.assembly_check import OverlapError, check_target, shrink
 from guiderail.models.parts.mesh_file import load_part
-from guiderail.models.parts.overlap import OverlapError, check_target, shrink
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 
 from guiderail.models.parts.assembly_check import make_solids, measure_side_clearance, plan_motion
-from guiderail.models.parts.drake_check import accepted_pieces
+from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import load_part
-from guiderail.models.parts.pieces import Piece
 from guiderail.models.parts.preparation import choose_tolerance, decimate, make_compliant, prepare_surfaces
 from guiderail.models.parts.simplification import crop_to_contact, simplify
-from guiderail.models.parts.solids import to_arrays
-from guiderail.models.parts.surface_distance import SurfaceLocator, measure_deviation
+from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, to_arrays
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")

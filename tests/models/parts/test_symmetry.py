@@ -2,7 +2,7 @@
 
 import pytest
 
-from guiderail.models.common.units import DEGREE
+from guiderail.models.common.transforms import DEGREE
 from guiderail.models.parts.assembly_check import plan_motion
 from guiderail.models.parts.symmetry import SYMMETRIES, find_symmetries
 

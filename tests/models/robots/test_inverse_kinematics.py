@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import find_robot
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 
 class Arm:

@@ -9,7 +9,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.robots.joint_range import JointRange
-from guiderail.systems.support.drake_poses import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform
 
 POSE = np.array([0.02, 0.03, 0.1, 0.7, 0.1, -0.2])
 MARGIN, SMALLEST = 0.1, 0.05

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import pose_to_transform
-from guiderail.models.common.transforms import RigidTransform, RotationMatrix
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import shape_constraints as sc
 from guiderail.models.templates.geometry import angle_between, largest, position_in

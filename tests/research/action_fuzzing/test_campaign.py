@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.drake_poses import transform_to_pose
+from guiderail.systems.support.drake_multibody import transform_to_pose
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, rollout
 from guiderail.tools.evaluation.step_log import read_step_log

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from research.benchmarks import engines
 from research.benchmarks.engines import OFFSETS, draw, even_lever, rigid_lever

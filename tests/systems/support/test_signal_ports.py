@@ -2,7 +2,7 @@ import pytest
 from pydrake.systems.framework import LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.signal_ports import SignalPorts
+from guiderail.systems.support.declarations import SignalPorts
 
 
 @pytest.fixture

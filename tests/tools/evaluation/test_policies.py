@@ -11,9 +11,8 @@ from onnx_file import linear_policy
 from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
-from guiderail.models.base_policy import BASE_POLICIES, chunk_samples, find_base_policy
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
+from guiderail.models.policy import BASE_POLICIES, Policy, chunk_samples, find_base_policy
 from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation import robustness as module

@@ -7,8 +7,7 @@ from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
 
 from guiderail import Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segment
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.poses import transform_to_pose
-from guiderail.models.common.transforms import RigidTransform
+from guiderail.models.common.transforms import RigidTransform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import UnsolvableError

@@ -1,6 +1,6 @@
 import numpy as np
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import demonstrations
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
 from research.generate.bnc_connector import TIMES as TIMES_RECORDED

@@ -12,7 +12,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import (
     FOLDER,
     BncDimensions,
@@ -22,7 +22,7 @@ from guiderail.models.objects.bnc_connector.geometry import (
     slot_mesh,
 )
 from guiderail.models.objects.bnc_connector.sdf import BARREL, barrel_sides, files, jack_sdf, main
-from guiderail.models.objects.triangle_mesh import TriangleMesh
+from guiderail.models.objects.sdf import TriangleMesh
 
 DIMENSIONS = BncDimensions()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import search_demonstrations as bnc_search
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS
 from research.generate.bnc_connector import FIRM_SEARCH_SESSION, SEARCH_SESSION, TIMES, record_one

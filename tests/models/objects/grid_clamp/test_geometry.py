@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from guiderail.models.common.units import MM
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.grid_clamp.geometry import (
     FOLDER,
     GridClampDimensions,

@@ -1,0 +1,40 @@
+"""Drake's multibody types: poses to and from its rigid transforms, and the joint dynamics of a plant."""
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+
+
+class JointDynamics:
+    """Mass matrix and torques of Coriolis forces and joint damping.
+
+    Args:
+        plant: Model of the arm and its payload alone, finalized.
+    """
+
+    def __init__(self, plant: MultibodyPlant):
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        self._plant, self._damping = plant, np.concatenate([joint.default_damping_vector() for joint in joints])
+
+    def evaluate(self, plant_context: Context) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mass matrix (n, n) and the torques (n,) [Nm] in the state of the plant's context."""
+        drag = self._plant.CalcBiasTerm(plant_context) + self._damping * self._plant.GetVelocities(plant_context)
+        return self._plant.CalcMassMatrix(plant_context), drag
+
+
+def pose_to_transform(pose: np.ndarray) -> RigidTransform:
+    """Return X = (Rz(a) Ry(b) Rx(c), [x y z]) of a pose [x y z a b c] (6,) [m, rad]."""
+    return RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
+
+
+def transform_to_pose(X: RigidTransform) -> np.ndarray:
+    """Return the pose (6,) of a transform, with a and c in (−π, π] and b in [−π/2, π/2] [m, rad]."""
+    return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
+
+
+def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
+    """Return the quaternion (η, ε) of R_desired Rᵀ with η ≥ 0, the shorter rotation, which has no singularity."""
+    q = (R_desired @ R.inverse()).ToQuaternion()
+    sign = 1.0 if q.w() >= 0.0 else -1.0
+    return sign * q.w(), sign * q.xyz()
