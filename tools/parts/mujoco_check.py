@@ -13,8 +13,8 @@ from guiderail.diagrams.tasks.part.file import PartModel, PartTaskFile
 from guiderail.diagrams.tasks.part.task import write_workcell
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.demonstrator import plan_straight_insertion
+from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
-from guiderail.models.parts.tetrahedra import piece_text
 from guiderail.tools.parts.trial import is_seated
 
 CHECK_SECONDS = 30  # CPU time of the insertions in MuJoCo [s]
