@@ -5,6 +5,7 @@ from .cartesian_position_controller import CartesianPositionController as Cartes
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .center_of_pressure import CenterOfPressure as CenterOfPressure
 from .chunk_reference import ChunkReference as ChunkReference
+from .chunk_safety_limiter import ChunkSafetyLimiter as ChunkSafetyLimiter
 from .command_disturbance import CommandDisturbance as CommandDisturbance
 from .command_filter import CommandFilter as CommandFilter
 from .command_watchdog import CommandWatchdog as CommandWatchdog

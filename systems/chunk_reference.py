@@ -32,7 +32,7 @@ class ChunkReference(LeafSystem):
     an observation of the command is not an algebraic loop.
 
     Args:
-        policy: Base policy (`models.policy`), a pure function.
+        policy: Base policy (`models.policy`), a pure function; None: the window is always the reference's.
         observation_size: n, at least 1.
         reference: Reference trajectory in control steps, for Σ_n and the first window.
         horizon: H, not negative.
@@ -46,7 +46,7 @@ class ChunkReference(LeafSystem):
 
     def __init__(
         self,
-        policy: BasePolicy,
+        policy: BasePolicy | None,
         observation_size: int,
         reference: ReferenceTrajectory,
         *,
@@ -92,7 +92,7 @@ class ChunkReference(LeafSystem):
         """
         state = context.get_discrete_state(self._state).value().copy()
         state[-1] += 1.0
-        if state[-1] % self._replan_steps == 0:
+        if self._policy is not None and state[-1] % self._replan_steps == 0:
             observation = self._observation_port.Eval(context).astype(np.float32)
             try:
                 samples = chunk_samples(self._policy, observation, self._reference.num_outputs)
@@ -105,7 +105,7 @@ class ChunkReference(LeafSystem):
         state = context.get_discrete_state(self._state).value()
         step, outputs = int(state[-1]), self._reference.num_outputs
         at = np.minimum(max(step, 0) + np.arange(self._horizon + 1), self._reference.num_steps - 1)
-        if step < 0:
+        if step < 0 or self._policy is None:
             means, covariances = self._reference.means[at], self._reference.covariances[at]
         else:
             first = step % self._replan_steps

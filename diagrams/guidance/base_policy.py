@@ -1,20 +1,29 @@
-"""Guidance around a base policy: KGRL and residual learning whose reference is the policy's chunks."""
+"""Guidance around a base policy: its chunks as KGRL's or a residual's reference, or guarded and executed."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator
-from pydrake.systems.framework import Diagram, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from guiderail.diagrams.envs.options import Integer, Number, Options
-from guiderail.diagrams.guidance.primitive import KgrlGuidance, primitive_config_of
+from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
+from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.policy import BASE_POLICIES, find_base_policy
 from guiderail.systems.chunk_reference import ChunkReference
+from guiderail.systems.chunk_safety_limiter import ChunkSafetyLimiter
+
+LIMIT_FACTOR = 2.0  # default limits of a guard, relative to the largest speed and jerk of the demonstrations
 
 
 class BasePolicyOptions(Options):
@@ -40,6 +49,126 @@ class BasePolicyOptions(Options):
         return value if value in BASE_POLICIES.names() else str(Path(value).resolve())
 
 
+class GuardOptions(BasePolicyOptions):
+    """Options of `base_policy`, which executes the chunks."""
+
+    guard: Literal["none", "projection", "slowdown"] = Field(
+        "projection",
+        description="filter of the chunks to the bounds, max_speed and max_jerk: the nearest chunk, a slower one on "
+        "the same path, or none",
+    )
+    max_jerk: Numbers = Field(
+        (),
+        description="largest jerk of a guarded command, like max_speed; default of both: twice the demonstrations'",
+    )
+
+    @field_validator("max_jerk")
+    @classmethod
+    def _check_positive(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        if not all(value > 0.0 for value in values):
+            raise ValueError("give positive numbers")
+        return values
+
+
+def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """Return the limits of velocity and jerk of a guard, (O,) each.
+
+    Args:
+        config: Demonstrations, for the default, and the limits of speed.
+        max_jerk: Limits of jerk: one for all outputs, one for position and one for angles, or O; () for the default.
+
+    Raises:
+        InputError: If there are other constraints of the motion, or the number of limits does not fit.
+    """
+    outputs, motion, period = config.num_outputs, config.motion, config.control_period
+    positions = min(outputs, 3)
+    if motion is not None and (
+        motion.outside or motion.inside or motion.state or np.isfinite(motion.max_acceleration).any()
+    ):
+        raise InputError("a guard limits speed and jerk inside linear bounds: leave max_acceleration and joints out")
+    limits = []
+    for order in (1, 3):
+        steps = np.abs(np.diff(config.reference.means, n=order, axis=0)).max(axis=0) / period**order
+        groups = (steps[:positions], steps[positions:])
+        limits.append(LIMIT_FACTOR * np.concatenate([np.full(len(one), one.max(initial=0.0)) for one in groups]))
+    velocity, jerk = limits
+    if motion is not None:
+        velocity = np.where(np.isfinite(motion.max_speed), motion.max_speed, velocity)
+    if max_jerk:
+        if len(max_jerk) not in (1, 2, outputs):
+            raise InputError(f"max_jerk is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(max_jerk)}")
+        angles = np.full(outputs - positions, (*max_jerk, np.inf)[1])
+        given = max_jerk if len(max_jerk) == outputs else np.append(np.full(positions, max_jerk[0]), angles)
+        jerk = np.where(np.isfinite(given), given, jerk)
+    return velocity, jerk
+
+
+class ChunkExecutionGuidance(PrimitiveGuidance):
+    """Guidance that commands chunks, behind a guard; the action has no effect. Exports ``rate`` too."""
+
+    def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False):
+        """Construct the guidance.
+
+        Args:
+            prior: Prior knowledge.
+            takes_window: Take the chunks from the input ``reference_window`` in place of the demonstrations' mean.
+
+        Raises:
+            InputError: If the guard cannot have the limits and constraints, or the motion waits for the robot.
+        """
+        super().__init__()
+        config, options, builder = primitive_config_of(prior), prior.options, DiagramBuilder()
+        if config.progress is not None:
+            raise InputError("a base policy is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
+        _, pose = self._export_inputs(builder, config)
+        outputs, points = config.num_outputs, config.horizon + 1
+        is_guarded = options["guard"] != "none"
+        # Not a Demultiplexer: Drake assumes that it depends on time, as `add_demonstration` explains.
+        means = np.eye(points * outputs if is_guarded else outputs, points * (outputs + outputs**2))
+        chunk = builder.AddNamedSystem("chunk", MatrixGain(D=means))
+        if takes_window:
+            builder.ExportInput(chunk.get_input_port(), "reference_window")
+        else:
+            reference = builder.AddNamedSystem("reference", _chunk_reference(prior, None, outputs))
+            builder.Connect(pose, reference.get_observation_input_port())
+            builder.Connect(reference.get_reference_window_output_port(), chunk.get_input_port())
+        if is_guarded:
+            velocity, jerk = guard_limits(config, options["max_jerk"])
+            guard = ChunkGuard(
+                config.constraints,
+                velocity,
+                jerk,
+                period=config.control_period,
+                start=config.constraints.nearest(config.reference.means[0]),
+                mode=options["guard"],
+            )
+            limiter = builder.AddNamedSystem(
+                "chunk_safety_limiter",
+                ChunkSafetyLimiter(guard, points, options["replan_steps"], config.control_period),
+            )
+            builder.Connect(chunk.get_output_port(), limiter.get_chunk_input_port())
+            builder.Connect(pose, limiter.get_pose_input_port())
+            builder.ExportOutput(limiter.get_rate_output_port(), "rate")
+            desired, fallback = limiter.get_desired_pose_output_port(), limiter.get_fallback_output_port()
+        else:
+            never = builder.AddNamedSystem("fallback", ConstantVectorSource([0.0]))
+            desired, fallback = chunk.get_output_port(), never.get_output_port()
+        self._finish(builder, replace(config, motion=None), desired, fallback)
+
+
+def _chunk_reference(prior: PriorKnowledge, source: str | None, observation_size: int) -> ChunkReference:
+    config, options = primitive_config_of(prior), prior.options
+    return ChunkReference(
+        None if source is None else find_base_policy(source),
+        observation_size,
+        config.reference,
+        horizon=config.horizon,
+        replan_steps=options["replan_steps"],
+        covariance_floor=options["covariance_floor"],
+        period=config.control_period,
+    )
+
+
 class _ChunkGuidance:
     """Mixin of guidance that takes its reference from a base policy."""
 
@@ -48,16 +177,7 @@ class _ChunkGuidance:
         super().__init__(prior, **arguments, takes_window=True)  # type: ignore[call-arg]
 
     def make_reference(self, observation_size: int) -> System:
-        config, options = primitive_config_of(self._prior), self._prior.options
-        return ChunkReference(
-            find_base_policy(options["base_policy"]),
-            observation_size,
-            config.reference,
-            horizon=config.horizon,
-            replan_steps=options["replan_steps"],
-            covariance_floor=options["covariance_floor"],
-            period=config.control_period,
-        )
+        return _chunk_reference(self._prior, self._prior.options["base_policy"], observation_size)
 
 
 class KgrlBasePolicyGuidance(_ChunkGuidance, KgrlGuidance):
@@ -66,6 +186,23 @@ class KgrlBasePolicyGuidance(_ChunkGuidance, KgrlGuidance):
 
 class ResidualBasePolicyGuidance(_ChunkGuidance, ResidualGuidance):
     """Bounded residual on a base policy (Policy Decorator; Yuan et al., 2024): p̂_t = p_t^base + Δp_t."""
+
+
+class BasePolicyGuidance(_ChunkGuidance, ChunkExecutionGuidance):
+    """Guidance that commands the chunks of a base policy, behind a guard."""
+
+
+@register_guidance(
+    "base_policy",
+    needs=(("demonstrations",),),
+    label="base policy",
+    color="#7f7f7f",
+    demonstrates=True,
+    options=GuardOptions,
+)
+def base_policy(prior: PriorKnowledge) -> Diagram:
+    """Build the execution of a base policy's chunks behind a guard."""
+    return BasePolicyGuidance(prior) if prior.options["base_policy"] else ChunkExecutionGuidance(prior)
 
 
 @register_guidance(

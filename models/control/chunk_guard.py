@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.sparse.csgraph import connected_components
 
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.primitives.constraints import LinearConstraints
+from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.qp import UnsolvableError, find_solver, solve_least_norm
 
 MODES = ("projection", "slowdown")
 RATES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)  # speeds along the chunk that a slowdown tries
 SAMPLES = 10  # of the path, per step of a chunk
+MIN_STEPS = 4  # of a chunk: it ends at rest
 MARGIN = 1e-4  # share of each limit that is left to the solver's rounding errors
 
 
@@ -45,12 +47,15 @@ class ChunkGuard:
     limits whatever happens; it is repeated if the solver finds no other. The mode "slowdown" preserves the path: it
     advances along the chunk at the greatest of `RATES` whose projection stays within a tolerance of the path.
 
+    The limits couple the steps of an output, and outputs only where a constraint has several of them: each group of
+    coupled outputs has a quadratic program of its own.
+
     Args:
         constraints: Bounds of every output, G y ≥ c.
         velocity: Velocity limits v (O,) [unit/s], positive.
         jerk: Jerk limits j (O,) [unit/s³], positive.
         period: T, control period [s], positive.
-        start: Output (O,) at rest inside the constraints, from which the motion starts.
+        start: Output (O,) at rest inside the constraints, from which the motion starts; see `reset`.
         mode: "projection" or "slowdown".
         tolerance: Distance from the path (O,) that a slowdown accepts [unit]; a tenth of v T by default.
 
@@ -79,15 +84,25 @@ class ChunkGuard:
             raise InputError(f"a control period is positive, not {period}")
         if mode not in MODES:
             raise InputError(f"a guard's mode is {' or '.join(MODES)}, not {brief(mode)}")
-        start = as_numbers(start, "the start")
-        if start.shape != (outputs,) or not constraints.violation(start) <= 0.0:
-            raise InputError(f"a guard starts from {outputs} numbers inside the constraints, not {brief(start)}")
-        self._constraints, self._mode = constraints, mode
+        self.constraints, self._mode = constraints, mode
         self._step, self._jerk = limits[0] * period, limits[1] * period**3
         self._tolerance = 0.1 * self._step if tolerance is None else as_numbers(tolerance, "tolerance")
+        coupled = (constraints.G != 0).T.astype(float) @ (constraints.G != 0)
+        number, labels = connected_components(coupled, directed=False)
+        self._groups = [np.flatnonzero(labels == group) for group in range(number)]
         self._solve = find_solver("daqp")
-        self._past = np.tile(start, (3, 1))
-        self._plan = start[None]
+        self.reset(start)
+
+    def reset(self, start: np.ndarray) -> None:
+        """Start again at rest at an output (O,) inside the constraints.
+
+        Raises:
+            InputError: If it has the wrong shape or violates a constraint.
+        """
+        start, outputs = as_numbers(start, "the start"), self.constraints.num_outputs
+        if start.shape != (outputs,) or not self.constraints.violation(start) <= TOLERANCE:
+            raise InputError(f"a guard starts from {outputs} numbers inside the constraints, not {brief(start)}")
+        self._past, self._plan = np.tile(start, (3, 1)), start[None]
 
     def guard(self, chunk: np.ndarray, num_executed: int | None = None) -> GuardedChunk:
         """Return the chunk within the limits, and continue after its first steps.
@@ -99,28 +114,45 @@ class ChunkGuard:
         Raises:
             InputError: If the chunk has the wrong shape or is not finite, or fewer than four steps.
         """
+        result = self.limit(chunk, self._past, self._plan)
+        number = len(result.outputs) if num_executed is None else num_executed
+        self._past = np.concatenate([self._past, result.outputs[:number]])[-3:]
+        self._plan = result.outputs[min(number, len(result.outputs) - 1) :]
+        return result
+
+    def limit(self, chunk: np.ndarray, past: np.ndarray, plan: np.ndarray) -> GuardedChunk:
+        """Return the chunk within the limits after a given past, without a change of the guard.
+
+        Args:
+            chunk: Requested outputs (K, O), from the next control step on.
+            past: Last three executed outputs (3, O).
+            plan: Rest of the previous result (n, O), n at least 1, repeated if no chunk within the limits is found.
+
+        Raises:
+            InputError: As `guard`.
+        """
         requested = as_numbers(chunk, "a chunk")
-        outputs = self._constraints.num_outputs
-        if requested.ndim != 2 or requested.shape[1] != outputs or len(requested) < 4:
+        outputs = self.constraints.num_outputs
+        if requested.ndim != 2 or requested.shape[1] != outputs or len(requested) < MIN_STEPS:
             raise InputError(f"a chunk has at least four steps of {outputs} outputs, not {brief(requested.shape)}")
         if not np.isfinite(requested).all():
             raise InputError("a chunk must be finite")
-        found = self._slow_down(requested) if self._mode == "slowdown" else (self._project(requested), 1.0)
-        held = self._plan[np.minimum(np.arange(len(requested)), len(self._plan) - 1)]
-        result = GuardedChunk(held, 0.0, True) if found[0] is None else GuardedChunk(found[0], found[1], False)
-        number = len(requested) if num_executed is None else num_executed
-        self._past = np.concatenate([self._past, result.outputs[:number]])[-3:]
-        self._plan = result.outputs[min(number, len(requested) - 1) :]
-        return result
+        if self._mode == "slowdown":
+            limited, rate = self._slow_down(requested, past)
+        else:
+            limited, rate = self._project(requested, past), 1.0
+        if limited is None:
+            return GuardedChunk(plan[np.minimum(np.arange(len(requested)), len(plan) - 1)], 0.0, True)
+        return GuardedChunk(limited, rate, False)
 
-    def _slow_down(self, chunk: np.ndarray) -> tuple[np.ndarray | None, float]:
+    def _slow_down(self, chunk: np.ndarray, past: np.ndarray) -> tuple[np.ndarray | None, float]:
         """Return the projection of the chunk at the greatest rate that preserves its path, and that rate."""
-        points = np.concatenate([self._past[-1:], chunk])
+        points = np.concatenate([past[-1:], chunk])
         projected = None
         for rate in RATES:
             at = rate / SAMPLES * np.arange(SAMPLES * len(chunk) + 1)
             path = np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])
-            projected = self._project(path[SAMPLES::SAMPLES])
+            projected = self._project(path[SAMPLES::SAMPLES], past)
             if projected is None:
                 continue
             # The result may lag behind on the path: a motion from rest does.
@@ -129,49 +161,69 @@ class ChunkGuard:
                 return projected, rate
         return projected, 0.0
 
-    def _project(self, chunk: np.ndarray) -> np.ndarray | None:
+    def _project(self, chunk: np.ndarray, past: np.ndarray) -> np.ndarray | None:
         """Return the nearest chunk (K, O) within the limits, or None if the solver finds none."""
-        steps, outputs = chunk.shape
-        sequence = np.eye(steps + 3)
-        velocity = np.diff(sequence, axis=0)[2:]
-        jerk = np.diff(sequence, n=3, axis=0)
-        rest = np.diff(sequence, axis=0)[-2:]
-        rows, lower, upper = [], [], []
-        for output in range(outputs):
-            differences = np.concatenate([velocity / self._step[output], jerk / self._jerk[output], rest])
-            bounds = np.concatenate([np.full(len(velocity) + len(jerk), 1.0 - MARGIN), np.zeros(len(rest))])
-            offset = differences[:, :3] @ self._past[:, output] + differences[:, 3:] @ chunk[:, output]
-            rows.append(differences[:, 3:] * self._step[output])
-            lower.append(-bounds - offset)
-            upper.append(bounds - offset)
-        scaled = self._constraints.G * self._step  # rows of all steps, for variables in units of v T
-        A = np.concatenate(
-            [
-                block_diag(*rows)[:, np.arange(outputs * steps).reshape(outputs, steps).T.ravel()],
-                np.kron(np.eye(steps), scaled),
-            ]
-        )
-        slack = (self._constraints.c[None] - chunk @ self._constraints.G.T).ravel()
-        low = np.concatenate([*lower, slack + MARGIN * np.tile(np.linalg.norm(scaled, axis=1), steps)])
-        high = np.concatenate([*upper, np.full(len(slack), np.inf)])
-        if self.is_within(chunk) and (chunk[-3:] == chunk[-1]).all():
+        if self.is_within(chunk, past) and (chunk[-3:] == chunk[-1]).all():
             return chunk.copy()
-        size = np.linalg.norm(A, axis=1)
-        kept = size > 0
-        A, low, high = A[kept] / size[kept, None], low[kept] / size[kept], high[kept] / size[kept]
+        projected = chunk.copy()
         try:
-            v, _ = solve_least_norm(A, low, high, self._solve)
+            for group in self._groups:
+                projected[:, group] += self._correction(chunk, past, group)
         except UnsolvableError:
             return None
-        found = chunk + self._step * v.reshape(steps, outputs)
-        found[-2:] = found[-3]  # exactly at rest
-        return found if self.is_within(found) else None
+        projected[-2:] = projected[-3]  # exactly at rest
+        return projected if self.is_within(projected, past) else None
 
-    def is_within(self, chunk: np.ndarray) -> bool:
-        """Return True if a chunk (K, O) that continues the executed outputs is within all limits."""
-        motion = np.concatenate([self._past, chunk])
+    def _correction(self, chunk: np.ndarray, past: np.ndarray, group: np.ndarray) -> np.ndarray:
+        """Return the correction (K, n) of the outputs of a group (n,).
+
+        Raises:
+            UnsolvableError: If the solver finds none.
+        """
+        steps, size = len(chunk), len(group)
+        velocity, jerk, rest = _differences(steps)
+        sequence = np.concatenate([past[:, group], chunk[:, group]])
+        rows, low, high = [], [], []
+        for index, output in enumerate(group):
+            differences = np.concatenate([velocity / self._step[output], jerk / self._jerk[output], rest])
+            bounds = np.concatenate([np.full(len(velocity) + len(jerk), 1.0 - MARGIN), np.zeros(len(rest))])
+            offset = differences @ sequence[:, index]
+            block = np.zeros((len(differences), steps, size))
+            block[:, :, index] = differences[:, 3:] * self._step[output]
+            rows.append(block.reshape(-1, steps * size))
+            low.append(-bounds - offset)
+            high.append(bounds - offset)
+        used = (self.constraints.G[:, group] != 0).any(axis=1)
+        G, c = self.constraints.G[used][:, group], self.constraints.c[used]
+        scaled = G * self._step[group]  # for variables in units of v T
+        slack = (c - chunk[:, group] @ G.T).ravel()
+        rows.append(np.kron(np.eye(steps), scaled))
+        low.append(slack + MARGIN * np.tile(np.linalg.norm(scaled, axis=1), steps))
+        high.append(np.full(len(slack), np.inf))
+        A, lower, upper = np.concatenate(rows), np.concatenate(low), np.concatenate(high)
+        if (lower <= 0.0).all() and (upper >= 0.0).all():
+            return np.zeros((steps, size))
+        length = np.linalg.norm(A, axis=1)
+        kept = length > 0
+        if (lower[~kept] > 0.0).any() or (upper[~kept] < 0.0).any():
+            raise UnsolvableError("the executed outputs violate a limit")
+        v, _ = solve_least_norm(
+            A[kept] / length[kept, None], lower[kept] / length[kept], upper[kept] / length[kept], self._solve
+        )
+        return self._step[group] * v.reshape(steps, size)
+
+    def is_within(self, chunk: np.ndarray, past: np.ndarray | None = None) -> bool:
+        """Return True if a chunk (K, O) is within all limits after a past (3, O), by default the executed outputs."""
+        motion = np.concatenate([self._past if past is None else past, chunk])
         return bool(
             (np.abs(np.diff(motion, axis=0)[2:]) <= self._step).all()
             and (np.abs(np.diff(motion, n=3, axis=0)) <= self._jerk).all()
-            and (chunk @ self._constraints.G.T >= self._constraints.c).all()
+            and (chunk @ self.constraints.G.T >= self.constraints.c).all()
         )
+
+
+@lru_cache(maxsize=16)
+def _differences(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the matrices of velocity, jerk and the last two velocities of three past and `steps` future outputs."""
+    first = np.diff(np.eye(steps + 3), axis=0)
+    return first[2:], np.diff(np.eye(steps + 3), n=3, axis=0), first[-2:]

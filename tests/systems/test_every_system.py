@@ -25,6 +25,7 @@ from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
@@ -94,6 +95,9 @@ def built():
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
         systems.ChunkReference(
             lambda seen: seen, 2, primitive(0).reference, horizon=1, replan_steps=1, covariance_floor=1.0, period=PERIOD
+        ),
+        systems.ChunkSafetyLimiter(
+            ChunkGuard(BOX, np.ones(2), np.ones(2), period=PERIOD, start=np.zeros(2)), 4, 2, PERIOD
         ),
         systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
         systems.MeanForce(2, 4, PERIOD),

@@ -89,3 +89,50 @@ def test_spread_of_the_chunks_widens_what_an_action_reaches(registered):
         commands = [run(env, np.tile([action, 0.0], (3, 1))).commanded[-1, 0] for action in (0.0, 1.0)]
         reached[name] = commands[1] - commands[0]
     assert reached["disagree"] > reached["agree"] + 0.01
+
+
+@pytest.mark.parametrize("guard", ["projection", "slowdown"])
+def test_guarded_chunks_are_within_bounds_speed_and_jerk(guard, registered):
+    random, limits = np.random.default_rng(2), {"max_speed": (0.3,), "max_jerk": (40.0,), "horizon": 11}
+    registered("jumps", lambda observation: np.tile(random.uniform(-1.0, 1.0, 2), (8, 1)))
+    options = {"guidance": "base_policy", "base_policy": "jumps", "action_repeat": 1, **limits}
+    env = make_env("NarrowPassage", guard=guard, **options)
+    trace = run(env, np.ones((60, 2)))
+    period = trace.period
+    assert np.abs(np.diff(trace.commanded, axis=0)).max() <= 0.3 * period
+    assert np.abs(np.diff(trace.commanded, n=3, axis=0)).max() <= 40.0 * period**3
+    assert trace.signals["commanded_violation"].max() <= 1e-9
+    assert np.ptp(trace.commanded, axis=0).max() > 0.01
+    free = run(make_env("NarrowPassage", guard="none", **options), np.ones((60, 2))).commanded
+    assert np.abs(np.diff(free, axis=0)).max() > 10 * 0.3 * period
+
+
+def test_unguarded_chunks_are_commanded_as_they_are(registered):
+    registered("line", lambda observation: np.outer(np.arange(1.0, 9.0), [1e-3, 2e-3]))
+    env = make_env("NarrowPassage", guidance="base_policy", base_policy="line", guard="none", replan_steps=4)
+    commanded = run(env, np.zeros((8, 2))).commanded
+    np.testing.assert_allclose(commanded[:8], np.outer(np.tile(np.arange(1.0, 5.0), 2), [1e-3, 2e-3]), atol=1e-12)
+
+
+def test_demonstrations_pass_the_default_guard_unchanged():
+    guarded, plain = (
+        run(make_env("NarrowPassage", guidance="base_policy", guard=guard, action_repeat=20), np.zeros((4, 2)))
+        for guard in ("projection", "none")
+    )
+    np.testing.assert_allclose(guarded.commanded[15:], plain.commanded[15:], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"max_jerk": (1.0, 1.0, 1.0)}, "max_jerk is 1, 2"),
+        ({"max_jerk": (-1.0,)}, "positive"),
+        ({"max_acceleration": (1.0,)}, "leave max_acceleration"),
+        ({"replan_steps": 42}, "steps"),
+        ({"progress": "state"}, "clock"),
+        ({"guard": "brake"}, "brake"),
+    ],
+)
+def test_guard_is_refused_when_an_option_does_not_fit(options, words):
+    with pytest.raises(InputError, match=words):
+        make_env("NarrowPassage", guidance="base_policy", **options)

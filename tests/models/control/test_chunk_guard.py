@@ -68,3 +68,24 @@ def test_guard_is_refused_when_an_argument_is_out_of_range():
         with pytest.raises(InputError, match="chunk"):
             make().guard(chunk)
     make().guard(np.zeros((4, 2)))
+
+
+def test_constraint_on_two_outputs_holds_and_couples_only_them():
+    slanted = LinearConstraints([[-1.0, -1.0, 0.0]], [-0.02])  # x + y <= 0.02
+    limits = (np.full(3, 0.2), np.full(3, 100.0))
+    coupled = ChunkGuard(slanted, *limits, period=PERIOD, start=np.zeros(3))
+    outputs = coupled.guard(np.tile([0.02, 0.02, 0.03], (30, 1))).outputs
+    assert (outputs[:, 0] + outputs[:, 1] <= 0.02).all()
+    np.testing.assert_allclose(outputs[-1], [0.01, 0.01, 0.03], atol=1e-4)
+    alone = ChunkGuard(LinearConstraints.none(1), [0.2], [100.0], period=PERIOD, start=np.zeros(1))
+    np.testing.assert_allclose(outputs[:, 2:], alone.guard(np.full((30, 1), 0.03)).outputs, atol=1e-9)
+
+
+def test_guard_starts_again_at_rest_after_a_reset():
+    guard, chunk = make(), np.tile([0.01, -0.02], (STEPS, 1))
+    first = guard.guard(chunk, 4).outputs
+    assert (guard.guard(chunk, 4).outputs != first).any()
+    guard.reset(np.zeros(2))
+    assert (guard.guard(chunk, 4).outputs == first).all()
+    with pytest.raises(InputError, match="inside"):
+        guard.reset(np.array([0.0, 0.031]))

@@ -1,0 +1,121 @@
+"""Limiter of the chunks of a policy to bounds, velocity and jerk limits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.chunk_guard import MIN_STEPS, ChunkGuard
+from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    outputs: np.ndarray
+    rate: float
+    fallback: float
+
+
+class ChunkSafetyLimiter(LeafSystem):
+    """Command the chunks of a policy within bounds, velocity and jerk limits (`ChunkGuard`).
+
+    Every ``replan_steps`` control steps, from the first one on, the chunk is limited as a continuation of the last
+    three commands. In between, the limited chunk is executed. The motion starts at rest at the measured pose, or at the
+    nearest one inside the bounds.
+
+    .. pydrake_system::
+
+        name: ChunkSafetyLimiter
+        input_ports:
+        - chunk
+        - pose
+        output_ports:
+        - desired_pose
+        - rate
+        - fallback
+
+    ``chunk`` is (K*O,), requested outputs (K, O), row-major, the current control step first, and constant during a
+    control step. ``pose`` is the measured pose (O,), read at initialization. ``desired_pose`` is (O,). ``rate`` (1,) is
+    the speed along the chunk relative to the chunk's: below 1 only with the mode "slowdown", and at a fallback.
+    ``fallback`` (1,) is 1 if the rest of the previous chunk is executed because no chunk within the limits was found,
+    or the requested one is not finite.
+
+    Args:
+        guard: Limits and mode, for O outputs; its state is not used.
+        num_steps: Number K of steps of a chunk, at least 4 and at least `replan_steps`.
+        replan_steps: Control steps that are executed of a chunk, at least 1.
+        period: Control period [s], that of the guard.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, guard: ChunkGuard, num_steps: int, replan_steps: int, period: float):
+        super().__init__()
+        check_period(period)
+        if not 1 <= replan_steps <= num_steps or num_steps < MIN_STEPS:
+            raise InputError(
+                f"a chunk has at least {MIN_STEPS} steps, 1 to all of which are executed, not {num_steps} and "
+                f"{replan_steps}"
+            )
+        self._guard, self._num_steps, self._replan_steps = guard, num_steps, replan_steps
+        self._outputs = guard.constraints.num_outputs
+        self._chunk_port = self.DeclareVectorInputPort("chunk", num_steps * self._outputs)
+        self._pose_port = self.DeclareVectorInputPort("pose", self._outputs)
+        # [last three commands and rest of the limited chunk (3 + K, O); rate, fallback, control steps since the start]
+        self._state = self.DeclareDiscreteState((3 + num_steps) * self._outputs + 3)
+        self._plan = declare_cache(
+            self,
+            "plan",
+            self._calc_plan,
+            prerequisites_of_calc={self._chunk_port.ticket(), self.discrete_state_ticket(self._state)},
+        )
+        plan = {self._plan.ticket()}
+        self._desired_pose_port = self.DeclareVectorOutputPort(
+            "desired_pose", self._outputs, self._calc_desired_pose, prerequisites_of_calc=plan
+        )
+        self._rate_port = self.DeclareVectorOutputPort("rate", 1, self._calc_rate, prerequisites_of_calc=plan)
+        self._fallback_port = self.DeclareVectorOutputPort(
+            "fallback", 1, self._calc_fallback, prerequisites_of_calc=plan
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
+
+    get_chunk_input_port = input_getter("chunk", "requested outputs, (K*O,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,), read at initialization")
+    get_desired_pose_output_port = output_getter("desired_pose", "command within the limits, (O,)")
+    get_rate_output_port = output_getter("rate", "speed along the chunk relative to the chunk's, (1,)")
+    get_fallback_output_port = output_getter("fallback", "flag that the previous chunk is executed further, (1,)")
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        start = self._guard.constraints.nearest(self._pose_port.Eval(context))
+        discrete_state.set_value(np.append(np.tile(start, 3 + self._num_steps), [1.0, 0.0, 0.0]))
+
+    def _calc_plan(self, context: Context) -> _Plan:
+        *motion, rate, fallback, step = context.get_discrete_state(self._state).value()
+        past, rest = np.split(np.reshape(motion, (-1, self._outputs)), [3])
+        if step % self._replan_steps != 0:
+            return _Plan(rest, rate, fallback)
+        requested = self._chunk_port.Eval(context).reshape(rest.shape)
+        if not np.isfinite(requested).all():
+            return _Plan(rest, 0.0, 1.0)
+        limited = self._guard.limit(requested, past, rest)
+        return _Plan(limited.outputs, limited.rate, float(limited.is_fallback))
+
+    def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # No command has been executed at time zero; see `HistoryBuffer`.
+        if context.get_time() > 0:
+            state, plan = context.get_discrete_state(self._state).value(), self._plan.Eval(context)
+            past = state[self._outputs : 3 * self._outputs]
+            values = [past, plan.outputs.ravel(), plan.outputs[-1], [plan.rate, plan.fallback, state[-1] + 1.0]]
+            discrete_state.set_value(np.concatenate(values))
+
+    def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._plan.Eval(context).outputs[0])
+
+    def _calc_rate(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._plan.Eval(context).rate)
+
+    def _calc_fallback(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._plan.Eval(context).fallback)

@@ -1,0 +1,87 @@
+"""Chunks behind the guard in a diagram: limits at every command, replanning, fallbacks, and the start."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ZeroOrderHold
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.chunk_guard import ChunkGuard
+from guiderail.models.primitives import LinearConstraints
+from guiderail.systems.chunk_safety_limiter import ChunkSafetyLimiter
+
+PERIOD, STEPS, REPLAN = 0.02, 12, 4
+VELOCITY, JERK, BOUND = np.array([0.1, 0.2]), np.array([50.0, 100.0]), np.array([0.05, 0.03])
+
+
+def guard(mode="projection"):
+    box = LinearConstraints.box(-BOUND, BOUND)
+    return ChunkGuard(box, VELOCITY, JERK, period=PERIOD, start=np.zeros(2), mode=mode)
+
+
+def run(chunks, pose=(0.0, 0.0), mode="projection"):
+    """Return commands (n, 2), rates (n,) and fallbacks (n,) at the control steps of chunks (n, K, O)."""
+    builder = DiagramBuilder()
+    system = builder.AddSystem(ChunkSafetyLimiter(guard(mode), STEPS, REPLAN, PERIOD))
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, STEPS * 2))  # constant during a control step
+    builder.Connect(hold.get_output_port(), system.get_chunk_input_port())
+    builder.ExportInput(hold.get_input_port(), "chunk")
+    builder.ExportInput(system.get_pose_input_port(), "pose")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    diagram.GetInputPort("pose").FixValue(context, np.asarray(pose))
+    port, found = diagram.GetInputPort("chunk").FixValue(context, np.ravel(chunks[0])), []
+    ports = system.get_desired_pose_output_port(), system.get_rate_output_port(), system.get_fallback_output_port()
+    for step, chunk in enumerate(chunks):
+        port.GetMutableData().set_value(np.ravel(chunk))
+        simulator.AdvanceTo(PERIOD * (step + 0.5))
+        found.append(np.concatenate([one.Eval(system.GetMyContextFromRoot(context)) for one in ports]))
+    return np.array(found)[:, :2], np.array(found)[:, 2], np.array(found)[:, 3]
+
+
+@pytest.mark.parametrize("mode", ["projection", "slowdown"])
+def test_every_command_is_within_the_limits_for_any_chunks(mode):
+    chunks = np.random.default_rng(0).uniform(-0.2, 0.2, (60, 1, 2)) * np.ones((1, STEPS, 1))
+    commands, _, fallback = run(chunks, mode=mode)
+    motion = np.concatenate([np.zeros((3, 2)), commands])
+    assert (np.abs(np.diff(motion, axis=0)) <= VELOCITY * PERIOD).all()
+    assert (np.abs(np.diff(motion, n=3, axis=0)) <= JERK * PERIOD**3).all()
+    assert (np.abs(motion) <= BOUND).all()
+    assert np.ptp(commands, axis=0).min() > 0.005
+    assert not fallback.all()
+
+
+def test_commands_are_those_of_the_guard_without_a_diagram():
+    chunks = np.random.default_rng(1).uniform(-0.02, 0.02, (12, STEPS, 2))
+    plain = guard()
+    expected = np.concatenate([plain.guard(chunks[step], REPLAN).outputs[:REPLAN] for step in range(0, 12, REPLAN)])
+    assert (run(chunks)[0] == expected).all()
+
+
+def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite():
+    chunks = np.full((3 * REPLAN, STEPS, 2), np.nan)
+    chunks[:REPLAN] = [0.03, 0.01]
+    commands, rate, fallback = run(chunks)
+    expected = guard().guard(chunks[0]).outputs
+    assert (commands[:STEPS] == expected).all()
+    assert (fallback == np.repeat([0.0, 1.0, 1.0], REPLAN)).all()
+    assert (rate == 1.0 - fallback).all()
+
+
+def test_motion_starts_at_the_nearest_pose_inside_the_bounds():
+    inside, outside = [0.02, -0.03], [0.2, -0.03]
+    for pose, start in ((inside, inside), (outside, [0.05, -0.03])):
+        commands, *_ = run(np.tile(start, (REPLAN, STEPS, 1)), pose)
+        np.testing.assert_allclose(commands, np.tile(start, (REPLAN, 1)), atol=1e-5)
+        assert (np.abs(commands) <= BOUND).all()
+
+
+def test_argument_is_refused_when_it_is_out_of_range():
+    for steps, replan in ((3, 1), (12, 0), (12, 13)):
+        with pytest.raises(InputError, match="chunk"):
+            ChunkSafetyLimiter(guard(), steps, replan, PERIOD)
+    with pytest.raises(InputError, match="period"):
+        ChunkSafetyLimiter(guard(), 4, 4, 0.0)
+    ChunkSafetyLimiter(guard(), 4, 4, PERIOD)
