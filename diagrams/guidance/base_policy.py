@@ -83,7 +83,7 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     outputs, motion, period = config.num_outputs, config.motion, config.control_period
     positions = min(outputs, 3)
     if motion is not None and (
-        motion.outside or motion.inside or motion.state or np.isfinite(motion.max_acceleration).any()
+        motion.outside or motion.inside or motion.state or np.isfinite(np.asarray(motion.max_acceleration)).any()
     ):
         raise InputError("a guard limits speed and jerk inside linear bounds: leave max_acceleration and joints out")
     limits = []
@@ -93,7 +93,8 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
         limits.append(LIMIT_FACTOR * np.concatenate([np.full(len(one), one.max(initial=0.0)) for one in groups]))
     velocity, jerk = limits
     if motion is not None:
-        velocity = np.where(np.isfinite(motion.max_speed), motion.max_speed, velocity)
+        speed = np.asarray(motion.max_speed, dtype=float)
+        velocity = np.where(np.isfinite(speed), speed, velocity)
     if max_jerk:
         if len(max_jerk) not in (1, 2, outputs):
             raise InputError(f"max_jerk is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(max_jerk)}")
