@@ -269,7 +269,15 @@ def test_own_task_is_fuzzed_with_every_guidance():
     declare()
     found = fuzz("lab/Own", episodes=3)
     assert found["failures"] == []
-    assert found["cases"].keys() <= {"kgrl", "kgrl_base_policy", "kmp", "residual", "residual_base_policy", "skgrl"}
+    assert found["cases"].keys() <= {
+        "base_policy",
+        "kgrl",
+        "kgrl_base_policy",
+        "kmp",
+        "residual",
+        "residual_base_policy",
+        "skgrl",
+    }
     assert found["all"]["episodes"] == 3
 
 
