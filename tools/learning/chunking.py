@@ -95,12 +95,11 @@ class ChunkLearner(BcLearner):
             torch.manual_seed(self._seed)
             sizes = [observations.shape[1], *self.config.net_arch, chunks.shape[1]]
             members = [_perceptron(sizes) for _ in range(self.config.members)]
-        groups, losses = np.array(self._groups), []
+        losses = []
         for index, network in enumerate(members):
             random = np.random.default_rng([self._seed, index])
             generator = torch.Generator().manual_seed(int(random.integers(2**62)))
-            drawn = random.integers(1, self.episodes + 1, size=self.episodes)  # bootstrap sample of demonstrations
-            rows = np.concatenate([np.flatnonzero(groups == one) for one in drawn])
+            rows = self._training_rows(random)
             optimizer = torch.optim.Adam(network.parameters(), lr=self.config.learning_rate)
             for _ in range(self.config.gradient_steps):
                 batch = rows[random.integers(len(rows), size=self.config.batch_size)]
@@ -113,6 +112,12 @@ class ChunkLearner(BcLearner):
                 optimizer.step()
             losses.append(loss.item())
         self.network, self._loss = torch.nn.Sequential(*members), float(np.mean(losses))
+
+    def _training_rows(self, random: np.random.Generator) -> np.ndarray:
+        """Return the rows that a network is trained on: those of a bootstrap sample of the demonstrations."""
+        groups = np.array(self._groups)
+        drawn = random.integers(1, self.episodes + 1, size=self.episodes)
+        return np.concatenate([np.flatnonzero(groups == one) for one in drawn])
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """Return the base policy: the ensemble as one network, whose output is limited to the demonstrated range."""

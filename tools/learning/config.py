@@ -176,6 +176,27 @@ class ChunkConfig(BcConfig):
     )
 
 
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class DistillationConfig(ChunkConfig):
+    """Settings of policy distillation, which trains a base policy on the commands of a trained KGRL policy."""
+
+    algorithm: str = "distillation"
+    demonstration_episodes: NonNegative = 0  # always 0: the teacher acts in every episode
+    teacher: str = ""  # folder of the teacher's run, or pretrained:NAME
+    action_noise: Annotated[float, Field(ge=0, le=1)] = 0.2  # standard deviation added to the teacher's actions
+    noisy_copies: NonNegative = 4  # of each observation, labeled by the teacher
+    copy_noise: Annotated[float, Field(ge=0, le=10)] = 0.2  # of a copy, relative to the spread of each observed number
+    members: Annotated[Positive, Field(le=50)] = 1  # E, networks of the ensemble
+    net_arch: NetArch = (128, 128)  # units of the hidden layers
+    batch_size: BatchSize = 256  # observations
+    gradient_steps: Positive = 8000  # after the last episode
+    observation_noise: Annotated[float, Field(ge=0, le=10)] = 0.0  # added without a change of the label
+
+    def __post_init__(self) -> None:
+        if self.demonstration_episodes:
+            raise InputError("distillation learns from its teacher: leave demonstration_episodes out")
+
+
 register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
 register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
 register_learner("td3", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "Td3Learner", Td3Config))
@@ -183,6 +204,10 @@ register_learner("crossq", DeferredLearner("guiderail.tools.learning.sb3_algorit
 register_learner("ppo", DeferredLearner("guiderail.tools.learning.on_policy", "PpoLearner", PpoConfig))
 register_learner("trpo", DeferredLearner("guiderail.tools.learning.on_policy", "TrpoLearner", TrpoConfig))
 register_learner("chunk", DeferredLearner("guiderail.tools.learning.chunking", "ChunkLearner", ChunkConfig))
+register_learner(
+    "distillation",
+    DeferredLearner("guiderail.tools.learning.distillation", "DistillationLearner", DistillationConfig),
+)
 register_learner("bc", DeferredLearner("guiderail.tools.learning.cloning", "BcLearner", BcConfig))
 
 _TABLE_4_1 = OffPolicyConfig(

@@ -202,7 +202,10 @@ def test_nothing_is_computed_between_control_steps(skill):
     [
         ("magic", "there is no guidance 'magic': .*kgrl, .*kmp, none, residual, .*safe_residual, sct, skgrl"),
         ("kgrll", "did you mean kgrl"),
-        ("sct", "'sct' needs a shared control template.*use kgrl, .*kmp, residual, .*residual_cbf, .*skgrl"),
+        (
+            "sct",
+            "'sct' needs a shared control template.*use base_policy, kgrl, .*kmp, residual, .*skgrl",
+        ),
         ("none", "'none' needs .*kmp"),
     ],
 )

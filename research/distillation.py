@@ -1,0 +1,172 @@
+"""Distillation of a KGRL policy (thesis, 6.2.3): teacher and student on the same held-out episodes, and their time.
+
+The student is executed alone, behind the guard of chunks, and as the reference of KGRL, inside its projection.
+
+Run it with `python -m research.distillation --teacher runs/teacher --student runs/student --out runs/distillation`.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.models.base_policy import chunk_samples, find_base_policy
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import beyond_defaults, make_environment
+from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.evaluate import evaluate_policies
+from guiderail.tools.evaluation.metrics import jerk
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.tables import write_table
+from research.command import Parser, print_result, run_program
+
+BLOCK = 10  # episodes of a stored file
+MEASURED = 300  # actions whose time is measured
+# Options of each way to execute the student; the teacher has its own.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "teacher": {},
+    "student": {"guidance": "base_policy", "guard": "none"},
+    "student, guarded": {"guidance": "base_policy", "guard": "projection"},
+    "student in KGRL's projection": {"guidance": "kgrl_base_policy"},
+}
+
+
+def options_of(variant: str, task: str, environment: Mapping[str, Any], student: Path, repeat: int) -> dict[str, Any]:
+    """Return the environment options of a variant.
+
+    Args:
+        variant: Name in `VARIANTS`.
+        task: Name of the task.
+        environment: Options of the teacher's environment.
+        student: Folder of the student's run.
+        repeat: Control steps of an action, after which the student predicts again.
+    """
+    given = VARIANTS[variant]
+    further = {"base_policy": str(student), "replan_steps": repeat} if given else {}
+    return beyond_defaults(task, environment) | given | further
+
+
+def evaluate_variant(teacher: RunFolder, student: Path, variant: str, episodes: int, seed: int) -> pd.DataFrame:
+    """Return the rows of held-out episodes, with the RMS of the commanded jerk of position and of angles."""
+    config = teacher.config()
+    options = options_of(variant, config.task, config.environment, student, config.action_repeat)
+    env: Any = make_environment(config.task, options)
+    try:
+        env.reset(seed=config.seed)
+        zero = np.zeros(env.action_space.shape, np.float32)
+        act = Policy.load(teacher.path) if variant == "teacher" else lambda observation: zero
+
+        def collect(env: Any, row: Any) -> dict[str, float]:
+            trace = env.unwrapped.trace
+            return {"jerk": jerk(trace.commanded, trace.period)[0]}
+
+        ((_, rows, kept),) = evaluate_policies(env, {variant: act}, episodes=episodes, seed=seed, collect=collect)
+        return pd.concat([rows, pd.DataFrame(kept)], axis=1)
+    finally:
+        env.close()
+
+
+def time_per_action(teacher: RunFolder, student: Path) -> dict[str, float]:
+    """Return the median time of an action, with all its commands, without simulation [ms].
+
+    The teacher's is that of its network and of a constrained primitive in every control step, the student's that of its
+    network.
+    """
+    config = teacher.config()
+    prior = make_prior_knowledge(config.task, **beyond_defaults(config.task, config.environment)).demonstrations
+    if prior is None:
+        raise InputError(f"{config.task} has no demonstrations")
+    primitive, policy, base = prior.primitive(history=False), Policy.load(teacher.path), find_base_policy(str(student))
+    gains, size = prior.null_space_gains(primitive), policy.description["observation_shape"][0]
+    observations = np.random.default_rng(0).uniform(-0.5, 0.5, (MEASURED, size)).astype(np.float32)
+    repeat = config.action_repeat
+    starts = (np.arange(MEASURED) * repeat) % (primitive.reference.num_steps - repeat)
+
+    def teach(index: int) -> None:
+        action = gains * (prior.selection @ np.asarray(policy(observations[index]), float))
+        for step in range(starts[index], starts[index] + repeat):
+            primitive.predict(int(step), action)
+
+    def imitate(index: int) -> None:
+        chunk_samples(base, observations[index], prior.num_outputs)
+
+    return {"teacher": _median_time(teach), "student": _median_time(imitate)}
+
+
+def _median_time(act: Callable[[int], None]) -> float:
+    for index in range(MEASURED):  # factors of the primitive's steps are computed at first use
+        act(index)
+    times = []
+    for index in range(MEASURED):
+        started = time.perf_counter()
+        act(index)
+        times.append(time.perf_counter() - started)
+    return 1e3 * float(np.median(times))
+
+
+def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> list[dict[str, Any]]:
+    """Evaluate teacher and student; write `distillation.csv` and `.md`; return the rows.
+
+    Args:
+        teacher: Folder of the teacher's run.
+        student: Folder of the student's run.
+        out: Folder; blocks of episodes that are already evaluated in it are not evaluated again.
+        episodes: Number of episodes of each variant.
+
+    Raises:
+        InputError: If there is no episode, or a folder has no such policy.
+    """
+    if episodes < 1:
+        raise InputError(f"give at least one episode, not {episodes}")
+    find_base_policy(str(student))
+    folder, rows = RunFolder(teacher), []
+    for number, variant in enumerate(VARIANTS):
+        tables = []
+        for first in range(0, episodes, BLOCK):
+            count = min(BLOCK, episodes - first)
+            file = out / "episodes" / f"{number}-{teacher.name}-{student.name}-{first}-{count}.csv"
+            arguments = (folder, student, variant, count, HELD_OUT_SEED + first)
+            tables.append(load_or_compute(file, lambda arguments=arguments: evaluate_variant(*arguments)))
+        table = pd.concat(tables)
+        rows.append(
+            {
+                "variant": variant,
+                "episodes": len(table),
+                "success_rate": float(table["success"].mean()),
+                "peak_force": float(table["peak_force"].max()),
+                "mean_peak_force": float(table["peak_force"].mean()),
+                "jerk": float(table["jerk"].mean()),
+                "max_commanded_violation": float(table["max_commanded_violation"].max()),
+            }
+        )
+    times = time_per_action(folder, student)
+    for row in rows:
+        row["time_per_action_ms"] = times.get(row["variant"], np.nan)
+    write_table(out / "distillation", rows)
+    return rows
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program with command-line arguments."""
+    parser = Parser(
+        "distillation", "Compare a distilled student with its teacher.", "--teacher runs/teacher --student runs/student"
+    )
+    parser.add_out("runs/distillation")
+    parser.add_argument("--teacher", type=Path, required=True, help="folder of the teacher's run")
+    parser.add_argument("--student", type=Path, required=True, help="folder of the student's run")
+    parser.add_argument("--episodes", type=int, default=100, help="held-out episodes of each variant (default: 100)")
+    parser.add_json()
+    options = parser.parse_args(arguments)
+    rows = compare(options.teacher, options.student, options.out, episodes=options.episodes)
+    table = str(options.out / "distillation.md")
+    print_result({"table": table, "rows": rows} if options.json else {"table": table}, as_json=options.json)
+
+
+if __name__ == "__main__":
+    run_program(main)

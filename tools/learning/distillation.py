@@ -1,0 +1,130 @@
+"""Policy distillation: a student that predicts the task-space commands of a trained KGRL policy (thesis, 6.2.3)."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.models.primitives import UnsolvableError
+from guiderail.tools.evaluation.rollout import Transition, is_compatible
+from guiderail.tools.learning.chunking import ChunkLearner
+from guiderail.tools.learning.config import DistillationConfig
+from guiderail.tools.pretrained import find_run
+
+CLOCK_SPREAD = 1e-6  # an entry of the observation that differs less between episodes is a function of the step
+
+
+class DistillationLearner(ChunkLearner):
+    """Learner of a student: from the teacher's observation to the next K commands, without the null space.
+
+    In every episode the teacher acts, with noise on its actions, so that observations off its own path are visited. The
+    labels are its commands without noise,
+
+        y_{t+k} = LC-NS-KMP(t + k, π(s_t)),   k = 0 … K−1,
+
+    computed for the visited observations and for copies of them with noise. The network is trained after the last
+    episode, and is a base policy (`guidance=base_policy`).
+    """
+
+    Config = DistillationConfig
+    config: DistillationConfig
+
+    def __init__(self, config: DistillationConfig, env: gymnasium.Env, **arguments: Any):
+        """Construct the learner; `Learner` describes the arguments.
+
+        Raises:
+            InputError: If there is no teacher with these observations and actions, or the guidance is not KGRL driven
+                by the clock.
+        """
+        super().__init__(config, env, **arguments | {"symmetry": None})
+        if not config.teacher:
+            raise InputError("distillation needs a teacher: give --set teacher=RUN")
+        self._teacher = Policy.load(find_run(config.teacher))
+        if not is_compatible(lambda env: self._teacher, env):
+            raise InputError(
+                f"the policy of {config.teacher} has other observations or actions: give the --env of its training"
+            )
+        declared = self._env.task.declaration.config
+        prior = make_prior_knowledge(declared).demonstrations
+        if declared.guidance != "kgrl" or prior is None or prior.motion is not None or prior.progress is not None:
+            raise InputError("distillation takes the commands of kgrl, driven by the clock: give --guidance kgrl")
+        self._primitive = prior.primitive(history=False)
+        self._gains, self._selection = prior.null_space_gains(self._primitive), prior.selection
+        self._num_outputs = prior.num_outputs
+        self._steps: list[int] = []  # control step of each observation
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the teacher's action with noise."""
+        action = self._teacher(observation)
+        noisy = action + self.config.action_noise * self._random.standard_normal(action.shape)
+        return np.clip(noisy, -1.0, 1.0).astype(np.float32)
+
+    def on_episode_start(self) -> None:
+        """Count the episode, and seed its noise."""
+        super().on_episode_start()
+        self._random = np.random.default_rng([self._seed, self.episodes])
+
+    def on_step(self, transition: Transition) -> None:
+        """Store the observation and its control step."""
+        self._observations.append(np.asarray(transition.observation, np.float32))
+        self._steps.append(self._step)
+        self._groups.append(self.episodes)
+        self._step = len(self._env.trace)
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return no columns."""
+        return {}
+
+    def label(self, observation: np.ndarray, step: int) -> np.ndarray:
+        """Return the teacher's commands (K, O) from a control step on, for an observation (n,) at that step."""
+        action = self._gains * (self._selection @ np.asarray(self._teacher(observation), float))
+        commands = []
+        for at in range(step, step + self.config.chunk_steps):
+            try:
+                commands.append(self._primitive.predict(at, action).output)
+            except UnsolvableError:  # as the guidance: the last command inside the constraints of this step
+                last = commands[-1] if commands else self._primitive.reference.means[0]
+                commands.append(self._primitive.constraints.nearest(last, at))
+        return np.array(commands)
+
+    def finish(self) -> None:
+        """Label the observations and copies of them with noise, and train."""
+        observations, steps, groups = np.array(self._observations), np.array(self._steps), list(self._groups)
+        scale = observations.std(axis=0) * ~self._clocks(observations, steps)
+        random = np.random.default_rng([self._seed, 0])
+        copies = [observations]
+        for _ in range(self.config.noisy_copies):
+            noise = self.config.copy_noise * scale * random.standard_normal(observations.shape)
+            copies.append((observations + noise).astype(np.float32))
+        self._actions = [
+            self.label(observation, int(step)).ravel()
+            for copy in copies
+            for observation, step in zip(copy, steps, strict=True)
+        ]
+        self._observations, self._groups = list(np.concatenate(copies)), groups * len(copies)
+        self._train()
+        self._observations, self._groups = list(observations), groups
+
+    @staticmethod
+    def _clocks(observations: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Return which entries of the observations (N, n) are functions of the control step (N,) alone, (n,)."""
+        spreads = [np.ptp(observations[steps == step], axis=0) for step in np.unique(steps)]
+        return np.max(spreads, axis=0) < CLOCK_SPREAD
+
+    def _training_rows(self, random: np.random.Generator) -> np.ndarray:
+        """Return all rows: a teacher can label any observation, so no spread is estimated."""
+        return np.arange(len(self._groups))
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return everything that the rest of a run depends on: the visited observations."""
+        arrays = {"observations": np.array(self._observations), "steps": np.array(self._steps)}
+        return arrays | {"groups": np.array(self._groups)}, {"episodes": self.episodes}
+
+    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Set the state to what `state` returned; raise KeyError if it does not fit."""
+        self._observations, self._steps = [*arrays["observations"]], arrays["steps"].tolist()
+        self._groups, self.episodes = arrays["groups"].tolist(), values["episodes"]
