@@ -14,9 +14,8 @@ import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.models.base_policy import chunk_samples, find_base_policy
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
+from guiderail.models.policy import Policy, chunk_samples, find_base_policy
 from guiderail.tools.environments import beyond_defaults, make_environment
 from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.evaluate import evaluate_policy

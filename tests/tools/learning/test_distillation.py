@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from guiderail.models.base_policy import chunk_samples, find_base_policy
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import FORMAT, Policy
+from guiderail.models.policy import FORMAT, Policy, chunk_samples, find_base_policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.config import DistillationConfig, make_config
