@@ -80,7 +80,7 @@ fci:  ## rehearse a Franka on the simulator of its protocol, minutes
 
 lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its own, minutes (downloads 4 GB)
 	python3.12 -m venv .venv-lerobot
-	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e integrations/lerobot_robot_guiderail \
+	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e . -e integrations/lerobot_robot_guiderail \
 	  "lerobot[core-scripts]" pytest
 	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null \
 	  integrations/lerobot_robot_guiderail/tests

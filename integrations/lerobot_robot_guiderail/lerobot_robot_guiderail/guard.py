@@ -1,0 +1,144 @@
+"""Guard of chunks as a step of LeRobot's processors: bounds, velocity and jerk limits of the actions of any policy.
+
+`add_guard` puts the step at the end of a stored policy's postprocessor, which `lerobot-rollout` then applies. It needs
+the core of guiderail in LeRobot's environment (`pip install guiderail`), not the simulation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.processor import ProcessorStep, ProcessorStepRegistry, TransitionKey
+
+HORIZON = 16  # steps of the chunk that holds a single action
+
+
+@ProcessorStepRegistry.register("guiderail_chunk_guard")
+@dataclass
+class ChunkGuardProcessorStep(ProcessorStep):
+    """Step that changes actions as little as possible so that they are within the limits (`ChunkGuard`).
+
+    A chunk (1, K, A) is limited as a whole. A single action, (A,), (1, A) or by name, is limited as a chunk that holds
+    it. All returned actions have to be executed, one a control period. An action that is not finite is refused. The
+    limits hold up to the rounding of the action's type.
+
+    Attributes:
+        lower: Lower bounds of the A numbers of an action; None for no bound.
+        upper: Upper bounds; None for no bound.
+        velocity: Velocity limits [unit/s].
+        jerk: Jerk limits [unit/s³].
+        period: Control period [s], one over `--fps`.
+        mode: "projection" or "slowdown".
+        start: Position at which an episode starts at rest; by default that of the observation in the first transition.
+        names: Names of the numbers, for actions and observations by name.
+    """
+
+    lower: list[float | None]
+    upper: list[float | None]
+    velocity: list[float]
+    jerk: list[float]
+    period: float
+    mode: str = "projection"
+    start: list[float] | None = None
+    names: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        try:
+            from guiderail.models.control.chunk_guard import MIN_STEPS, ChunkGuard
+            from guiderail.models.primitives import LinearConstraints
+        except ImportError as error:
+            raise ImportError("the guard needs guiderail in this environment: pip install guiderail") from error
+        sizes = {len(one) for one in (self.lower, self.upper, self.velocity, self.jerk, *filter(None, [self.names]))}
+        if len(sizes) != 1:
+            raise ValueError("lower, upper, velocity, jerk and names have one entry for each number of an action")
+        lower = np.array([-math.inf if one is None else one for one in self.lower], float)
+        upper = np.array([math.inf if one is None else one for one in self.upper], float)
+        box = LinearConstraints.box(lower, upper)
+        self._min_steps = MIN_STEPS
+        self._guard = ChunkGuard(
+            box, self.velocity, self.jerk, period=self.period, start=box.nearest(np.zeros(len(lower))), mode=self.mode
+        )
+        self.is_fallback = False
+        self.reset()
+
+    def __call__(self, transition: Any) -> Any:
+        """Return the transition with its action within the limits.
+
+        Raises:
+            ValueError: If the action has the wrong shape or names or is not finite, or the start is unknown or outside
+                of the bounds.
+        """
+        action = transition.get(TransitionKey.ACTION)
+        by_name = isinstance(action, dict)
+        values = self._of_names(action) if by_name else np.asarray(torch.as_tensor(action).detach().cpu(), dtype=float)
+        if not self._is_started:
+            self._guard.reset(self._find_start(transition.get(TransitionKey.OBSERVATION)))
+            self._is_started = True
+        size = len(self.velocity)
+        if not 1 <= values.ndim <= 3 or values.shape[-1] != size or (values.ndim > 1 and len(values) != 1):
+            raise ValueError(f"an action has the shape ({size},), (1, {size}) or (1, K, {size}), not {values.shape}")
+        chunk = values.reshape(-1, size)
+        number = len(chunk)
+        ending = HORIZON if number == 1 else max(self._min_steps, number)
+        held = np.concatenate([chunk, np.tile(chunk[-1], (ending - number, 1))])
+        result = self._guard.guard(held, number)
+        self.is_fallback = result.is_fallback
+        limited = result.outputs[:number].reshape(values.shape)
+        changed = transition.copy()
+        changed[TransitionKey.ACTION] = (
+            {name: float(value) for name, value in zip(self.names, limited, strict=True)}
+            if by_name
+            else torch.as_tensor(limited, dtype=action.dtype, device=action.device)
+        )
+        return changed
+
+    def _of_names(self, numbers: Any) -> np.ndarray:
+        missing = [name for name in self.names if name not in numbers]
+        if missing or not self.names:
+            raise ValueError(f"the guard needs the numbers {missing or 'of an action by name: give names'}")
+        return np.array([float(numbers[name]) for name in self.names])
+
+    def _find_start(self, observation: Any) -> np.ndarray:
+        if self.start is not None:
+            return np.array(self.start, float)
+        if not isinstance(observation, dict):
+            raise ValueError("the guard needs the position at which the episode starts: give start")
+        return self._guard.constraints.nearest(self._of_names(observation))
+
+    def reset(self) -> None:
+        """Start an episode: the next action continues from the start at rest."""
+        self._is_started = False
+
+    def get_config(self) -> dict[str, Any]:
+        """Return the attributes."""
+        return asdict(self)
+
+    def transform_features(self, features: Any) -> Any:
+        """Return the features unchanged."""
+        return features
+
+
+def add_guard(policy: Path | str, **limits: Any) -> None:
+    """Put a guard at the end of the postprocessor of a stored policy.
+
+    Args:
+        policy: Folder of the policy.
+        limits: Attributes of `ChunkGuardProcessorStep`.
+    """
+    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+    from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME
+
+    pipeline = PolicyProcessorPipeline.from_pretrained(
+        str(policy),
+        config_filename=f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json",
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    pipeline.steps = [*pipeline.steps, ChunkGuardProcessorStep(**limits)]
+    pipeline.save_pretrained(policy)

@@ -1,0 +1,113 @@
+"""Guard of chunks as a step of LeRobot's processors, with a double of LeRobot's interface.
+
+`make lerobot` tests it with the real library.
+"""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/guard.py"
+PERIOD, VELOCITY, JERK, BOUND = 0.1, 0.5, 5.0, 0.2
+NAMES = ["a.pos", "b.pos"]
+
+
+@pytest.fixture(scope="module")
+def guard():
+    """Return the module, imported with a double of `lerobot.processor`."""
+    registered = {}
+
+    def register(name):
+        return lambda kind: registered.setdefault(name, kind)
+
+    processor = ModuleType("lerobot.processor")
+    processor.ProcessorStep = type("ProcessorStep", (), {})
+    processor.ProcessorStepRegistry = SimpleNamespace(register=register)
+    processor.TransitionKey = SimpleNamespace(ACTION="action", OBSERVATION="observation")
+    doubles = {"lerobot": ModuleType("lerobot"), "lerobot.processor": processor}
+    spec = importlib.util.spec_from_file_location("guiderail_lerobot_guard", FILE)
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, double in doubles.items():
+            patch.setitem(sys.modules, name, double)
+        patch.setitem(sys.modules, spec.name, module)
+        spec.loader.exec_module(module)
+    assert registered == {"guiderail_chunk_guard": module.ChunkGuardProcessorStep}
+    return module
+
+
+def make(guard, **changes):
+    limits = {"lower": [-BOUND, None], "upper": [BOUND, None], "velocity": [VELOCITY] * 2, "jerk": [JERK] * 2}
+    return guard.ChunkGuardProcessorStep(**limits | {"period": PERIOD, "start": [0.0, 0.0], "names": NAMES} | changes)
+
+
+def send(step, action, observation=None):
+    return step({"action": action, "observation": observation})["action"]
+
+
+@pytest.mark.parametrize("mode", ["projection", "slowdown"])
+@pytest.mark.parametrize("shape", [(2,), (1, 2), (1, 3, 2), (1, 8, 2)])
+def test_actions_are_within_the_limits(guard, shape, mode):
+    step, random = make(guard, mode=mode), np.random.default_rng(1)
+    sent = [send(step, torch.from_numpy(random.uniform(-0.5, 0.5, shape))) for _ in range(30)]
+    assert all(one.shape == shape for one in sent)
+    motion = np.concatenate([np.zeros((3, 2)), torch.cat([one.reshape(-1, 2) for one in sent]).numpy()])
+    assert np.abs(np.diff(motion, axis=0)).max() <= VELOCITY * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(motion, n=3, axis=0)).max() <= JERK * PERIOD**3 * (1 + 1e-9)
+    assert np.abs(motion[:, 0]).max() <= BOUND
+    assert np.ptp(motion, axis=0).max() > 0.005
+
+
+def test_motion_reaches_an_action_that_is_held(guard):
+    step = make(guard)
+    sent = [send(step, torch.tensor([[0.15, -0.3]], dtype=torch.float64)) for _ in range(40)]
+    np.testing.assert_allclose(sent[-1][0], [0.15, -0.3], atol=1e-3)
+
+
+def test_actions_by_name_start_at_the_observed_position(guard):
+    step, observed = make(guard, start=None), dict(zip(NAMES, (0.1, 2.0), strict=True))
+    assert send(step, observed, observed) == pytest.approx(observed, abs=1e-4)
+    first = send(step, dict.fromkeys(NAMES, 0.15), observed)
+    assert 0.1 < first["a.pos"] < 0.12
+    step.reset()
+    assert send(step, observed, observed) == pytest.approx(observed, abs=1e-4)
+    step.reset()
+    outside = dict.fromkeys(NAMES, 0.3)
+    assert send(step, outside, outside)["a.pos"] <= BOUND
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (torch.full((1, 2), float("nan")), "finite"),
+        (torch.zeros(1, 3), "shape"),
+        (torch.zeros(2, 2), "shape"),
+        ({"a.pos": 0.0}, "b.pos"),
+    ],
+)
+def test_action_is_refused_when_it_does_not_fit(guard, action, words):
+    with pytest.raises(ValueError, match=words):
+        send(make(guard), action)
+
+
+def test_guard_is_refused_when_start_or_limits_are_missing(guard):
+    with pytest.raises(ValueError, match="give start"):
+        send(make(guard, start=None), torch.zeros(1, 2))
+    with pytest.raises(ValueError, match="one entry"):
+        make(guard, velocity=[1.0])
+    with pytest.raises(ValueError, match="positive"):
+        make(guard, jerk=[1.0, 0.0])
+    with pytest.raises(ValueError, match="inside"):
+        send(make(guard, start=[0.21, 0.0]), torch.zeros(1, 2))
+
+
+def test_configuration_makes_the_same_step(guard):
+    step = make(guard)
+    again = guard.ChunkGuardProcessorStep(**step.get_config())
+    action = torch.tensor([[0.3, 0.4]])
+    assert (send(step, action) == send(again, action)).all()
