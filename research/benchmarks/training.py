@@ -24,7 +24,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
-from guiderail.tools.learning import batched_mlp, checkpoint, fast_sb3, off_policy, trainer
+from guiderail.tools.learning import checkpoint, fast_sb3, off_policy, trainer
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
 
@@ -48,10 +48,10 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
     (NStepReplayBuffer, "sample", "replay"),
     (fast_sb3.FastTrainingStep, "train", "gradient step"),
-    (batched_mlp.BatchedMLP, "forward", "forward"),
-    (batched_mlp.BatchedMLP, "backward", "backward"),
-    (batched_mlp.BatchedMLP, "input_gradient", "backward"),
-    (batched_mlp.FlatAdam, "step", "optimizer"),
+    (fast_sb3.BatchedMLP, "forward", "forward"),
+    (fast_sb3.BatchedMLP, "backward", "backward"),
+    (fast_sb3.BatchedMLP, "input_gradient", "backward"),
+    (fast_sb3.FlatAdam, "step", "optimizer"),
     (checkpoint, "save_checkpoint", "checkpoint"),
 )
 REST = "everything else"

@@ -95,7 +95,7 @@ def train(
     from stable_baselines3.common.logger import configure
 
     from guiderail.tools.learning.fast_sb3 import FastTqc
-    from guiderail.tools.learning.replay import DemonstrationReplayBuffer
+    from guiderail.tools.learning.sb3_state import DemonstrationReplayBuffer
 
     class Rows(BaseCallback):
         rows: list[Row]

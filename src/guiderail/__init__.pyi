@@ -46,12 +46,12 @@ from .tools.evaluation.rollout import Callback as Callback
 from .tools.evaluation.rollout import Transition as Transition
 from .tools.evaluation.rollout import rollout as rollout
 from .tools.guided.env import GuidedEnv as GuidedEnv
+from .tools.guided.env import GuidedVectorEnv as GuidedVectorEnv
 from .tools.guided.guide import Guide as Guide
 from .tools.guided.segment import Frame as Frame
 from .tools.guided.segment import Segment as Segment
 from .tools.guided.segment import cut_demonstrations as cut_demonstrations
 from .tools.guided.segment import find_events as find_events
-from .tools.guided.vector_env import GuidedVectorEnv as GuidedVectorEnv
 from .tools.imports import trust_imports as trust_imports
 from .tools.learning.learner import Learner as Learner
 from .tools.learning.learner import LearnerConfig as LearnerConfig

@@ -20,7 +20,7 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 from guiderail.tools.cli.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
-from guiderail.tools.evaluation.scope import counts_collisions, evaluation_scope
+from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from research.action_fuzzing.campaign import fuzz
 

@@ -87,7 +87,7 @@ def fit_bounds(
     as_json: cli.Json = False,
 ) -> None:
     """Fit bounds of the commanded pose to demonstrations, phase by phase."""
-    from guiderail.tools.datasets.bounds import fit_bounds as fit
+    from guiderail.tools.datasets.validate import fit_bounds as fit
 
     result = fit(
         file,

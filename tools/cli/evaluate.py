@@ -27,9 +27,7 @@ def evaluate(
     processes: cli.Processes = None,
     policy: Annotated[
         str | None,
-        option(
-            "Policy to evaluate in a TASK, or on hardware instead of the run's: scripted, {baselines}."
-        ),
+        option("Policy to evaluate in a TASK, or on hardware instead of the run's: scripted, {baselines}."),
     ] = None,
     env: cli.Env = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
@@ -215,9 +213,7 @@ def certify(
     ] = None,
     attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
     verify: Annotated[Path | None, option("Folder of a certificate: check it and compare it with the skill.")] = None,
-    key: Annotated[
-        Path | None, option("Key that signs the certificate or, with --verify, checks it.")
-    ] = None,
+    key: Annotated[Path | None, option("Key that signs the certificate or, with --verify, checks it.")] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,

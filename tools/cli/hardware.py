@@ -67,7 +67,7 @@ def teleoperate(
             raise InputError("--json prints what was demonstrated: give --record too")
     elif guidance is not None:
         raise InputError("a demonstration is recorded without guidance: leave --guidance out")
-    from guiderail.tools.teleop.teleoperate import teleoperate as run
+    from guiderail.tools.teleop.recorder import teleoperate as run
 
     statistics = run(name, environment, record=record, log=print_progress)
     if statistics is not None:

@@ -181,7 +181,7 @@ def train(
 
 def _wait_for_supervisor() -> Any:
     """Block until a browser connects; return the supervisor."""
-    from guiderail.tools.teleop.supervisor import MeshcatSupervisor
+    from guiderail.tools.teleop.teleoperator import MeshcatSupervisor
 
     supervisor = MeshcatSupervisor(print_progress)
     supervisor.wait()

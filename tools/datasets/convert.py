@@ -16,7 +16,7 @@ from guiderail.tools.datasets.formats.csv_layouts import read_csv_files
 from guiderail.tools.datasets.formats.lerobot import INFO, read_lerobot, write_lerobot
 from guiderail.tools.datasets.formats.recorded import describe_time_shift
 from guiderail.tools.datasets.formats.ros_bag import find_bags, read_bags, write_mcap
-from guiderail.tools.datasets.paths import ENDINGS, check_new, load_demonstrations, path_exists
+from guiderail.tools.files import ENDINGS, check_new, load_demonstrations, path_exists
 
 WRITERS: dict[str, Callable[[Path, Demonstrations], list[str]]] = {"lerobot": write_lerobot, "mcap": write_mcap}
 """Export formats by name."""

@@ -14,7 +14,6 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.paths import ENDINGS, check_new
 from guiderail.tools.environments import changed_environment, make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import (
@@ -28,11 +27,23 @@ from guiderail.tools.evaluation.cache import (
 from guiderail.tools.evaluation.evaluation import COLLISIONS, LABELS, Evaluation, compare, statistics
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
-from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_seed, is_compatible, rollout
-from guiderail.tools.evaluation.scope import counts_collisions, evaluation_scope, refuse_guidance_change
-from guiderail.tools.evaluation.subject import Subject, find_subject, make_baselines
-from guiderail.tools.files import write_atomically
+from guiderail.tools.evaluation.rollout import (
+    HELD_OUT_SEED,
+    EpisodeProgress,
+    PolicyFn,
+    check_seed,
+    is_compatible,
+    rollout,
+)
+from guiderail.tools.evaluation.subject import (
+    Subject,
+    counts_collisions,
+    evaluation_scope,
+    find_subject,
+    make_baselines,
+    refuse_guidance_change,
+)
+from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.visualization.style import is_demonstrated

@@ -23,8 +23,14 @@ from guiderail.tools.evaluation.evaluate import evaluate_once
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import wilson
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
-from guiderail.tools.evaluation.scope import default_baselines, hides, refuse_guidance_change
-from guiderail.tools.evaluation.subject import Subject, find_subject, make_baselines
+from guiderail.tools.evaluation.subject import (
+    Subject,
+    default_baselines,
+    find_subject,
+    hides,
+    make_baselines,
+    refuse_guidance_change,
+)
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import is_demonstrated, label, legend, new_figure, save_figure

@@ -14,8 +14,7 @@ from guiderail.diagrams.hardware.clock import garbage_collection_disabled
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, rollout
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, EpisodeProgress, PolicyFn, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.hardware.connection import Log, RobotConnection
 from guiderail.tools.hardware.executor import hardware_environment

@@ -32,8 +32,15 @@ from guiderail.tools.evaluation.step_log import step_log_file, table, write_step
 from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, RobotConnection
 from guiderail.tools.hardware.operator import operator_keys
-from guiderail.tools.hardware.preflight import PreflightChecks, confirm_checks, start_simulator
-from guiderail.tools.hardware.slow_motion import SPEED, is_near, pose_distance, slow_approach
+from guiderail.tools.hardware.preflight import (
+    SPEED,
+    PreflightChecks,
+    confirm_checks,
+    is_near,
+    pose_distance,
+    slow_approach,
+    start_simulator,
+)
 from guiderail.tools.learning.run_folder import RunFolder
 
 SIGNALS = {

@@ -22,8 +22,7 @@ from guiderail.models.control.joint_status import Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.connection import Log
 from guiderail.tools.hardware.operator import OperatorKeys
-from guiderail.tools.hardware.preflight import PreflightChecks
-from guiderail.tools.hardware.slow_motion import is_near, pose_distance, retrace, slow_approach
+from guiderail.tools.hardware.preflight import PreflightChecks, is_near, pose_distance, retrace, slow_approach
 
 # A pull that checks a success: commanded distance, largest measured distance [m], smallest measured force [N].
 PULL_DISTANCE, MAX_PULL_MOTION, MIN_PULL_FORCE = 3.0 * MM, 1.0 * MM, 1.5

@@ -15,8 +15,7 @@ import pandas as pd
 from guiderail.diagrams.hardware.clock import garbage_collection_disabled
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import write_atomically
 from guiderail.tools.hardware.connection import Log, RobotConnection

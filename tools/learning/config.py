@@ -199,8 +199,8 @@ class DistillationConfig(ChunkConfig):
 
 register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
 register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
-register_learner("td3", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "Td3Learner", Td3Config))
-register_learner("crossq", DeferredLearner("guiderail.tools.learning.sb3_algorithms", "CrossQLearner", CrossQConfig))
+register_learner("td3", DeferredLearner("guiderail.tools.learning.off_policy", "Td3Learner", Td3Config))
+register_learner("crossq", DeferredLearner("guiderail.tools.learning.off_policy", "CrossQLearner", CrossQConfig))
 register_learner("ppo", DeferredLearner("guiderail.tools.learning.on_policy", "PpoLearner", PpoConfig))
 register_learner("trpo", DeferredLearner("guiderail.tools.learning.on_policy", "TrpoLearner", TrpoConfig))
 register_learner("chunk", DeferredLearner("guiderail.tools.learning.chunking", "ChunkLearner", ChunkConfig))

@@ -17,8 +17,8 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
+from sb3_contrib import TQC, CrossQ
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.preprocessing import is_image_space
@@ -27,14 +27,26 @@ from torch.nn.utils import parameters_to_vector
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.asymmetric import observe_privileged, with_privileged
 from guiderail.tools.learning.checkpoint import CheckpointSelection
-from guiderail.tools.learning.config import OffPolicyConfig, action_gamma
+from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error
-from guiderail.tools.learning.networks import IMAGE_POOL, AveragePooledImage, NormalizedReLU, add_dropout, export_policy
-from guiderail.tools.learning.replay import DemonstrationReplayBuffer
-from guiderail.tools.learning.sb3_state import module_arrays, random_state, restore_modules, restore_random
+from guiderail.tools.learning.networks import (
+    IMAGE_POOL,
+    AveragePooledImage,
+    NormalizedReLU,
+    add_dropout,
+    export_policy,
+    observe_privileged,
+    with_privileged,
+)
+from guiderail.tools.learning.sb3_state import (
+    DemonstrationReplayBuffer,
+    module_arrays,
+    random_state,
+    restore_modules,
+    restore_random,
+)
 
 
 class OffPolicyLearner(Learner):
@@ -395,3 +407,37 @@ class TqcLearner(OffPolicyLearner):
 
     algorithm = TQC
     fast_algorithm = FastTqc
+
+
+class Td3Learner(OffPolicyLearner):
+    """Learner of twin delayed DDPG (TD3; Fujimoto, van Hoof and Meger, 2018), which explores with normal noise."""
+
+    Config = Td3Config
+    algorithm = TD3
+    config: Td3Config
+
+    def algorithm_arguments(self, config: Any) -> dict[str, Any]:
+        """Return the settings of the delayed actor and of the target actions."""
+        names = ("policy_delay", "target_policy_noise", "target_noise_clip")
+        return {name: getattr(config, name) for name in names}
+
+    def explore(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action plus noise, clipped to the action space."""
+        action, space = super().explore(observation), self.model.action_space
+        deviation = self.config.exploration_noise * (space.high - space.low) / 2
+        return np.clip(self.random.normal(action, deviation), space.low, space.high).astype(space.dtype)
+
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {"actor": self.model.actor.optimizer, "critic": self.model.critic.optimizer}
+
+
+class CrossQLearner(OffPolicyLearner):
+    """Learner of CrossQ (Bhatt et al., 2024): batch normalization in place of target critics."""
+
+    Config = CrossQConfig
+    algorithm = CrossQ
+    config: CrossQConfig
+
+    def algorithm_arguments(self, config: Any) -> dict[str, Any]:
+        """Return the settings of the delayed actor."""
+        return {"policy_delay": config.policy_delay}

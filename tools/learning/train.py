@@ -18,8 +18,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
+from guiderail.tools.evaluation.rollout import EpisodeProgress, PolicyFn, check_seed
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.interventions import Supervisor

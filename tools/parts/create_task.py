@@ -28,8 +28,7 @@ from guiderail.models.parts.assembly_check import shrink as shrink_part
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
 from guiderail.models.parts.preparation import ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.models.parts.symmetry import find_symmetries
-from guiderail.tools.datasets.paths import check_new
-from guiderail.tools.files import atomic_folder
+from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact
 
 if TYPE_CHECKING:
@@ -191,7 +190,7 @@ def create_task(
         measured, search = _measure(folder, task, choice, prepared, clock, say)
         if not only_insert:
             task = task.model_copy(update={"search": search})
-            from guiderail.tools.parts.mujoco_check import add_convex_pieces
+            from guiderail.tools.parts.trial import add_convex_pieces
 
             if not (scenario or choice.contact.snapping):
                 task = add_convex_pieces(folder, task, surfaces, tolerance, say)

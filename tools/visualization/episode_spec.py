@@ -11,8 +11,7 @@ from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import MakePolicy
 from guiderail.tools.evaluation.metrics import COLLISION
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, check_seed
-from guiderail.tools.evaluation.scope import refuse_guidance_change
-from guiderail.tools.evaluation.subject import find_subject
+from guiderail.tools.evaluation.subject import find_subject, refuse_guidance_change
 
 
 @dataclass(frozen=True)

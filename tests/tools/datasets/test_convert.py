@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.bounds import fit_bounds
 from guiderail.tools.datasets.convert import export_demonstrations, import_recording
+from guiderail.tools.datasets.validate import fit_bounds
 
 NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 

@@ -3,9 +3,8 @@
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.datasets.paths import check_new, path_exists
 from guiderail.tools.evaluation.evaluate import evaluate
-from guiderail.tools.files import atomic_folder
+from guiderail.tools.files import atomic_folder, check_new, path_exists
 
 
 def test_check_new_accepts_missing_parent_folders(tmp_path):

@@ -3,9 +3,8 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.bounds import fit_bounds
-from guiderail.tools.datasets.paths import load_demonstrations
-from guiderail.tools.datasets.validate import validate_demonstrations
+from guiderail.tools.datasets.validate import fit_bounds, validate_demonstrations
+from guiderail.tools.files import load_demonstrations
 
 CLOCK = np.linspace(0, 1, 30)
 

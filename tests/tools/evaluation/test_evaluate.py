@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.evaluate import (
 )
 from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
-from guiderail.tools.evaluation.scope import evaluation_scope, refuse_guidance_change
+from guiderail.tools.evaluation.subject import evaluation_scope, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder
 
 

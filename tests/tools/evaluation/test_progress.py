@@ -2,7 +2,7 @@ import io
 
 from rich.console import Console
 
-from guiderail.tools.evaluation.progress import EpisodeProgress
+from guiderail.tools.evaluation.rollout import EpisodeProgress
 
 
 def rows(count):

@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from guiderail.tools.hardware.slow_motion import MIN_ANGULAR_SPEED, MIN_SPEED, pose_distance, retrace
+from guiderail.tools.hardware.preflight import MIN_ANGULAR_SPEED, MIN_SPEED, pose_distance, retrace
 
 PERIOD = 0.02
 

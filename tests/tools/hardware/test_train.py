@@ -22,10 +22,10 @@ from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.operator import OperatorKeys
+from guiderail.tools.hardware.preflight import SPEED
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import RobotSession, robot_session
 from guiderail.tools.hardware.sim_driver import START
-from guiderail.tools.hardware.slow_motion import SPEED
 from guiderail.tools.hardware.train import _train, train_on_robot
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
@@ -62,7 +62,7 @@ def make(patch, start, **options):
 @pytest.fixture(scope="module")
 def shared():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("guiderail.tools.hardware.slow_motion.SETTLING_TIME", 0.1)
+        patch.setattr("guiderail.tools.hardware.preflight.SETTLING_TIME", 0.1)
         env = make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
         yield env
 
@@ -164,7 +164,7 @@ def test_operator_stop_truncates_and_reset_resumes(env):
 
 
 def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
-    monkeypatch.setattr("guiderail.tools.hardware.slow_motion.SETTLING_TIME", 0.1)
+    monkeypatch.setattr("guiderail.tools.hardware.preflight.SETTLING_TIME", 0.1)
     env = make(monkeypatch, START, guidance="residual", bound=0.0005)
     observations = []
 

@@ -166,7 +166,7 @@ def test_parts_of_convex_pieces_are_offered_in_mujoco(folder):
     from guiderail.diagrams.envs.make import make_env
     from guiderail.diagrams.tasks.part.file import read_task_file
     from guiderail.diagrams.tasks.part.task import load_task_folder
-    from guiderail.tools.parts.mujoco_check import insert_in_mujoco
+    from guiderail.tools.parts.trial import insert_in_mujoco
 
     pytest.importorskip("mujoco")
     file = read_task_file(folder)
@@ -272,7 +272,7 @@ def test_task_is_unchanged_when_bounds_cannot_be_drawn(folder, tmp_path, monkeyp
         raise InputError("no room")
 
     before = (folder / "task.yaml").read_text()
-    monkeypatch.setattr("guiderail.tools.datasets.bounds._draw", fail)
+    monkeypatch.setattr("guiderail.tools.datasets.validate._draw", fail)
     args = ("--draw", tmp_path / "bounds.png", "--out", tmp_path / "bounds.yaml", "--task", folder)
     call("dataset", "fit-bounds", folder / "demonstrations.npz", *args, code=2)
     assert (folder / "task.yaml").read_text() == before

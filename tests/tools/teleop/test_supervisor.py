@@ -7,9 +7,8 @@ import pytest
 from pydrake.geometry import Meshcat
 
 from guiderail.tools.environments import make_environment
-from guiderail.tools.teleop import supervisor as supervising
-from guiderail.tools.teleop.supervisor import LABEL_KEYS, LABELS, LIMIT, RELEASE, MeshcatSupervisor
-from guiderail.tools.teleop.teleoperator import KEY_PAIRS
+from guiderail.tools.teleop import teleoperator as supervising
+from guiderail.tools.teleop.teleoperator import KEY_PAIRS, LABEL_KEYS, LABELS, LIMIT, RELEASE, MeshcatSupervisor
 
 
 class Page:

@@ -4,7 +4,7 @@ import pytest
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.pouring.task import scripted_pour
 from guiderail.models.policy import Policy
-from guiderail.tools.teleop.teleoperate import run_episode
+from guiderail.tools.teleop.recorder import run_episode
 from guiderail.tools.teleop.teleoperator import GAMEPAD_AXES, KEY_PAIRS
 
 

@@ -12,10 +12,9 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, constant_policy, uniform_random
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.visualization import motion
+from guiderail.tools.visualization import replay
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
-from guiderail.tools.visualization.motion import DRAWN, Motion, violation_unit
-from guiderail.tools.visualization.replay import find_report, write_page
+from guiderail.tools.visualization.replay import DRAWN, Motion, find_report, violation_unit, write_page
 
 ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
 BALL = f"{DRAWN}/robot/ball"
@@ -93,7 +92,7 @@ def test_page_links_an_existing_report(page, tmp_path):
 
 
 def test_motion_keeps_the_peak_force_when_it_is_resampled(monkeypatch):
-    monkeypatch.setattr(motion, "POINTS", 7)
+    monkeypatch.setattr(replay, "POINTS", 7)
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 10}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)

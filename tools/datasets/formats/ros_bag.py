@@ -18,8 +18,7 @@ from guiderail.tools.datasets.formats.recorded import (
     poses_in_target,
     rotations_of,
 )
-from guiderail.tools.datasets.paths import in_order
-from guiderail.tools.files import atomic_folder
+from guiderail.tools.files import atomic_folder, in_order
 
 # Attributes that lead to the pose in a message, by its type.
 POSES = {
