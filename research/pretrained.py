@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import guiderail
-from guiderail.tools.cli.output import to_json
+from guiderail.tools.cli.app import to_json
 from guiderail.tools.pretrained import PRETRAINED_FOLDER
 
 ARM = {"station": "arm", "sensing": "robot", "difficulty": "hard", "reward": "aligned"}

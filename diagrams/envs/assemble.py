@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -27,12 +27,13 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
-from guiderail.models.primitives.progress import StateProgress
 from guiderail.models.primitives.reference import pass_through
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
-from guiderail.systems.policy_system import PolicySystem
 from guiderail.systems.reward_system import RewardSystem
+
+if TYPE_CHECKING:
+    from guiderail.models.primitives.progress import StateProgress
 
 HALF_TURN_MARGIN = 0.1  # [rad] margin for turns by actions and contact, in addition to the motion
 
@@ -89,6 +90,8 @@ def _state_progress(task: Task, period: float) -> StateProgress | None:
     options = task.config.part("primitive")
     if options.get("progress", "clock") == "clock":
         return None
+    from guiderail.models.primitives.progress import StateProgress
+
     return StateProgress(options["progress_tolerance"], round(options["max_lag"] / period))
 
 
@@ -380,6 +383,8 @@ def build_skill_diagram(
     if not isinstance(policy, System):
         port = loop.observation
         seen_as = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
+        from guiderail.systems.policy_system import PolicySystem
+
         policy = PolicySystem(policy, seen_as, action.size(), task.config.action_repeat * station.control_period)
     builder.AddNamedSystem("policy", policy)
     seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")

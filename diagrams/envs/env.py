@@ -19,7 +19,6 @@ from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
-from guiderail.systems.policy_system import PolicyError
 
 RECORDED_SIGNALS = (
     "commanded_violation",
@@ -233,9 +232,11 @@ class DiagramEnv(DrakeGymEnv):
         """Store the message of a failed simulation in `_failure`; every other error propagates."""
         try:
             yield
-        except PolicyError:
-            raise  # a policy inside the diagram failed, not the simulation
         except (RuntimeError, SystemExit) as error:
+            from guiderail.systems.policy_system import PolicyError
+
+            if isinstance(error, PolicyError):  # a policy inside the diagram failed, not the simulation
+                raise
             if self._observation is None or not _SIMULATION_FAILURE.search(str(error)):
                 raise
             self._failure = str(error)

@@ -26,7 +26,6 @@ from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
-from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
@@ -52,7 +51,10 @@ def make_station(task: Task) -> Station:
     if config.control_period is not None and "control_period" in inspect.signature(kind.build).parameters:
         arguments["control_period"] = task.control_period
     build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
-    if isinstance(disturbances, Disturbances):
+    if task.workcell_kind == "workcell":
+        from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
+
+        assert isinstance(disturbances, Disturbances)
         station = disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
     else:
         station = build()

@@ -12,13 +12,8 @@ from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
-from guiderail.models.control.motion_constraints import MotionConstraintFilter
-from guiderail.systems.command_filter import CommandFilter
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.history_buffer import HistoryBuffer
-from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
-from guiderail.systems.progress_clock import ProgressClock
 
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
@@ -59,6 +54,8 @@ class PrimitiveGuidance(Guidance):
         """
         command, fallback = self._limit_motion(builder, config, kmp, pose)
         if config.progress is not None:
+            from guiderail.systems.progress_clock import ProgressClock
+
             rule, period = config.progress, config.control_period
             clock = builder.AddNamedSystem("progress", ProgressClock(rule, config.num_outputs, period))
             builder.Connect(command, clock.get_command_input_port())
@@ -73,6 +70,9 @@ class PrimitiveGuidance(Guidance):
         command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
         if config.motion is None:
             return command, fallback
+        from guiderail.models.control.motion_constraints import MotionConstraintFilter
+        from guiderail.systems.command_filter import CommandFilter
+
         law = MotionConstraintFilter(config.motion, config.control_period)
         motion = builder.AddNamedSystem("motion_constraints", CommandFilter(law, config.control_period))
         either = builder.AddNamedSystem("fallbacks", Adder(2, 1))
@@ -199,6 +199,8 @@ class SkgrlGuidance(PrimitiveGuidance):
     """
 
     def __init__(self, prior: PriorKnowledge):
+        from guiderail.systems.history_buffer import HistoryBuffer
+
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
         action, pose = self._export_inputs(builder, config)
@@ -209,6 +211,8 @@ class SkgrlGuidance(PrimitiveGuidance):
         ]
         kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period, shorter))
         if shorter:
+            from guiderail.systems.history_length_schedule import HistoryLengthSchedule
+
             schedule = builder.AddNamedSystem(
                 "history_length",
                 HistoryLengthSchedule(

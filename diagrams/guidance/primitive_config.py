@@ -1,17 +1,22 @@
 """Configuration of a movement primitive, which KMP, KGRL, sKGRL and residual guidance are built from."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
-from guiderail.models.primitives.progress import StateProgress
+
+if TYPE_CHECKING:
+    from guiderail.models.control.keep_out import KeepOut
+    from guiderail.models.control.motion_constraints import MotionConstraints
+    from guiderail.models.primitives.progress import StateProgress
 
 HISTORY_SOURCES = ("commanded", "measured")
 

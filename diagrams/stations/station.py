@@ -34,7 +34,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,15 +46,15 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 
 from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.envs.task_diagram import round_period
-from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
-from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.models.control.wrench import WrenchBound
-from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.stations.workcell import Workcell
+    from guiderail.models.control.motion_constraints import StateConstraints
+    from guiderail.models.control.wrench import WrenchBound
 
 Robot = TypeVar("Robot")
 
@@ -127,6 +127,8 @@ class Impedance:
         A limit is never raised. The shares of the axes favor z, along which workpieces are inserted. The approach speed
         is limited for contacts of `CONTACT_STIFFNESS`.
         """
+        from guiderail.models.control.wrench import WrenchBound
+
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))
         axes = to_wrench_order(limits.tolist())
@@ -153,6 +155,8 @@ def command_timeout(period: float) -> float:
 
 def tare_steps(period: float) -> tuple[int, int]:
     """Return the numbers of steps of `period` [s] before and during a tare."""
+    from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
+
     skipped, averaged = (max(round(n * CONTROL_PERIOD / period), 1) for n in (TARE_SKIPPED, TARE_AVERAGED))
     return skipped, averaged
 
@@ -259,6 +263,8 @@ class ControllerPlant:
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
         """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""
         X_TP = pose_to_transform(pose)
+        from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+
         return solve_inverse_kinematics(self.plant, self.target, self.tool_center, X_TP, posture)
 
     def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:

@@ -5,8 +5,7 @@ from typing import Annotated
 
 from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, command, option
-from guiderail.tools.cli.output import print_progress, print_result
+from guiderail.tools.cli.app import argument, command, option, print_progress, print_result
 
 dataset = cli.command_group("dataset", "Import, export and validate demonstrations, and fit bounds to them.")
 template = cli.command_group("template", "Validate shared control templates.")

@@ -8,8 +8,7 @@ import typer
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option
-from guiderail.tools.cli.output import print_message, print_result, to_json
+from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
 
 QUICK = 20  # episodes of a quick evaluation
 

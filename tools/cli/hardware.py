@@ -7,8 +7,7 @@ import typer
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option
-from guiderail.tools.cli.output import print_progress, print_result
+from guiderail.tools.cli.app import argument, option, print_progress, print_result
 
 Url = Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's default]")]
 

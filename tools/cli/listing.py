@@ -5,8 +5,7 @@ from typing import Annotated
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument
-from guiderail.tools.cli.output import print_result
+from guiderail.tools.cli.app import argument, print_result
 
 
 @cli.command("list BncConnector", "list")

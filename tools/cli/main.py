@@ -12,8 +12,7 @@ import typer
 
 from guiderail.models.common.errors import InputError, RunsFailedError, explain_missing
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.cli.app import app
-from guiderail.tools.cli.output import print_message
+from guiderail.tools.cli.app import app, print_message
 
 COMMANDS = {
     "train": ("train", "demo"),

@@ -5,8 +5,7 @@ from typing import Annotated
 
 from guiderail.models.common.errors import RunsFailedError
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option
-from guiderail.tools.cli.output import print_result
+from guiderail.tools.cli.app import argument, option, print_result
 
 
 @cli.command("study study.yaml --out studies --methods skgrl,kgrl --seeds 30,31")

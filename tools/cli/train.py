@@ -6,8 +6,7 @@ from typing import Annotated, Any
 from guiderail.diagrams.tasks.registry import check_task_name
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option
-from guiderail.tools.cli.output import print_message, print_progress, print_result
+from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
 
 
 @cli.command("train NarrowPassage --guidance skgrl --episodes 60 --out runs/passage")

@@ -7,8 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option
-from guiderail.tools.cli.output import to_json
+from guiderail.tools.cli.app import argument, option, to_json
 
 
 @cli.command("visualize runs/passage --html replay.html")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import pandas as pd
@@ -21,9 +21,11 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress, PolicyFn, check_seed
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
-from guiderail.tools.learning.interventions import Supervisor
 from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
+
+if TYPE_CHECKING:
+    from guiderail.tools.learning.interventions import Supervisor
 
 DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
 # Statistics of a run's summary.

@@ -1,8 +1,10 @@
 """Training loop: from a configuration to the files of a run folder."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import torch
@@ -12,13 +14,14 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.actors import ParallelLearner
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
 from guiderail.tools.learning.learner import LEARNERS, Learner, LearningLog, divergence_error, learner_arguments
-from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
+
+if TYPE_CHECKING:
+    from guiderail.tools.learning.actors import ParallelLearner
+    from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
 
 # Largest fraction of the time for the step log and checkpoints: a small checkpoint is written after every episode, a
 # large one now and then. The first and the last are always written.
@@ -106,6 +109,8 @@ def run_training(
             callbacks = Sb3Callbacks(sb3_callbacks, learner)
         with folder.locked():
             if config.learner.pipelined:
+                from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
+
                 child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
                 learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
             elif config.learner.num_envs:
@@ -134,6 +139,8 @@ def run_training(
 def _parallel(
     folder: RunFolder, config: RunConfig, env: gymnasium.Env, learner: Learner, demonstrator: Demonstrator | None
 ) -> ParallelLearner:
+    from guiderail.tools.learning.actors import ParallelLearner
+
     demonstrations = config.learner.demonstration_episodes
     return ParallelLearner(
         learner, env, num_envs=config.learner.num_envs, seed=config.seed, num_episodes=config.episodes,
@@ -163,6 +170,8 @@ def _train(
             folder.remove_policy()  # if killed from here on, the folder would hold an outdated policy
     supervised = None
     if config.human_in_the_loop and supervisor is not None:
+        from guiderail.tools.learning.interventions import SupervisedTraining
+
         supervised = SupervisedTraining(config, supervisor, load_checkpoint(folder.checkpoint)[1] if rows else {})
         supervised.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
         env, config = supervised.env, supervised.config
@@ -176,8 +185,8 @@ def _train(
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
         act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner.act
-        if isinstance(learner, ParallelLearner):
-            row = learner.episode(episode)
+        if config.learner.num_envs:
+            row = cast("ParallelLearner", learner).episode(episode)
         elif supervised is None:
             row = rollout(env, act, learner, *callbacks, index=episode)
         else:

@@ -26,7 +26,6 @@ from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
-from guiderail.models.control.shapes import Sphere
 from guiderail.models.objects.narrow_passage import demonstrations
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
@@ -264,6 +263,8 @@ class NarrowPassage(Task):
         """Return the obstacle as a disc to stay outside of, with `obstacles_constrain`."""
         if not self.options.obstacles_constrain:
             return None
+        from guiderail.models.control.shapes import Sphere
+
         discs = [Sphere(obstacle, self._geometry.obstacle_radius) for obstacle in self._geometry.obstacles]
         return MotionConstraints(self.constraints(), outside=discs)
 

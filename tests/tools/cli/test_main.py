@@ -7,8 +7,8 @@ import typer
 
 import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.tools.cli.app import to_json
 from guiderail.tools.cli.main import COMMANDS, load_commands, main
-from guiderail.tools.cli.output import to_json
 from guiderail.tools.environments import as_value
 from guiderail.tools.learning.run_folder import RunFolder
 from research.studies import study_path
