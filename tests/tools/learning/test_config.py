@@ -28,4 +28,4 @@ def test_config_accepts_large_networks():
 
 
 def test_learners_are_listed_without_importing_their_modules():
-    assert {*LEARNERS._declarations} == {"bc", "chunk", "crossq", "ppo", "sac", "td3", "tqc", "trpo"}
+    assert {*LEARNERS._declarations} == {"bc", "chunk", "crossq", "distillation", "ppo", "sac", "td3", "tqc", "trpo"}
