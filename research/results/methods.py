@@ -24,7 +24,8 @@ COLUMNS = (
 )  # fmt: skip
 README_COLUMNS = (
     "task", "guided, success [%]", "residual RL, success [%]", "scripted / random, success [%]",
-    "training episodes per seed (seeds)", "training episodes ended by force or collision, guided / residual [%]",
+    "training episodes per seed (seeds)", "training episodes ended by force or collision, guided [%]",
+    "the same, residual RL [%]",
 )  # fmt: skip
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
@@ -265,7 +266,8 @@ def readme_table(tables: Path) -> str:
                 f"{_percent(scripted)} / {_percent(random)}",
                 ", ".join(dict.fromkeys(f"{n:g}" for _, seeds in guided for n in seeds["training_episodes"]))
                 + f" ({len(guided[0][1])})",
-                f"{', '.join(_stopped(seeds) for _, seeds in guided)} / {_stopped(residual)}",
+                "; ".join(f"{name.split(',')[0]} {_stopped(seeds)}" for name, seeds in guided),
+                _stopped(residual),
             )
         )
     return _markdown(README_COLUMNS, rows)
