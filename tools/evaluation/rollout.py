@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
 
@@ -250,6 +249,8 @@ class EpisodeProgress:
 
     def status(self) -> str:
         """Return success and return of the last episodes, and the largest constraint violation of all."""
+        from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION  # pandas takes a second
+
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
         violation = "none" if self._max_violation <= TOLERANCE else f"{self._max_violation:.1e} {VIOLATION}"
         prefix = "" if self._window is None else f"last {len(self._recent)}: "

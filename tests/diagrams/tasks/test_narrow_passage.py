@@ -359,8 +359,11 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"guidance": "sct"}, "a shared control template.*use kgrl, .*kmp, residual, .*residual_cbf, .*skgrl"),
-        ({"guidance": "none"}, "use kgrl, .*kmp, residual, .*residual_cbf, .*skgrl"),
+        (
+            {"guidance": "sct"},
+            "a shared control template.*use base_policy, kgrl, .*kmp, residual, .*residual_cbf",
+        ),
+        ({"guidance": "none"}, "use base_policy, kgrl, .*kmp, residual, .*residual_cbf, .*skgrl"),
         ({"guidance": "magic"}, "there is no guidance 'magic'"),
         ({"reward": "dense"}, "no reward 'dense': choose one of shaped, sparse"),
         ({"observation": "smell"}, "choose one of image, state"),
