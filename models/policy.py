@@ -1,9 +1,9 @@
 """Trained policies: weights and a description in files without code, evaluated with NumPy.
 
-A base policy is one that predicts chunks of commanded poses, which guidance takes as its reference: a function from an
-observation (n,) to the next K commanded outputs, one a control step: samples (E, K, O) of an ensemble or of a
-generative model, one chunk (K, O), or a flat vector of either. A `Policy` whose description has the entry `chunk`,
-[E, K, O], is one (`guiderail train --algorithm chunk`).
+A base policy predicts chunks of commanded poses, which guidance takes as its reference. It is a function from an
+observation (n,) to the next K commanded outputs, one per control step. It returns samples (E, K, O) of an ensemble or
+of a generative model, one chunk (K, O), or a flat vector of either. A `Policy` whose description has the entry
+`chunk`, [E, K, O], is a base policy (`guiderail train --algorithm chunk`).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Policy:
     Args:
         layers: Weight (out, in) and bias (out,) of each layer, first to last.
         description: Content of `policy.json`: the shape of observations, the limits of actions, `activation` ("relu",
-            the default, or "normalized_relu"), and for images `pool`, the side of the squares of pixels that are
-            averaged.
+            the default, "normalized_relu" or "tanh"), `squash` ("tanh", the default, or "clip"), and for images `pool`,
+            the side of the squares of pixels that are averaged.
 
     Raises:
         ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from observation
@@ -89,7 +89,7 @@ class Policy:
 
     @classmethod
     def load(cls, folder: Path | str) -> Policy:
-        """Read the policy that a run left in its folder.
+        """Read the policy that a training run saved in its folder.
 
         Args:
             folder: Folder with `policy.safetensors` and `policy.json`.
@@ -131,7 +131,7 @@ class Policy:
         """Return the action for one observation, in the units of the action space.
 
         Raises:
-            ValueError: If the observation has another shape than those of the training.
+            ValueError: If the observation does not have the shape of the training's observations.
         """
         observation = np.asarray(observation)
         if observation.shape != self._shape:
@@ -177,7 +177,7 @@ def find_base_policy(source: str) -> BasePolicy:
     """Return the base policy of a registered name, or of a folder with `policy.safetensors`.
 
     Raises:
-        InputError: If there is none, or the folder's policy predicts no chunks.
+        InputError: If there is no such base policy, or the folder's policy predicts no chunks.
     """
     if source in BASE_POLICIES.names():
         return BASE_POLICIES.get(source)
@@ -216,7 +216,7 @@ def mean_and_variance(samples: np.ndarray, num_points: int) -> tuple[np.ndarray,
     """Return the mean and the variance of chunks (E, K, O) at the next points, each (num_points, O).
 
     The last point of a shorter chunk is repeated. Covariances between outputs are left out, because those of few
-    samples are spurious. One sample has no variance.
+    samples are spurious. The variance of a single sample is zero.
     """
     points = np.minimum(np.arange(num_points), samples.shape[1] - 1)
     variances = samples.var(axis=0, ddof=1) if len(samples) > 1 else np.zeros(samples.shape[1:])

@@ -19,9 +19,9 @@ class ActiveConstraintProjector(LeafSystem):
 
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    (`SharedControlTemplate.command`). The last command is state, initialized with the measured pose, moved towards the
-    constraints as far as one period allows. Between control instants the output is a pure function of it and the
-    request.
+    (`SharedControlTemplate.command`). The last command is discrete state. Its initial value is the measured
+    pose, moved towards the constraints as far as one period allows. Between control instants the output is a pure
+    function of the last command and the request.
 
     The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite, or if the
     tracking error exceeds its bound and the request would not reduce it, for example if the robot is blocked. If a
@@ -42,10 +42,11 @@ class ActiveConstraintProjector(LeafSystem):
         - measured_violation
 
     All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
-    template's state. A violation is the distance from the projection, the larger of meters and radians, 0 inside.
+    template's state. A violation is the distance of a pose from its projection, the larger of meters and radians, 0
+    inside.
 
     Args:
-        template: The template.
+        template: Shared control template.
         frames: Poses of the template's objects by name, in the frame of the poses at the ports.
         period: Control period [s], positive.
         max_tracking_error: Distance between the robot and its command beyond which the last command is
@@ -76,7 +77,7 @@ class ActiveConstraintProjector(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
 
-        # The last command, and the pose measured at that time.
+        # The last command (6,), and the pose (6,) measured at that time.
         self._last = self.DeclareDiscreteState(12)
         last = self.discrete_state_ticket(self._last)
         constraints = {self._state_port.ticket(), self.frames.ticket}
@@ -133,7 +134,7 @@ class ActiveConstraintProjector(LeafSystem):
             is_waiting = tracking_error > self._max_tracking_error and not reduces_error
             if not is_waiting and np.isfinite(desired).all():
                 return np.array([*desired, 0.0])
-        # Projecting a command that is inside already would let it creep by rounding.
+        # Projecting a command that is already inside would move it by rounding errors at every step.
         if self._violation(context, last) > INSIDE:
             inside = self._constrained(context, last, last)
             last = inside if np.isfinite(inside).all() else last
@@ -170,7 +171,7 @@ class ActiveConstraintProjector(LeafSystem):
         if not np.isfinite(measured).all():
             raise InputError(f"a template begins at the robot's pose: the measured pose must be finite, not {measured}")
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
-        # Not the value of the state port, which is initialized at this same instant.
+        # The state port cannot be used, because its source is initialized at this same instant.
         state = self._template.state_at(X_WE, frames)
         command = self._template.command(state, X_WE, X_WE, frames, self._period)
         discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))

@@ -45,7 +45,7 @@ class CartesianPositionController(LeafSystem):
     V is the velocity that reaches the desired pose in one period, within the speed limits.
     `pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics` computes v; while no joint limit is active, a
     closed form gives the same optimum. Position and velocity limits of the joints are satisfied and the direction of
-    the tool's motion is preserved; if both are not possible, the motion slows down or stops. A joint that starts
+    the tool's motion is preserved; if this is not possible, the motion slows down or stops. A joint that starts
     outside its position limits may return within its velocity limit and moves no farther out. While the desired pose is
     not finite, older than the timeout, or more than one period in the future (`CommandValidity`), the joint command is
     constant. Near a singular posture a damped pseudoinverse is used (`models.control.damped_inverse`): the direction of
@@ -174,7 +174,7 @@ class CartesianPositionController(LeafSystem):
             plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
-        # With q included, a joint outside its limits neither jumps back nor makes the problem infeasible.
+        # Limits that include q: a joint outside its limits neither jumps back nor makes the problem infeasible.
         limits = np.minimum(self._position_limits[0], q), np.maximum(self._position_limits[1], q)
         velocities, is_stuck = self._joint_velocities(q, V, J, limits)
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])
@@ -195,13 +195,13 @@ class CartesianPositionController(LeafSystem):
     def _joint_velocities(
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray | None, bool]:
-        """Return joint velocities for the tool velocity V, or None, and True if V cannot be followed."""
+        """Return joint velocities for the tool velocity V, or None on failure, and True if V cannot be followed."""
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
             velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))
             return velocities, not is_following(J, velocities, V)
         if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, position_limits):
-            return velocities, False  # no limit is active: the optimum in closed form, which is faster
+            return velocities, False  # no limit is active: the closed form is optimal, and faster
         self._parameters.set_joint_position_limits(position_limits)
         result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
         return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound

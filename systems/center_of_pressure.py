@@ -29,7 +29,7 @@ class CenterOfPressure(LeafSystem):
         min_force: Force along z below which there is no contact [N], positive.
 
     Raises:
-        InputError: If the force is not positive.
+        InputError: If `min_force` is not positive.
     """
 
     def __init__(self, min_force: float):

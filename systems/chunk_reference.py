@@ -11,13 +11,13 @@ from guiderail.systems.support.declarations import check_period, declare_cache, 
 
 
 class ChunkReference(LeafSystem):
-    """Predict the reference window of the next H+1 control steps by a base policy.
+    """Predict the reference window of the next H+1 control steps with a base policy.
 
         mean = mean of the chunks;  covariance = diag(variance of the chunks) + covariance_floor · Σ_n
 
     Every ``replan_steps`` control steps the policy predicts chunks from the observation just before that instant; in
-    between, the window advances along them. Σ_n are the covariances of a reference trajectory, whose window is the
-    output until the first prediction.
+    between, the window advances along them. Σ_n are the covariances of a reference trajectory. Until the first
+    prediction, the output is the window of this trajectory.
 
     .. pydrake_system::
 
@@ -28,16 +28,16 @@ class ChunkReference(LeafSystem):
         - reference_window
 
     ``observation`` is (n,). ``reference_window`` is ((H+1)(O + O²),): means (H+1, O) and covariances (H+1, O, O),
-    row-major, in the units of the outputs; the first point is the current control step. It is a function of state, so
-    an observation of the command is not an algebraic loop.
+    row-major, in the units of the outputs; the first point is the current control step. The port depends on state
+    alone, so that an observation of the command does not cause an algebraic loop.
 
     Args:
-        policy: Base policy (`models.policy`), a pure function; None: the window is always the reference's.
-        observation_size: n, at least 1.
+        policy: Base policy (`models.policy`), a pure function; if None, the window is always that of the reference.
+        observation_size: Size n of the observation, at least 1.
         reference: Reference trajectory in control steps, for Σ_n and the first window.
-        horizon: H, not negative.
+        horizon: Number of future points H after the current one, not negative.
         replan_steps: Control steps between two predictions, at least 1.
-        covariance_floor: Share of Σ_n that is added, positive.
+        covariance_floor: Factor of Σ_n in the covariance, positive.
         period: Control period [s], positive.
 
     Raises:
@@ -68,7 +68,7 @@ class ChunkReference(LeafSystem):
         self._replan_steps, self._floor = replan_steps, covariance_floor
         self._num_points, outputs = horizon + replan_steps, reference.num_outputs
         self._observation_port = self.DeclareVectorInputPort("observation", observation_size)
-        # [means and variances of the chunk (2, H + replan_steps, O); control steps since the start: −1 before it]
+        # [means and variances of the chunk (2, H + replan_steps, O); control steps since the start, −1 before it]
         self._state = self.DeclareDiscreteState(np.append(np.zeros(2 * self._num_points * outputs), -1.0))
         self._window = declare_cache(
             self, "window", self._calc_window, prerequisites_of_calc={self.discrete_state_ticket(self._state)}

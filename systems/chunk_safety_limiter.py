@@ -1,4 +1,4 @@
-"""Limiter of the chunks of a policy to bounds, velocity and jerk limits."""
+"""Limiter that keeps the chunks of a policy within bounds, velocity limits and jerk limits."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class _Plan:
 
 
 class ChunkSafetyLimiter(LeafSystem):
-    """Command the chunks of a policy within bounds, velocity and jerk limits (`ChunkGuard`).
+    """Execute the chunks of a policy within bounds, velocity limits and jerk limits (`ChunkGuard`).
 
     Every ``replan_steps`` control steps, from the first one on, the chunk is limited as a continuation of the last
     three commands. In between, the limited chunk is executed. The motion starts at rest at the measured pose, or at the
@@ -37,15 +37,15 @@ class ChunkSafetyLimiter(LeafSystem):
 
     ``chunk`` is (K*O,), requested outputs (K, O), row-major, the current control step first, and constant during a
     control step. ``pose`` is the measured pose (O,), read at initialization. ``desired_pose`` is (O,). ``rate`` (1,) is
-    the speed along the chunk relative to the chunk's: below 1 only with the mode "slowdown", and at a fallback.
+    the executed speed relative to that of the requested chunk, below 1 only with the mode "slowdown" or at a fallback.
     ``fallback`` (1,) is 1 if the rest of the previous chunk is executed because no chunk within the limits was found,
-    or the requested one is not finite.
+    or because the requested chunk is not finite.
 
     Args:
         guard: Limits and mode, for O outputs; its state is not used.
         num_steps: Number K of steps of a chunk, at least 4 and at least `replan_steps`.
-        replan_steps: Control steps that are executed of a chunk, at least 1.
-        period: Control period [s], that of the guard.
+        replan_steps: Number of control steps that are executed of each chunk, at least 1.
+        period: Control period [s], equal to the period of the guard.
 
     Raises:
         InputError: If an argument is out of range.

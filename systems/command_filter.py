@@ -8,12 +8,12 @@ from guiderail.systems.support.declarations import check_period, declare_cache, 
 
 
 class CommandFilter(LeafSystem):
-    """Map the last command and the desired one to a safe one, once a control step.
+    """Compute a safe command from the last command and the desired pose, once per control step.
 
         safe_pose = law(last safe_pose, desired_pose)
 
-    See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`, which uses the last two commands. The last
-    command is the measured pose at initialization.
+    See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`, which uses the last two commands. At
+    initialization, the last command is the measured pose.
 
     .. pydrake_system::
 
@@ -43,7 +43,7 @@ class CommandFilter(LeafSystem):
         size = len(law.start(np.zeros(outputs)))
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
-        self._last = self.DeclareDiscreteState(size)  # begins with the command
+        self._last = self.DeclareDiscreteState(size)  # state of the law, which begins with the last command
         self._command = declare_cache(
             self,
             "command",

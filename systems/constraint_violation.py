@@ -8,7 +8,7 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 
 
 class ConstraintViolation(LeafSystem):
-    """Maximum violation of linear constraints G y ≥ c, and of shapes and states if there are any, by a pose y.
+    """Largest violation of linear constraints G y ≥ c, or of motion constraints, by a pose y.
 
         violation = max(c − G y), negative if all constraints are slack
 
@@ -21,7 +21,8 @@ class ConstraintViolation(LeafSystem):
         - violation
 
     ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c; `UNCONSTRAINED` if there is no
-    constraint. It depends on the pose and the control step alone, so it evaluates every guidance in the same way.
+    constraint. The violation depends on the pose and the control step alone, so it evaluates every guidance in the same
+    way.
 
     Args:
         constraints: Constraints on O outputs, linear (constant, or one set per control step) or of a motion.

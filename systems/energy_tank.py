@@ -12,11 +12,11 @@ from guiderail.models.control.energy_tank import admissible_share, spring_energy
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
-_WRENCH_ORDER = [0, 1, 2, 5, 4, 3]  # coordinates of a wrench among those of a pose
+_WRENCH_ORDER = [0, 1, 2, 5, 4, 3]  # index among pose coordinates of each wrench coordinate
 
 
 class _Admitted(NamedTuple):
-    """Reference (6,), limits (6,) in the order of a pose, and energy of the tank [J]."""
+    """Admitted reference (6,), limits (6,) in the order of pose coordinates, and energy of the tank [J]."""
 
     reference: np.ndarray
     limits: np.ndarray
@@ -24,15 +24,16 @@ class _Admitted(NamedTuple):
 
 
 class EnergyTank(LeafSystem):
-    """Pass a reference and a bound on, as long as the energy that they add to the spring is in the tank.
+    """Pass on changes of a reference and a wrench bound as far as the tank holds the energy that they require.
 
         T' = T + Σ D Δx² / h − (U(x_r', F') − U(x_r, F)) ≥ 0
 
-    U is the energy of the clipped spring at the measured pose x. A change of the reference x_r, or of the limits F, is
-    paid from the tank. What the damper dissipates, at least Σ D Δx² / h in a period h, refills it up to the capacity.
-    If the tank does not suffice, only a share of the change is passed on. A lower limit applies at once. The energy of
-    spring, tank and motion therefore grows by nothing but the work of the surroundings, which cannot extract more than
-    the initial content (Ferraguti, Secchi, Fantuzzi 2013).
+    U is the energy of the clipped spring at the measured pose x. The energy that a change of the reference x_r or of
+    the limits F adds to the spring is taken from the tank. The energy that the damper dissipates, at least Σ D Δx² / h
+    in a period h, refills the tank up to its capacity. If the tank holds too little energy, only a
+    share of the change is passed on. A lower limit applies at once. The energy of spring, tank and motion therefore
+    increases only by work of the environment, which cannot extract more than the initial content (Ferraguti, Secchi,
+    Fantuzzi 2013).
 
     .. pydrake_system::
 
@@ -47,8 +48,8 @@ class EnergyTank(LeafSystem):
         - energy
 
     ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
-    desired pose that is not finite is passed on without a cost. ``max_wrench`` and ``admitted_wrench`` are (8,), [fx fy
-    fz tx ty tz], norm of the force and norm of the torque [N, Nm]. ``energy`` is (1,), the content [J].
+    desired pose that is not finite is passed on and takes no energy. ``max_wrench`` and ``admitted_wrench`` are (8,),
+    [fx fy fz tx ty tz], norm of the force and norm of the torque [N, Nm]. ``energy`` is (1,), the content [J].
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.

@@ -34,10 +34,10 @@ class TerminationTerm:
             signal share its port.
         condition: Pure function of these signals, called by name, that returns True if the condition is met.
         steps: Number of control steps in which the condition must be met before the episode ends, at least 1.
-        progress: Function of the same signals, optional. If it is given, the steps need not be consecutive, and the
-            count is reset when its value exceeds its maximum so far by `min_progress`. Otherwise the steps must be
-            consecutive.
-        min_progress: Smallest increase of `progress` that resets the count.
+        progress: Optional function of the same signals. With this function, the steps need not be consecutive, and the
+            count is reset when its value exceeds its maximum so far by more than `min_progress`. Without it, the steps
+            must be consecutive.
+        min_progress: Increase above the maximum of `progress` beyond which the count is reset.
     """
 
     termination: str
@@ -57,8 +57,8 @@ class TerminationTerm:
 class EpisodeMonitor(LeafSystem):
     """Evaluate termination terms in order of precedence and output the reason of the first one that is met.
 
-    Each term counts a control step once. At the end of a step the output includes it already; the state includes it
-    after the event of that instant. Once a term has terminated the episode, the output is constant.
+    Each term counts a control step once. At the end of a step, the output already includes this step; the state
+    includes it after the update event of that instant. Once a term has terminated the episode, the output is constant.
 
     .. pydrake_system::
 

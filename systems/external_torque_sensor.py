@@ -45,9 +45,10 @@ class ExternalTorqueSensor(LeafSystem):
 
         τ = τ_c + ε ∘ (τ_c + g(q)) + g'(q) − g(q) − c ∘ tanh(v / v₀) + b + d + σ ∘ n,  n ~ N(0, 1) once per period
 
-    An arm computes its external torques as measured torques minus those of its model. τ_c are the torques of contact
-    forces, g(q) the gravity of the model and g'(q) that of the actual bodies, c friction, b offsets, and d a random
-    walk. Torques of inertia are compensated exactly. The errors are parameters, which a reset samples and restores.
+    An arm computes its external torques as the measured torques minus the torques of its model. τ_c are the torques of
+    contact forces, g(q) the gravity of the model and g'(q) that of the actual bodies, c friction, b offsets, and d a
+    random walk. Inertial torques are compensated exactly. The errors are parameters, which a reset samples and
+    restores.
 
     .. pydrake_system::
 
@@ -63,7 +64,7 @@ class ExternalTorqueSensor(LeafSystem):
 
     Args:
         plant: Model of the arm alone, finalized.
-        payload_body: Body that a payload is rigidly attached to, at its center of mass.
+        payload_body: Body to whose center of mass a payload is rigidly attached.
         noise: Standard deviations σ, (n,) [Nm].
         drift: Standard deviations of d after `DRIFT_TIME`, (n,) [Nm].
         period: Period of noise and drift [s], positive.
@@ -99,7 +100,7 @@ class ExternalTorqueSensor(LeafSystem):
         state, parameters = self._state_port.ticket(), self.all_parameters_ticket()
         self._model = declare_plant_context(self, plant, self._set_positions, prerequisites_of_calc={state})
         self._bodies_set = declare_cache(self, "actual_bodies", self._actual_bodies, prerequisites_of_calc={parameters})
-        # In a list with the bodies that the context has: they change at a reset, the positions at every step.
+        # The value is [plant context, bodies set in it]: bodies change only at a reset, positions at every step.
         self._actual = self.DeclareCacheEntry(
             description="actual_arm",
             value_producer=ValueProducer(
@@ -144,7 +145,7 @@ class ExternalTorqueSensor(LeafSystem):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
     def add_payload(self, context: Context, mass: float) -> None:
-        """Add a mass [kg] that the arm's model does not have; `context` is this system's."""
+        """Add a payload of a mass [kg] that is not in the arm's model; `context` is this system's."""
         masses = context.get_mutable_numeric_parameter(self._mass)
         masses.SetAtIndex(self._payload_index, masses.GetAtIndex(self._payload_index) + mass)
 

@@ -36,10 +36,10 @@ class FunctionGuidanceSystem(LeafSystem):
     outputs are state without direct feedthrough, so that the measured pose of a station can close the loop.
 
     Args:
-        function: Pure function (action, pose, wrench) → desired pose. A reset cannot restore internal memory.
-        action_size: A, at least 1.
-        pose_size: O, at least 1.
-        wrench_size: W, at least 1.
+        function: Pure function (action, pose, wrench) → desired pose; a reset cannot restore internal memory.
+        action_size: Size A of the action, at least 1.
+        pose_size: Size O of the poses, at least 1.
+        wrench_size: Size W of the wrench, at least 1.
         period: Control period [s], positive.
 
     Raises:

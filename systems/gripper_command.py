@@ -11,7 +11,7 @@ class GripperCommand(LeafSystem):
     """Desired state of gripper joints: the last finite desired positions, with zero velocity.
 
     Desired positions are clipped to the joint limits. If a position is not finite, or the port is not connected, the
-    previous desired position remains in force; the first one is the initial opening.
+    previous desired position remains in force, at first the initial opening.
 
     .. pydrake_system::
 

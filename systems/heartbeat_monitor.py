@@ -8,15 +8,16 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_SENDERS, Fault, Heartbeat
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
-FORGET_TIME = 1.0  # time for which a silent monitor is missed while another one is alive [s]
+FORGET_TIME = 1.0  # age of a heartbeat above which its sender is ignored while another monitor is alive [s]
 
 
 class HeartbeatMonitor(LeafSystem):
     """Raise a fault when a robot-side safety monitor reports a stop or its heartbeat times out.
 
-    Each sender has a timeout of its own, so that one monitor cannot hide that another one has exited. A monitor that
-    was replaced is missed for `FORGET_TIME`, and for good if no other one is alive. No fault is raised before the first
-    heartbeat, so that a robot without a safety monitor can be used.
+    Each sender has a timeout of its own, so that one monitor cannot hide that another one has exited. A monitor whose
+    heartbeat has timed out is ignored once the heartbeat is older than `FORGET_TIME` and another monitor is alive, so
+    that a monitor can be replaced. No fault is raised before the first heartbeat, so that a robot without a safety
+    monitor can be used.
 
     .. pydrake_system::
 
@@ -46,7 +47,7 @@ class HeartbeatMonitor(LeafSystem):
         self._period, self._timeout = period, timeout
         self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
-        # For each sender [sender, NaN if none; its last sequence number; time since that heartbeat in s].
+        # For each sender [sender, or NaN for an unused row; its last sequence number; time since that heartbeat in s].
         self._initial = np.tile([np.nan, 0.0, 0.0], MAX_SENDERS)
         self._state = self.DeclareDiscreteState(self._initial)
         self._fault_port = self.DeclareVectorOutputPort(
@@ -67,7 +68,7 @@ class HeartbeatMonitor(LeafSystem):
     get_fault_output_port = output_getter("fault", "combined fault, (1,), a code of `Fault`")
 
     def is_alive(self, context: Context) -> bool:
-        """Return True if a heartbeat has been received and has not timed out."""
+        """Return True if a heartbeat of any monitor has been received and has not timed out."""
         return bool((self._senders(context)[:, 2] <= self._timeout).any())
 
     def _heartbeats(self, context: Context) -> tuple[Heartbeat, ...]:

@@ -13,8 +13,8 @@ class HistoryBuffer(LeafSystem):
         history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
     At every control step the newest output replaces the oldest. Initialization fills all P entries with
-    ``initial_output`` if it is connected, otherwise with ``output``. Where ``output`` is a command,
-    ``initial_output`` is the measured pose.
+    ``initial_output`` if it is connected, otherwise with ``output``. If ``output`` is a command, connect the measured
+    pose to ``initial_output``.
 
     .. pydrake_system::
 

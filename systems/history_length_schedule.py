@@ -26,16 +26,16 @@ class HistoryLengthSchedule(LeafSystem):
         - history_length
 
     ``wrench`` is (W,), measured; its first three entries are a force [N] (its first two for W = 2).
-    ``history_length`` is (1,), P; it is state, initially the longest.
+    ``history_length`` is (1,), the number P of stored outputs; it is discrete state, initially the longest length.
 
     Args:
-        lengths: History lengths in any order, each at least 1, because without a history a command would not start at
-            the end of its predecessor.
+        lengths: History lengths in any order, each at least 1, because without a history a command would not start
+            where the previous one ended.
         period: Control period [s], positive.
         contact_threshold: Force above which contact begins [N].
         release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.
         dwell_steps: Control steps in free space before the next longer length, at least 1.
-        wrench_size: W, at least 1.
+        wrench_size: Size W of the wrench, at least 1.
 
     Raises:
         InputError: If an argument is out of range.
@@ -66,7 +66,7 @@ class HistoryLengthSchedule(LeafSystem):
         self._contact_threshold, self._release_threshold = contact_threshold, release_threshold
         self._dwell_steps = dwell_steps
         self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
-        # [index into the lengths, longest first; 1 in contact; control steps since the last change in free space]
+        # [index into `_lengths`, longest first; 1 in contact, else 0; steps in free space since the last longer length]
         self._state = self.DeclareDiscreteState(3)
         self._history_length_port = self.DeclareVectorOutputPort(
             "history_length",
@@ -86,7 +86,7 @@ class HistoryLengthSchedule(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         index, in_contact, num_free_steps = context.get_discrete_state(self._state).value()
         force = float(np.linalg.norm(self._wrench_port.Eval(context)[:3]))
-        # In this form NaN counts as contact.
+        # `not force <=` instead of `force >`, so that NaN counts as contact.
         in_contact = not force <= (self._release_threshold if in_contact else self._contact_threshold)
         if in_contact:
             index, num_free_steps = min(index + 1, len(self._lengths) - 1), 0

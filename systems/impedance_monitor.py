@@ -8,12 +8,12 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ImpedanceMonitor(LeafSystem):
-    """Estimate the contact force from the wrench of an impedance and detect its saturation.
+    """Estimate the contact force from the wrench of an impedance, and detect that the wrench saturates.
 
         contact_force = ‖f‖,  at rest f = K (x_d − x)
 
-    In a collision this is a better measure than the contact force itself, because the instantaneous force of an impact
-    depends on the step of the simulation and the force of the impedance does not.
+    In a collision this estimate is a better measure than the simulated contact force: the instantaneous force of an
+    impact depends on the time step of the simulation, and the force of the impedance does not.
 
     .. pydrake_system::
 
@@ -28,7 +28,7 @@ class ImpedanceMonitor(LeafSystem):
     [N]. ``saturation`` (1,) is 1 if any of the six components is within 0.1 % of its limit, otherwise 0.
 
     Args:
-        limits: Limits of the magnitudes of the components, (6,) [N, Nm], positive.
+        limits: Limit of the magnitude of each component, (6,) [N, Nm], positive.
 
     Raises:
         InputError: If there are not six positive limits.

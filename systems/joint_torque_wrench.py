@@ -15,9 +15,9 @@ class JointTorqueWrench(LeafSystem):
 
         F = (Jᵀ)⁺ τ_external,  τ y' = F − y
 
-    τ_external are the measured joint torques minus those of the arm's weight and inertia; an arm with torque sensors
-    computes them itself. The pseudoinverse is damped, so that near a singular posture the estimate tends to zero
-    instead of diverging.
+    τ_external are the measured joint torques minus the torques of the arm's weight and inertia; the controller of an
+    arm with torque sensors provides them. The pseudoinverse is damped, so that near a singular posture the estimate
+    tends to zero instead of diverging.
 
     .. pydrake_system::
 
@@ -30,7 +30,7 @@ class JointTorqueWrench(LeafSystem):
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool center P in the axes of
     T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, without direct feedthrough.
-    The first sample initializes the filter: a filter that rises from zero would hide a part of the bias from a tare.
+    The first sample initializes the filter: a filter that starts at zero would not reach the full bias before a tare.
     Samples that are not finite are skipped.
 
     Args:
@@ -82,7 +82,7 @@ class JointTorqueWrench(LeafSystem):
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         external_torque = self._external_torque_port.Eval(context)
-        # NaN would remain in the filter for ever.
+        # NaN would remain in the state of the filter.
         if not is_finite(self._positions_port.Eval(context)) or not is_finite(external_torque):
             return EventStatus.DidNothing()
         J = self._plant.CalcJacobianSpatialVelocity(

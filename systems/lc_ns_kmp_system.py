@@ -41,31 +41,32 @@ class LcNsKmpSystem(LeafSystem):
     ``null_space_action`` is (O,), the policy's action in [−1, 1], constant during a control step. ``history`` is
     (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
     length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
-    starts at the end of the previous one. ``reference_window`` is ((H+1)(O + O²),), means and covariances in place of
-    the reference's, the current step first (`ChunkReference`), if it is connected. ``command`` is (O,).
+    starts at the end of the previous one. If ``reference_window`` ((H+1)(O + O²),) is connected, its means and
+    covariances, the current step first, replace those of the reference (`ChunkReference`). ``command`` is (O,).
     ``constraint_violation`` (1,) is max(c − G y) of the command: negative if all constraints are slack, `UNCONSTRAINED`
     if there is none. ``fallback`` (1,) is 1 if no window within the constraints was found; the command is then the
-    point nearest to the last command within the constraints of its step.
+    point nearest to the last command within the constraints of the current step.
 
-    The step is state and counts control periods since time zero, unless ``motion_time`` (1,) [s] is connected
-    (`ProgressClock`), which then determines it. The command is a pure function of step, action and
-    history, evaluated once per control step (see docs/concepts/rates.md). The evaluation
-    raises an `InputError` if no primitive has the selected history length.
+    The step is discrete state that counts control periods since time zero. If ``motion_time`` (1,) [s] is connected
+    (`ProgressClock`), it determines the step instead. The command is a pure function of step, action and history,
+    evaluated once per control step (see docs/concepts/rates.md). The evaluation raises an `InputError` if no primitive
+    has the selected history length.
 
     Args:
         primitive: Primitive with O outputs and a history of P outputs.
         gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); ones by default.
-        period: Control period [s], positive. It must be that of the reference trajectory, otherwise the speed differs
-            from the demonstrations.
+        period: Control period [s], positive. It must equal the period of the reference trajectory, otherwise the
+            motion is faster or slower than the demonstrations.
         shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their gains
             (O,).
 
     Raises:
         InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
-            `shorter` has no shorter history, the history length of another one, or other constraints.
+            `shorter` has a history that is not shorter, the same history length as another primitive, or constraints
+            that differ from those of `primitive`.
     """
 
-    #: ``constraint_violation`` if there is no constraint: finite, so that it can be logged and reduced.
+    #: ``constraint_violation`` if there is no constraint; finite, so that logs and statistics accept it.
     UNCONSTRAINED = -1e30
 
     def __init__(
@@ -205,7 +206,7 @@ class LcNsKmpSystem(LeafSystem):
                 prediction = primitive.predict_window(step, means, covariances, action, history)
             output, fallback = prediction.output, 0.0
         except UnsolvableError:
-            # The constraints of this step may have changed: the last command alone might violate them.
+            # The constraints may differ from those of the previous step: the last command itself might violate them.
             last_command = context.get_discrete_state(self._last_command).value()
             output, fallback = self._primitive.constraints.nearest(last_command, step), 1.0
         return _Prediction(step, output, fallback)

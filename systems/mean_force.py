@@ -12,8 +12,8 @@ class MeanForce(LeafSystem):
 
         force = (force_sum − force_sum at the last control step) / substeps
 
-    A control step consists of many plant steps. The force at the end of the last one misses contacts that are already
-    over and depends on the plant step during an impact; the mean does neither.
+    A control step consists of many plant steps. The force at the end of the last plant step misses contacts that
+    are already over, and during an impact it depends on the length of the plant step. The mean has neither problem.
 
     .. pydrake_system::
 
@@ -28,7 +28,7 @@ class MeanForce(LeafSystem):
     since the last control step [N]. ``magnitude`` is (1,), its norm [N].
 
     Args:
-        size: D, at least 1.
+        size: Number D of force components, at least 1.
         substeps: Plant steps per control step, at least 1.
         period: Control period [s], positive.
 

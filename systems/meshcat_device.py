@@ -22,8 +22,8 @@ class MeshcatDevice(LeafSystem):
         output_ports:
         - action
 
-    ``action`` is (n,), in [−1, 1], sampled once per control period. An entry is the value of its gamepad axis outside
-    the dead zone, otherwise the value of its slider; each slider has two keys.
+    ``action`` is (n,), in [−1, 1], sampled once per period. An entry is the value of its gamepad axis outside the dead
+    zone, otherwise the value of its slider, which two keys move.
 
     Args:
         meshcat: Meshcat instance that shows the sliders and reads the gamepad.
@@ -32,7 +32,7 @@ class MeshcatDevice(LeafSystem):
         period: Sampling period [s], positive.
 
     Raises:
-        InputError: If the period is not positive, or the numbers of axes and key pairs differ.
+        InputError: If the period is not positive, there is no axis, or the numbers of axes and key pairs differ.
     """
 
     def __init__(

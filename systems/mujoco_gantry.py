@@ -21,7 +21,7 @@ from guiderail.systems.support.drake_multibody import pose_to_transform
 if TYPE_CHECKING:
     import mujoco
 
-MAX_JOINT_SPEED = 1e3  # a faster joint is a failed simulation [m/s], [rad/s]
+MAX_JOINT_SPEED = 1e3  # joint speed above which a simulation counts as diverged [m/s, rad/s]
 
 
 def mujoco_engine() -> ModuleType:
@@ -43,7 +43,7 @@ class DivergedError(RuntimeError):
 
 
 class MovedBodies(NamedTuple):
-    """Bodies of a plant with poses from the engine: the fixture, the tool, and the workpiece fixed to the tool."""
+    """Bodies of a plant that the MuJoCo model contains: the fixture, the tool, and the workpiece fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody
@@ -65,9 +65,9 @@ class MujocoGantry(LeafSystem):
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 
-    with the contact forces f of the engine; w is their wrench on the tool at its center, in the axes of T. A static
-    plant defines the pose of the fixture and the pose of the workpiece in the tool, offsets included. The bodies of the
-    model are placed accordingly before every update.
+    with the contact forces f of the engine, the wrench w of f on the tool at its center in the axes of T, and the
+    filtered wrench y. A static plant defines the pose of the fixture and the pose of the workpiece in the tool, offsets
+    included. Before every update, the bodies of the model are placed at these poses.
 
     .. pydrake_system::
 
@@ -84,7 +84,7 @@ class MujocoGantry(LeafSystem):
         - geometry_poses
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
-    output of the static plant; ``body_poses`` contains the same poses with the simulated ones of tool and workpiece.
+    output of the static plant; ``body_poses`` contains these poses, with tool and workpiece at their simulated poses.
     ``state`` is (12,), the pose and its velocity. ``geometry_poses`` contains the poses of all frames with geometry.
     ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is (6,), the forces and
     torques of the six motors in the order of the pose. Positions, velocities and warm start of the engine and the state
@@ -96,7 +96,7 @@ class MujocoGantry(LeafSystem):
     Args:
         model: MuJoCo model with bodies of the names in `MovedBodies`; this system writes to it.
         plant: Finalized plant without joints, registered as a source of geometry.
-        moved: Bodies of the plant that the model simulates.
+        moved: Bodies of the plant that the model contains.
         X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
         period: Update period [s], positive, an integer multiple of the model's step.
         time_constant: τ of the wrench filter [s]; 0 disables it.
@@ -124,19 +124,19 @@ class MujocoGantry(LeafSystem):
             raise InputError(f"MuJoCo's step of {step} s does not divide the period of {period} s")
         self._mujoco = mujoco_engine()
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # Work memory: every update writes all values that it reads, so no state survives in it.
+        # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
         self.model, self._data = model, self._mujoco.MjData(model)
-        # Divergence, or a full buffer, in which case the engine would ignore further contacts.
+        # Warnings of divergence, or of a full buffer, with which the engine would ignore further contacts.
         failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
         self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
-        # Includes the warm start of the solver, so that a restored state continues identically.
+        # Stored parts of the engine's state, including the warm start, so that a restored state continues identically.
         self._parts = self._mujoco.mjtState.mjSTATE_INTEGRATION
         self._time_constant = time_constant
         self._X_WT, self._X_TW = X_WT, X_WT.inverse()
         self._fixture, self._workpiece = (model.body(name).id for name in ("fixture", "workpiece"))
         self._moved = MovedBodies(*(int(body.index()) for body in moved))
         frames = [(i, plant.GetBodyFrameIdIfExists(BodyIndex(i))) for i in range(1, plant.num_bodies())]
-        self._frames = [(body, frame) for body, frame in frames if frame is not None]  # of bodies with geometry
+        self._frames = [(body, frame) for body, frame in frames if frame is not None]  # only bodies with geometry
         size = self._mujoco.mj_stateSize(model, self._parts)
         self._physics = slice(0, size)
         self._filtered = slice(size, size + 6)
@@ -225,7 +225,7 @@ class MujocoGantry(LeafSystem):
         num_substeps = self._scale_contact(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
-        # At a count of 0 the engine would write a log file to the working directory.
+        # Counts start at 1: from 0, the first warning makes the engine write a log file to the working directory.
         for warning in self._failures:
             data.warning[warning].number = 1
         filtered = state[self._filtered]
@@ -261,8 +261,8 @@ class MujocoGantry(LeafSystem):
     def _scale_contact(self, friction: float, modulus: float) -> int:
         """Scale the model's contact parameters and return the number of substeps that replace one step.
 
-        The natural frequency of a spring times the step, and the time constant of a contact in steps, remain in the
-        range that the engine integrates. A stiffer spring has the same damping ratio.
+        The step is short enough that the engine can integrate the stiffer springs, and the time constant of a contact
+        is at least two steps. A stiffer spring keeps its damping ratio.
         """
         model, nominal = self.model, self._nominal
         num_substeps = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
@@ -275,7 +275,10 @@ class MujocoGantry(LeafSystem):
         return num_substeps
 
     def _contact_wrench(self) -> np.ndarray:
-        """Return the wrench of the generalized contact forces: slides are the axes of T, a hinge a carries a · t."""
+        """Return the wrench of the generalized contact forces.
+
+        The slide joints are along the axes of T; the generalized force of a hinge about axis a is a · t, t the torque.
+        """
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
 

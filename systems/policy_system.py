@@ -1,4 +1,4 @@
-"""Policy as a system, in the place where an environment writes its actions."""
+"""System that evaluates a policy, for simulations of a task diagram without an environment."""
 
 from collections.abc import Callable
 
@@ -37,9 +37,10 @@ class PolicySystem(LeafSystem):
     feedthrough: zero before the first evaluation and after a reset.
 
     Args:
-        policy: Pure function observation → action (A,), clipped to [−1, 1]. A reset cannot restore internal memory.
-        observation: N, at least 1, or a model value of an image port, `Value(ImageRgba8U(w, h))`.
-        action_size: A, at least 1.
+        policy: Function from observation to action (A,), which is clipped to [−1, 1]. It must be pure, because a reset
+            cannot restore internal memory.
+        observation: Size N of the observation, at least 1, or a model value of an image, `Value(ImageRgba8U(w, h))`.
+        action_size: Size A of the action, at least 1.
         period: Action period [s], positive, an integer multiple of the control period.
 
     Raises:

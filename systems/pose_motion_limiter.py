@@ -9,8 +9,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_limits import MotionLimits
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
-# Where axes cannot be synchronized, for numerical reasons (about one of 10,000 adversarial commands), each has a
-# trajectory of its own; where there is none either, the motion is braked to rest.
+# Modes in order of preference. If the axes cannot be synchronized for numerical reasons (about one of 10,000
+# adversarial commands), each axis has its own trajectory; if that fails too, the motion is braked to rest.
 FALLBACKS = (
     (ControlInterface.Position, Synchronization.Time),
     (ControlInterface.Position, Synchronization.No),
@@ -22,12 +22,13 @@ POSE_AXES = [5, 4, 3]  # indices of Rx, Ry, Rz in a pose, in the order of SciPy'
 class PoseMotionLimiter(LeafSystem):
     """Follow a desired pose with limited velocity, acceleration and jerk, starting from the measured pose at rest.
 
-    While the blend factor is zero the output is the measured pose. When it becomes positive, the output starts there
-    and moves to the desired pose on the time-optimal trajectory within the limits (Berscheid and Kröger, "Jerk-limited
-    Real-time Trajectory Generation with Arbitrary Target States", RSS 2021), computed again in each period. The
-    orientation is a rotation vector from the orientation at the start (`MotionLimits.rotation_vector_limits`). Each
-    axis has a share of 1/√3 of the limit, so that the norms are within the limits. A desired pose that is not finite,
-    or that is half a turn or more from the start, is ignored: the output comes to rest at the last valid one.
+    While the blend factor is zero the output is the measured pose. When it becomes positive, the output starts at the
+    measured pose and moves to the desired pose on the time-optimal trajectory within the limits (Berscheid and Kröger,
+    "Jerk-limited Real-time Trajectory Generation with Arbitrary Target States", RSS 2021), computed again in each
+    period. The orientation is represented by the rotation vector from the orientation at the start
+    (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
+    the limits. A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the
+    output comes to rest at the last valid one.
 
     .. pydrake_system::
 
@@ -91,7 +92,7 @@ class PoseMotionLimiter(LeafSystem):
         desired = self._desired_pose_port.Eval(context)
         if np.isfinite(desired).all():
             turn = (start.inv() * Rotation.from_euler("xyz", desired[POSE_AXES])).as_rotvec()
-            # Half a turn away the rotation vector jumps to the opposite side.
+            # At half a turn the rotation vector jumps to the opposite direction.
             if np.linalg.norm(turn) < 0.9 * np.pi:
                 state[18:24] = np.concatenate([desired[:3], turn])
         wanted = InputParameter(6)
@@ -114,15 +115,15 @@ class PoseMotionLimiter(LeafSystem):
 
 
 def _plan(wanted: InputParameter) -> Trajectory:
-    """Return a trajectory to the target, or to rest if there is none.
+    """Return a trajectory to the target, or a trajectory to rest if the target has none.
 
     Raises:
-        InputError: If there is no trajectory to rest either.
+        InputError: If neither is found.
     """
     for wanted.control_interface, wanted.synchronization in FALLBACKS:
         trajectory = Trajectory(6)
         try:
-            # An instance that a system stored would be reported as leaked when the interpreter exits.
+            # Constructed on every call: an instance stored in a system would be reported as leaked when Python exits.
             if Ruckig(6).calculate(wanted, trajectory) in (Result.Working, Result.Finished):
                 return trajectory
         except RuckigError:

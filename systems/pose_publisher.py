@@ -23,7 +23,7 @@ class PosePublisher(LeafSystem):
         - pose
         - arm_state
 
-    ``pose`` is X_TP as (6,), [x y z Rz Ry Rx] in meters and radians. ``arm_state`` is (1,), a number of `ArmState`.
+    ``pose`` is X_TP as (6,), [x y z Rz Ry Rx] in meters and radians. ``arm_state`` is (1,), a value of `ArmState`.
 
     Args:
         write_pose: Function that sends a pose X_BaseTool at a time [s], such as `PoseDriver.write_pose`.

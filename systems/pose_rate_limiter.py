@@ -11,9 +11,9 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 class PoseRateLimiter(LeafSystem):
     """Follow a desired pose with limited speed, starting from the measured pose.
 
-    While the blend factor is zero the output is the measured pose. If it is positive at initialization, the output
-    starts from the pose measured then. Afterwards it moves towards the desired pose. In each period the position moves
-    along a straight line by at most speed times period; each angle turns separately, in the shorter direction. A
+    While the blend factor is zero the output is the measured pose. If the factor is positive at initialization, the
+    output starts from the pose measured then. Afterwards it moves towards the desired pose. In each period the position
+    moves along a straight line by at most speed times period; each angle turns separately, in the shorter direction. A
     desired pose within the speed limits is output unchanged. A desired pose that is not finite is ignored.
 
     .. pydrake_system::

@@ -11,8 +11,9 @@ class PoseWrench(LeafSystem):
 
         f = τ_xyz,  [ez, Rz(a) ey, Rz(a) Ry(b) ex]ᵀ t = τ_abc
 
-    See `wrench_of_generalized_force`. On a gantry the joint positions are the pose of the tool, so the generalized
-    contact forces of the plant are the wrench of the environment, without the tool's weight and inertia.
+    with force f, torque t and generalized forces τ (see `wrench_of_generalized_force`). On a gantry the joint positions
+    are the pose of the tool, so the generalized contact forces of the plant are the wrench of the environment, without
+    the tool's weight and inertia.
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""Progress of a movement primitive by how the robot follows its commands."""
+"""Clock of a movement primitive that waits for a robot that does not follow the commands."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem

@@ -15,7 +15,7 @@ class Recording:
     """Samples of named signals.
 
     Args:
-        times: Start times of the N recorded control periods, (N,) [s]; the signals are sampled at their ends.
+        times: Start times of the N recorded control periods, (N,) [s]; the signals are sampled at the end of each.
         signals: Samples of each signal by name, (N, size).
     """
 
@@ -29,9 +29,9 @@ class Recording:
 class Recorder(LeafSystem):
     """Record named signals at the end of each control period.
 
-    The sample at the instant k·period contains the values just before it: the command since (k−1)·period and its
-    result, which is one row of a demonstration. Recording stops after `num_samples` samples. The samples are declared
-    state, which a reset clears.
+    The sample at the instant k·period contains the values just before that instant: the command since (k−1)·period and
+    the resulting motion, as one row of a demonstration. Recording stops after `num_samples` samples. The samples are
+    declared state, which a reset clears.
 
     .. pydrake_system::
 
@@ -90,7 +90,7 @@ class Recorder(LeafSystem):
 
     def _record(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = int(context.get_discrete_state(self._count).value()[0])
-        # No step has ended at time zero. An event offset of one period would not coincide exactly with k * period.
+        # No step has ended at time zero. With an event offset of one period, rounding would miss k * period.
         if context.get_time() == 0 or count == self._num_samples:
             return EventStatus.DidNothing()
         row = np.concatenate(list(self._signals.eval(context).values()))

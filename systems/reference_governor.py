@@ -12,10 +12,11 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 class ReferenceGovernor(LeafSystem):
     """Move a desired pose towards the measured one, so that the force of a spring and damper stays inside a bound.
 
-        x_r = x + e_r,  K e_r inside the bound less (K h + D) |v|,  |v| → at most F / √(k m)
+        x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
-    for six joints with stiffness K and damping D, a moving mass m and contacts of stiffness k: see `governed_error`. A
-    desired pose that is close enough is output unchanged up to rounding.
+    for six joints with stiffness K and damping D, and time step h. Motion faster than F / √(k m) is slowed down, with
+    force bound F, contact stiffness k and moving mass m (see `governed_error`). A desired pose that is close enough is
+    output unchanged up to rounding.
 
     .. pydrake_system::
 
@@ -28,8 +29,8 @@ class ReferenceGovernor(LeafSystem):
         - reference_pose
 
     ``desired_pose`` and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``state`` is (12,), the
-    measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), [fx fy fz tx ty tz], norm of the force and norm
-    of the torque [N, Nm]; it lowers the bound and cannot raise it.
+    measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), the limits of [fx fy fz tx ty tz], of the norm
+    of the force and of the norm of the torque [N, Nm]; it can lower the bound but not raise it.
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.

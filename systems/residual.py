@@ -21,7 +21,7 @@ class Residual(LeafSystem):
         output_ports:
         - desired_pose
 
-    All are (O,); ``action`` is in [−1, 1]. Drake's `Adder` computes the same sum, but its output counts as
+    All ports are (O,); ``action`` is in [−1, 1]. Drake's `Adder` computes the same sum, but its output counts as
     time-dependent, so downstream outputs would be computed again at every plant step.
 
     Args:

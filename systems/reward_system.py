@@ -48,7 +48,7 @@ class RewardSystem(LeafSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If there is no term, a name is not allowed, two terms disagree about the size of a signal, or the
+        InputError: If there is no term, a name is not allowed, two terms state different sizes of a signal, or the
             parameters of a function are not named like its signals. At evaluation, if a term is not one finite number.
     """
 
@@ -112,7 +112,7 @@ class RewardSystem(LeafSystem):
         if array.size != 1 or array.dtype.kind not in "fiub":
             raise InputError(f"reward term {term.name!r}{self._of_task} must be one number, and it is {brief(value)}")
         number = float(array.item())
-        # A learner would diverge episodes later, far from the cause.
+        # Without this error a learner would diverge only episodes later, far from the cause.
         if not math.isfinite(number):
             raise InputError(f"reward term {term.name!r}{self._of_task} is not finite, but {number}")
         return number

@@ -34,8 +34,8 @@ class SctInputMapping(LeafSystem):
     ``state`` is (1,), the number of the template's state.
 
     Args:
-        template: The template.
-        frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+        template: Shared control template.
+        frames: Poses of the template's objects by name, in the frame that the poses at the ports refer to.
         period: Time for which an input is held [s], positive.
 
     Raises:

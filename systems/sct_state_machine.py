@@ -38,8 +38,8 @@ class SctStateMachine(LeafSystem):
     the states, and its increase in a step is d_{t−1} − d_t of equation 3.2.
 
     Args:
-        template: The template.
-        frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+        template: Shared control template.
+        frames: Poses of the template's objects by name, in the frame that the poses at the ports refer to.
         period: Control period [s], positive.
 
     Raises:

@@ -15,8 +15,8 @@ class SensorDisturbance(LeafSystem):
 
         y = s ∘ u(t − k h) + b + C (x − x₀) + d + σ ∘ n,  n ~ N(0, 1), sampled once per period h
 
-    and then rounded to whole multiples of the resolution. s, b, C, k and the seed of noise and drift are parameters,
-    which a reset samples and restores. d is a random walk, and x₀ the configuration x at the initialization. An
+    and then rounded to whole multiples of the resolution. s, b, C, k and the seed of noise and drift are parameters of
+    the context, which a reset sets. d is a random walk, and x₀ is the configuration x at the initialization. An
     initialization restarts the noise and fills the delay line with zeros.
 
     .. pydrake_system::
@@ -33,10 +33,10 @@ class SensorDisturbance(LeafSystem):
     Args:
         period: Period h of noise, drift and delay [s], positive.
         noise: Standard deviations σ, (n,), not negative.
-        delay: Largest delay in periods, at least 0; k is 1 or more and by default this.
+        delay: Largest delay in periods, at least 0, and default of k; `set_delay` sets k from 1 to this delay.
         drift: Standard deviations of d after `DRIFT_TIME`, (n,), not negative; none by default.
-        resolution: Steps of the output, (n,), not negative; 0 for no rounding, the default.
-        configuration_size: m.
+        resolution: Resolution of the output, (n,), not negative; 0, the default, disables rounding.
+        configuration_size: Size m of the configuration; 0 if the error does not depend on a configuration.
 
     Raises:
         InputError: If an argument is out of range.
@@ -109,22 +109,22 @@ class SensorDisturbance(LeafSystem):
     get_disturbed_measurement_output_port = output_getter("disturbed_measurement", "disturbed measurement, (n,)")
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
-        """Set s and b, (n,) each, and the seed of noise and drift; `context` is this system's."""
+        """Set scale s and bias b, (n,) each, and the seed of noise and drift; `context` is this system's."""
         for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
     def set_delay(self, context: Context, delay: int) -> None:
-        """Set k; `context` is this system's.
+        """Set the delay k in periods; `context` is this system's.
 
         Raises:
-            InputError: If it is not from 1 to the largest delay.
+            InputError: If `delay` is not from 1 to the largest delay.
         """
         if not 1 <= delay <= self._delay:
             raise InputError(f"the delay of this sensor is from 1 to {self._delay} periods, not {delay}")
         context.get_mutable_numeric_parameter(self._used_delay).SetAtIndex(0, float(delay))
 
     def set_gradient(self, context: Context, gradient: np.ndarray) -> None:
-        """Set C, (n, m), of a sensor with a configuration; `context` is this system's."""
+        """Set the gradient C (n, m) of the error in the configuration; `context` is this system's."""
         context.get_mutable_numeric_parameter(self._gradient).SetFromVector(np.ravel(gradient))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -12,7 +12,7 @@ from guiderail.systems.support.declarations import check_period, input_getter
 class TorquePublisher(LeafSystem):
     """Publish joint torques once per period while enabled; otherwise no message is sent, not even zeros.
 
-    While the driver is to hold the arm, it is asked to do so once per period instead.
+    While ``is_holding`` is 1, `hold` is called once per period instead.
 
     .. pydrake_system::
 
@@ -23,7 +23,7 @@ class TorquePublisher(LeafSystem):
         - is_holding
 
     ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0. ``is_holding``
-    is (1,); `hold` is called while it is 1.
+    is (1,), 1 while the driver has to hold the arm.
 
     Args:
         write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.

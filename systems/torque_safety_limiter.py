@@ -38,14 +38,14 @@ class ArmState(IntEnum):
 
 @dataclass(frozen=True)
 class SafetyLimits:
-    """Limits of an arm, and the times in which it stops and starts.
+    """Limits of an arm, and the durations of its stop and start.
 
     Args:
         velocity: Velocity limit of each joint (n,) [rad/s], positive.
         torque: Limit of the torque sent to each joint (n,) [Nm], positive.
         external_torque: Limit of the external torque of each joint (n,) [Nm], positive.
         force: Limit of the force on the tool [N], positive.
-        lower, upper: Corners of the workspace of the tool center, in the axes of the target (3,) [m].
+        lower, upper: Corners of the workspace of the tool center in the target frame (3,) [m].
         damping_time: Duration of damping in a stop, after which zero torque is sent [s], positive.
         decay_time: Decay time of the joint velocities during damping [s], at least two periods.
         ramp_time: Time in which the blend factor increases to 1 [s], positive.
@@ -77,16 +77,16 @@ class TorqueSafetyLimiter(LeafSystem):
 
         τ = clip(a f τ_commanded + (1 − a) τ_damping)
 
-    The blend factor a increases from 0 to 1 in the ramp time. The freshness f is 1 for a status that is at most one
-    period old and 0 for one that is two periods old, because torques computed from an old state would accelerate the
-    arm. τ_damping (`damping_torque`) reduces the velocity with the decay time, at the inertia of the last accepted
-    positions. Its velocity is estimated from several sources and decays by prediction when no status is accepted.
+    The blend factor a increases from 0 to 1 in the ramp time. The freshness f falls from 1 at a status age of one
+    period to 0 at two periods, because torques computed from an old state could accelerate the arm. τ_damping
+    (`damping_torque`) lets the velocity decay with the decay time, given the inertia at the last accepted positions.
+    The velocity is estimated from several sources, and predicted while no status is accepted.
 
     A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
-    the start the limiter waits for a valid status and then takes over by itself. The output is always finite and within
-    the torque limits; zero torque is the robot's own gravity compensation. While a robot sends no status nothing is
-    sent to it, nor immediately after its return. A driver that can hold the arm by itself (brakes, position control)
-    is asked to do so when a status fault stopped the arm.
+    the start the limiter waits for a valid status and then takes over without `resume`. The output is always finite and
+    within the torque limits; at zero torque the robot only compensates its weight. After a stop, zero torque is sent
+    for `ZERO_TORQUE_TIME`, and then only while there is no status fault. A driver that can hold the arm by itself
+    (brakes, position control) is asked to do so when a status fault stopped the arm.
 
     .. pydrake_system::
 
@@ -118,8 +118,8 @@ class TorqueSafetyLimiter(LeafSystem):
 
     ``fault`` is (1,), the code of the `Fault` that stopped the arm, or 0. ``arm_state`` is (1,), a value of `ArmState`.
     ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are sent. ``is_holding`` (1,) is 1 while the
-    driver holds the arm instead. ``not_following`` (1,) is 1 while the desired pose is not followed: the arm is stopped
-    or taking over, or no valid command is available.
+    driver has to hold the arm instead. ``not_following`` (1,) is 1 while the desired pose is not followed: the arm is
+    stopped or taking over, or no valid command is available.
 
     Args:
         plant: Model of the arm and its payload alone, finalized; its inertia is used.

@@ -38,7 +38,7 @@ class WrenchSensor(LeafSystem):
     Args:
         plant: Finalized plant, connected to this system.
         wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
-        tool: Bodies behind the wrist, welded together.
+        tool: Bodies on the child side of the wrist, welded together.
         center: Center of compliance P, fixed to the first body of `tool`.
         R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
         period: Sampling period [s], positive; ideally the plant's time step.

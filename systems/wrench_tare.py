@@ -13,8 +13,8 @@ class WrenchTare(LeafSystem):
 
         y_k = 0 for k < s + n,  y_k = u_k − (1/n) Σ u_j over j = s … s + n − 1 afterwards
 
-    k counts samples since the initialization, s are samples that are skipped until filters have settled, and n samples
-    are averaged. Whatever the robot touches during these samples is subtracted too.
+    k counts samples since the initialization. The first s samples are skipped until filters have settled, and the next
+    n samples are averaged. A contact force during these n samples would be subtracted too.
 
     .. pydrake_system::
 
@@ -24,12 +24,12 @@ class WrenchTare(LeafSystem):
         output_ports:
         - tared_wrench
 
-    Both are (6,), force first [N, Nm].
+    Both ports are (6,), force first [N, Nm].
 
     Args:
         period: Sampling period [s], positive.
-        skipped: s, at least 0.
-        averaged: n, at least 1.
+        skipped: Number s of skipped samples, at least 0.
+        averaged: Number n of averaged samples, at least 1.
 
     Raises:
         InputError: If an argument is out of range.

@@ -33,10 +33,10 @@ from guiderail.tools.tables import write_table
 
 GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
 SEARCH_STEPS = 100_000  # steps of the adversary that determines the budgets
-BUDGET_MARGIN = 1.5  # budgets relative to the adversary's worst corrections
-MIN_EXCESS = ((0.01,), (0.1,))  # smallest budgets of excess, in actions: at one step, and in total
-MIN_KEY_BYTES = 16  # as the checker demands
-ROUNDING = 1.0 + 1e-6  # an adversary may reach an exact bound up to rounding
+BUDGET_MARGIN = 1.5  # ratio of the budgets to the worst corrections of the adversary
+MIN_EXCESS = ((0.01,), (0.1,))  # smallest budgets of excess at one step and in total, in units of the action
+MIN_KEY_BYTES = 16  # shortest key that the checker accepts
+ROUNDING = 1.0 + 1e-6  # tolerance factor: an adversary may reach an exact bound up to rounding
 
 
 def certify_skill(
@@ -52,7 +52,7 @@ def certify_skill(
 
     Args:
         subject: Folder of a run, or name of a task.
-        environment: Options of the environment that differ from those of the run or the task.
+        environment: Options that replace options of the run's or the task's environment.
         out: Folder to write; `certificate` in the run's folder by default.
         start_within: Largest start offset of the robot in any output [unit of the output]; by default the one that
             the task declares, plus the error of a measured pose.
@@ -61,8 +61,8 @@ def certify_skill(
         key: File of the key that signs the certificate; None: no signature.
 
     Returns:
-        Numbers of the regimes, the certificate's path and the checker's verdict; after an attack also the table's rows
-        and the share of the budgets that corrections used.
+        Path of the certificate, verdict of the checker, and extreme bounds of each regime; after an attack also the
+        rows of `attack.csv` and the share of the budgets that corrections used.
 
     Raises:
         InputError: If there is no such run or task, or its guidance cannot be certified.
@@ -118,7 +118,7 @@ def verify_certificate(
     """Check a certificate, and compare its assumptions with a skill.
 
     The checker proves that the bounds follow from the primitive, the constraints, the impedance and the budget in the
-    files. Here these are computed again from the skill, and the search for the budget is repeated.
+    files. This function computes all four again from the skill and repeats the search for the budget.
 
     Args:
         subject: Folder of a run, or name of a task.
@@ -131,7 +131,7 @@ def verify_certificate(
         The certificate's path and the verdict, "yes" or "no" with the reason.
 
     Raises:
-        InputError: As `certify_skill`, or if the folder has no certificate.
+        InputError: As in `certify_skill`, or if the folder has no certificate.
     """
     _read_key(key)
     skill = _find_skill(subject, environment, start_within)
@@ -156,10 +156,10 @@ class _Skill:
     """Subject of a certificate.
 
     Attributes:
-        loop: Primitive in its loop.
+        loop: Primitive in its feedback loop.
         stiffness: Stiffness of the impedance, or None.
         limits: Limits of the impedance's wrench, or None.
-        about: Description.
+        about: Description of the run or task, stored in the certificate.
     """
 
     loop: CertifiedLoop
@@ -193,13 +193,13 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
 
 
 def _search_budget(loop: CertifiedLoop) -> AttackResult:
-    """Return the budget that corrections of a loop with a history need, by a search of `SEARCH_STEPS` steps."""
+    """Return the worst corrections of a loop with a history that an adversary finds in `SEARCH_STEPS` steps."""
     every_step = np.ones(loop.primitive.num_steps, bool)
     return Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
 
 
 def _run_checker(folder: Path, key: Path | None) -> str:
-    """Return what the checker prints, which runs in a process of its own."""
+    """Run the checker in a separate process and return its output."""
     command = [sys.executable, checker.__file__, str(folder), *([] if key is None else [str(key)])]
     process = subprocess.run(command, capture_output=True, text=True)
     return (process.stdout or process.stderr).strip()
@@ -209,7 +209,7 @@ def _read_key(key: Path | None) -> bytes | None:
     """Return the content of a key file.
 
     Raises:
-        InputError: If it cannot be read or is too short.
+        InputError: If the file cannot be read or is too short.
     """
     if key is None:
         return None
@@ -223,10 +223,10 @@ def _read_key(key: Path | None) -> bytes | None:
 
 
 def _make_loop(task: str, options: Mapping[str, Any], start_within: float | None) -> CertifiedLoop:
-    """Build the primitive of an environment in its loop.
+    """Build the feedback loop of an environment's primitive.
 
     Raises:
-        InputError: If the start offset is negative or not finite.
+        InputError: If an option cannot be certified, or the start offset is negative or not finite.
     """
     demonstrated = make_prior_knowledge(task, **options).demonstrations
     assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
@@ -291,7 +291,7 @@ def _find_corrected_steps(loop: CertifiedLoop, certified: CertifiedBounds) -> np
 
 
 def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndarray:
-    """Return the largest start offset (O,) of the environment's history: that of a reset plus a pose's error."""
+    """Return the largest start offset (O,) of the environment's history: the offset of a reset plus a pose's error."""
     config = EnvConfig.resolve(task, options)
     declared = config.make_task().start_within()
     try:
@@ -322,7 +322,7 @@ def _find_subject(subject: str, environment: Mapping[str, Any]) -> tuple[str, di
 
 
 def _extremes(bounds: Bounds) -> dict[str, list[float | None]]:
-    """Return the extreme bounds of each output over all steps; None where there is none."""
+    """Return the extreme bounds of each output over all steps; None if an output is not bounded."""
     extremes = {
         "lower": bounds.lower.min(axis=0),
         "upper": bounds.upper.max(axis=0),

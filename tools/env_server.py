@@ -4,7 +4,7 @@ Started by `python -m guiderail.tools.env_server TASK_OR_RUN [OPTIONS]`; OPTIONS
 options. It reads requests from standard input and answers on standard output, and ends when its input ends. Requests
 are `{"reset": SEED}`, with null to continue the random stream, and `{"action": [...]}`. The first line and every answer
 has `observation`, `pose`, `wrench`, `is_done`, `is_success` and `termination`; the first line also has `action_size`
-and `period` [s]. A refused request is answered with `error`, and nothing moves.
+and `period` [s]. A refused request is answered with `error`, and the simulation does not advance.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
 
 
 class EnvServer:
-    """Answers requests for one environment.
+    """Server that answers requests for one environment.
 
     Args:
-        env: The environment.
+        env: Environment to reset and step.
     """
 
     def __init__(self, env: DiagramEnv):
@@ -52,7 +52,7 @@ class EnvServer:
         self._observation = env.reset()[0]
 
     def describe(self) -> dict[str, Any]:
-        """Return the first line."""
+        """Return the content of the first line."""
         action_space = self._env.action_space
         return {"action_size": action_space.shape[0], "period": self._env.time_step} | self._state()
 
@@ -103,7 +103,7 @@ def serve(server: EnvServer, requests: IO[str], answers: IO[str]) -> None:
 
 def main(arguments: list[str]) -> int:
     """Serve the environment that the arguments name."""
-    # Messages of libraries on standard output would be taken for answers.
+    # Redirect standard output to standard error: messages of libraries would be read as answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     try:

@@ -25,7 +25,7 @@ from guiderail.models.common.yaml import parse_yaml
 
 
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
-    """Return the task of a name or of a task folder's path, and what a run has to import for it.
+    """Return the name of a task, given its name or its folder's path, and the imports that a run of it needs.
 
     Raises:
         InputError: If the folder's task is not valid.
@@ -37,13 +37,13 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
 
 
 def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
-    """Return a digest of the files that a task consists of; empty if there are only installed ones.
+    """Return a digest of the files that a task consists of; empty if all of them are installed.
 
-    Files are the task folder, those that an option of the environment names, such as demonstrations, and those of the
-    imports, as `import_modules` returns them.
+    These are the files of the task folder, the files that an option of the environment names, such as demonstrations,
+    and the imported files, as `import_modules` returns them.
 
     Raises:
-        InputError: If its task folder does not exist any more, or a file cannot be read.
+        InputError: If the task folder no longer exists, or a file cannot be read.
     """
     folder = getattr(TASKS.get(task), "folder", None) if task in TASKS.names() else None
     folder_digest = ""
@@ -70,7 +70,7 @@ def _read(file: Path) -> bytes:
 
 
 def task_options(task: str) -> dict[str, Any]:
-    """Return the options of a task's environment with their defaults, or `inspect.Parameter.empty`.
+    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none.
 
     Raises:
         InputError: If the task is unknown.
@@ -109,7 +109,7 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def check_reset(task: str, options: Mapping[str, Any]) -> None:
-    """Refuse options that the reset of a task does not take; other environments check their own.
+    """Check the reset options of a guiderail task; other environments check theirs in `reset`.
 
     Raises:
         InputError: If an option is unknown, or a value has the wrong type or is out of range.
@@ -119,7 +119,7 @@ def check_reset(task: str, options: Mapping[str, Any]) -> None:
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments, out of all of an environment's, that differ from the defaults.
+    """Return the arguments of an environment that differ from the defaults.
 
     These are guidance, station and difficulty if they are not the task's defaults, and other arguments that differ from
     the defaults for these three.
@@ -136,8 +136,8 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
 def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return all arguments of a run's environment with changes.
 
-    Another difficulty replaces the settings that the run has only from its own difficulty. For another station, options
-    that it does not have are removed.
+    A change of difficulty replaces the settings that the run's own difficulty determined. A change of station removes
+    the options that the new station does not have.
 
     Raises:
         InputError: If there is no such difficulty.
@@ -189,8 +189,8 @@ def _numbers(value: Any) -> Any:
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
     """Make the environment of a task. From this call on the process computes with one thread.
 
-    Matrices are small here. Where other processes use the cores, threads that wait for each other take eighty times as
-    long (a movement primitive with a history: 78 s instead of 1 s), and sums would depend on their number.
+    Matrices are small here. If other processes use the cores, several threads that wait for each other take eighty
+    times as long (a movement primitive with a history: 78 s instead of 1 s), and sums depend on the number of threads.
 
     Raises:
         InputError: If the task or an argument is unknown, or options are incompatible.

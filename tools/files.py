@@ -1,4 +1,4 @@
-"""Output files and folders: complete or absent, and checked before anything is computed for them."""
+"""Output files and folders: written atomically, and checked before their content is computed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PARTIAL = re.compile(r"\..*\.(\d+)\.part")
 
 
 def remove_partial_files(folder: Path) -> None:
-    """Remove what killed calls of `write_atomically` and `atomic_folder` left in a folder and below it.
+    """Remove partial files that killed calls of `write_atomically` and `atomic_folder` left in a folder and below it.
 
     Files that another process is still writing stay, and so does everything in a subfolder with a lock of its own.
     """
@@ -83,7 +83,7 @@ def check_writable(path: Path) -> None:
         if path.is_dir():
             raise InputError(f"{path} is a folder that already exists: name another path")
         parent = next(one for one in path.absolute().parents if one.exists())
-        with tempfile.TemporaryFile(dir=parent):  # permission bits do not suffice: they do not bind root
+        with tempfile.TemporaryFile(dir=parent):  # permission bits do not suffice: root can ignore them
             pass
     except OSError as error:
         raise write_error(path, error) from error
@@ -93,7 +93,7 @@ def check_writable(path: Path) -> None:
 def atomic_folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that is renamed to `out` at the end, or removed after an error.
 
-    What killed processes left of the same folder is removed.
+    Partial folders that killed processes left for the same path are removed first.
 
     Raises:
         InputError: If the folder cannot be written.
@@ -118,7 +118,7 @@ def write_error(path: Path, error: OSError) -> InputError:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if there is a file or a folder.
+    """Return True if a path is an existing file or folder.
 
     Raises:
         InputError: If the file system refuses the path, as for a name that is too long.
@@ -139,7 +139,7 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_new(out: Path, what: str) -> None:
-    """Refuse a path that exists or cannot be written, before anything is computed for it.
+    """Check that a path is new and can be written, before its content is computed.
 
     Args:
         out: Path.

@@ -27,7 +27,7 @@ def trust_imports(trusted: bool = True) -> Iterator[None]:
     """Let files that are read in this context, such as run folders, import the code that they name.
 
     Args:
-        trusted: Whether they may; False within a context that trusts them.
+        trusted: True to allow such imports; False to forbid them within a context that allows them.
     """
     token = _TRUSTED.set(trusted)
     try:
@@ -45,8 +45,8 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
 
     Returns:
-        Names to import them again; files and folders by their absolute paths, so that a run can be resumed from another
-        folder.
+        Names with which the modules can be imported again. Files and folders have absolute paths, so that a run can be
+        resumed from another folder.
 
     Raises:
         InputError: If there is no such module, file or folder, or it cannot be imported.
@@ -69,17 +69,17 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
 
 
 def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
-    """Import what a file names, as `import_modules`, if that executes nothing new or is trusted.
+    """Import the modules that a file names, as `import_modules`, if that executes no new code or is trusted.
 
     A task folder holds no code. A module that this process has imported, and a file that the user has named in this
     process, need no trust.
 
     Args:
-        modules: Names in the file.
-        source: The file, for messages.
+        modules: Names of the modules, as the file has them.
+        source: File that names the modules, for error messages.
 
     Raises:
-        InputError: If code would be executed without trust, or as `import_modules`.
+        InputError: If code would be executed without trust, or if `import_modules` raises one.
     """
     modules = tuple(modules)
     if not _TRUSTED.get() and (untrusted := [module for module in modules if _executes(module)]):
@@ -115,12 +115,12 @@ def _is_module(name: str) -> bool:
         return find_spec(name) is not None
     except ModuleNotFoundError as error:
         return not f"{name}.".startswith(f"{error.name}.")
-    except (ImportError, ValueError):  # such as __main__, which has no specification
+    except (ImportError, ValueError):  # for example __main__, which has no module specification
         return False
 
 
 def _import_file(path: Path) -> str:
-    """Run a file, with its folder on the path as for a program; once for each content."""
+    """Run a file with its folder on `sys.path`, as for a script, unless it has run with the same content before."""
     path = path.resolve()
     content = path.read_bytes()
     if _IMPORTED_FILES.get(path) == content:
@@ -141,7 +141,7 @@ def _import_file(path: Path) -> str:
 
 
 def _import_or_refuse(name: str, load: Callable[[], Any]) -> Any:
-    """Return the imported module; raise an InputError with the line of an error in it."""
+    """Return the imported module; raise an InputError with the line if the module raises an error."""
     try:
         return load()
     except InputError:

@@ -27,10 +27,10 @@ def table_text(rows: Rows) -> str:
 def read_table(path: Path) -> pd.DataFrame:
     """Read a CSV file.
 
-    A column of numbers has only numbers and empty cells, which are NaN. In a column of text an empty cell is "".
+    A column of only numbers and empty cells is numeric; its empty cells are NaN. In a column of text they are "".
 
     Raises:
-        InputError: If the file is missing, a row has another length than the header, or names are missing or repeated.
+        InputError: If the file is missing, a row is not as long as the header, or column names are missing or repeated.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
@@ -57,7 +57,7 @@ def _parse_column(cells: Sequence[str]) -> pd.Series:
 
 
 def write_table(path: Path, rows: Rows) -> Path:
-    """Write rows as `path`.csv and as `path`.md, and return the path of the latter."""
+    """Write rows as `path`.csv and as `path`.md, and return the path of the Markdown file."""
     table = pd.DataFrame(rows, dtype=object)
     write_atomically(path.with_suffix(".csv"), table_text(table).encode())
     lines = [[name.replace("_", " ") for name in table], ["---"] * len(table.columns)]

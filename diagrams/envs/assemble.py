@@ -35,15 +35,15 @@ from guiderail.systems.reward_system import RewardSystem
 if TYPE_CHECKING:
     from guiderail.models.primitives.progress import StateProgress
 
-HALF_TURN_MARGIN = 0.1  # [rad] margin for turns by actions and contact, in addition to the motion
+HALF_TURN_MARGIN = 0.1  # smallest distance of demonstrated angles from ±180°, for turns by actions and contact [rad]
 
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """Return the prior knowledge that a task provides to guidance on a station.
 
     Raises:
-        InputError: If the steps of the reference trajectory are not control periods, or it comes near an angle at which
-            the station's pose jumps.
+        InputError: If the time steps of the reference trajectory differ from the control period, or its angles come
+            near ±180°, where the station's pose jumps.
     """
     provides = task.provides()
     skill = None
@@ -86,7 +86,7 @@ _NOT_PRIMITIVE = (*KERNEL_OPTIONS, "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
 
 
 def _state_progress(task: Task, period: float) -> StateProgress | None:
-    """Return the rule of progress among a task's options; None: the clock drives the motion."""
+    """Return the progress rule from a task's options, or None if the clock drives the motion."""
     options = task.config.part("primitive")
     if options.get("progress", "clock") == "clock":
         return None
@@ -96,13 +96,13 @@ def _state_progress(task: Task, period: float) -> StateProgress | None:
 
 
 def _num_steps(task: Task, period: float) -> int:
-    """Return the control steps of an episode, with those that the motion may wait."""
+    """Return the number of control steps of an episode, including those for which the motion may wait."""
     progress = _state_progress(task, period)
     return task.num_steps + (0 if progress is None else progress.max_lag)
 
 
 def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
-    """Return a task's constraints of the motion with the limits among its options; None if there are none."""
+    """Return a task's motion constraints with the limits from its options, or None if it has neither."""
     motion, outputs = task.motion_constraints(), constraints.num_outputs
     limits: dict[str, Any] = {}
     options = task.config.part("primitive")
@@ -123,7 +123,7 @@ def _motion_constraints(task: Task, constraints: LinearConstraints, station: Sta
 
 
 def _check_clock(times: np.ndarray, period: float) -> None:
-    """Refuse a reference trajectory with steps other than control periods; `times` are (N,) [s]."""
+    """Raise an `InputError` if the steps between the `times` (N,) [s] of a reference differ from the `period` [s]."""
     steps = np.diff(times)
     if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
         raise InputError(
@@ -133,7 +133,7 @@ def _check_clock(times: np.ndarray, period: float) -> None:
 
 
 def _refuse_half_turns(means: np.ndarray) -> None:
-    """Refuse a motion (N, 6) that comes near an angle at which the station's pose jumps by a full turn."""
+    """Raise an `InputError` if angles of a motion (N, 6) come near ±180°, where the station's pose jumps."""
     furthest = np.abs(means[:, 3:]).max(initial=0.0)
     if furthest > np.pi - HALF_TURN_MARGIN:
         raise InputError(
@@ -143,10 +143,10 @@ def _refuse_half_turns(means: np.ndarray) -> None:
 
 
 class Signals:
-    """Ports by name while a diagram is built; "last_x" is the value of x one control step earlier."""
+    """Collection of ports by name while a diagram is built; "last_x" is the value of x one control step earlier."""
 
     def __init__(self, builder: DiagramBuilder, period: float, ports: Mapping[str, OutputPort]):
-        """Construct the collection; holds are added to the builder, with the control period [s]."""
+        """Construct the collection; holds for "last_x" are added to the builder, with the control `period` [s]."""
         self._builder, self._period, self._ports = builder, period, dict(ports)
 
     def add(self, ports: Mapping[str, OutputPort]) -> None:
@@ -185,7 +185,7 @@ class Signals:
 
 
 class Loop:
-    """Station, guidance and observation, connected to a loop that only lacks the policy.
+    """Station, guidance and observation, connected as a control loop without its policy.
 
     Attributes:
         builder: Builder of the root diagram.
@@ -257,7 +257,7 @@ class Loop:
 def build_task_diagram(
     task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None
 ) -> TaskDiagram:
-    """Wire a task: its loop, reward and episode monitor. The policy's `action` is an input.
+    """Build the diagram of a task: control loop, reward and episode monitor. The policy's `action` is an input port.
 
     Args:
         task: Task.
@@ -321,7 +321,7 @@ def build_task_diagram(
         _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
-    displaces = GUIDANCE.get(task.config.guidance).displaces  # symmetries hold only for actions that displace
+    displaces = GUIDANCE.get(task.config.guidance).displaces  # symmetries hold only if actions displace outputs
     return TaskDiagram(
         diagram=diagram,
         control_period=period,
@@ -342,12 +342,12 @@ class SkillDiagram:
     """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station.
 
     Attributes:
-        diagram: Diagram with subsystems of these names; exports pose, desired_pose, wrench, contact_force, held_action,
-            constraint_violation and fallback.
+        diagram: Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench,
+            contact_force, held_action, constraint_violation and fallback.
         control_period: Control period [s].
-        num_steps: Control steps of an episode.
+        num_steps: Number of control steps of an episode.
         randomize: As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
-        meshcat: Page that the diagram publishes to, if there is one.
+        meshcat: Meshcat page that the diagram publishes to; None if there is none.
     """
 
     diagram: Diagram
@@ -365,15 +365,15 @@ def build_skill_diagram(
     *,
     render_mode: str | None = None,
 ) -> SkillDiagram:
-    """Wire a learned skill, without reward and episode monitor.
+    """Build the diagram of a learned skill, without reward and episode monitor.
 
     Args:
         task: Task that the skill was learned on.
         station: Station.
         guidance: Diagram with the ports of `Guidance`.
         policy: Function from an observation to an action, which a `PolicySystem` calls every `action_repeat` control
-            periods; or system with an input `observation` and an output `action`.
-        render_mode: None, or "human" for a browser view.
+            periods; or a system with an input `observation` and an output `action`.
+        render_mode: None, "human" (browser view) or "rgb_array" (exports the image of the task's camera).
 
     Raises:
         InputError: As `build_task_diagram`, or if the sizes of the policy's ports do not match.
@@ -419,7 +419,7 @@ def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
 
 
 def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
-    """Add the violations of the task's constraints; without any, those that guidance computes are used."""
+    """Return the ports of the constraint violations by name; without task constraints, guidance's ports are used."""
     constraints = task.constraints()
     poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
     poses["measured_violation"] = station.get_pose_output_port()

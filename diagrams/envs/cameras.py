@@ -33,8 +33,8 @@ _OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
 PUBLISH_PERIOD = 1 / 50  # period of a browser view [s]
 
 
-# Observations have Drake's default light, from the camera. In pictures, light from above shows edges better, and the
-# background is white as a page.
+# Observations have Drake's default light, from the camera. Pictures have a white background and light from above, which
+# shows edges better.
 _LIGHTS = [
     LightParameter(type="directional", frame="camera", direction=[0.3, 0.2, 1.0], intensity=0.7),
     LightParameter(type="directional", frame="world", direction=[-0.2, 0.3, -1.0], intensity=0.5),
@@ -60,7 +60,7 @@ class Camera:
     X_WC: RigidTransform
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixels, (n, 2) from the upper left corner, of points (n, 3) in the world."""
+        """Return the pixel coordinates (n, 2), from the upper left corner, of points (n, 3) in the world [m]."""
         p_C = self.X_WC.inverse() @ np.asarray(points, float).T
         focal = 0.5 * self.size[1] / np.tan(0.5 * self.vertical_fov)
         return (focal * p_C[:2] / p_C[2]).T + 0.5 * np.array(self.size)
@@ -96,8 +96,8 @@ def add_camera(
         InputError: If this machine lacks the library that renders without a display.
     """
     check_rendering()
-    # Mesa renders with one LLVM, and Triton, a dependency of PyTorch with CUDA, has another: if Triton's is loaded
-    # second, the process ends in a segmentation fault. PyTorch imports Triton with its compiler.
+    # Mesa and Triton, a dependency of PyTorch with CUDA, load different versions of LLVM. If Triton's is loaded second,
+    # the process ends with a segmentation fault. PyTorch imports Triton late, with its compiler.
     with suppress(ImportError):
         import_module("triton")
     renderer = _PICTURE_RENDERER if is_picture else _OBSERVATION_RENDERER
@@ -118,7 +118,7 @@ def add_camera(
 
 
 def check_rendering() -> None:
-    """Refuse to render if EGL is missing; Drake would abort the process.
+    """Check that EGL is installed, because without it Drake would abort the process.
 
     Raises:
         InputError: If EGL is missing; the message names the package to install.
@@ -133,7 +133,7 @@ def check_rendering() -> None:
 
 
 def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
-    """Open a browser view on this machine, at an address with a token; without an existing page, a new one.
+    """Open a browser view on this machine, by default on a new page; return its page and its visualizer.
 
     Raises:
         InputError: If the environment forbids Drake to open a network port.

@@ -46,14 +46,14 @@ INFO_KEYS = (
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
-# Messages of Drake, or of a system with another engine, when the physics failed and not the wiring. Drake's own
-# assertions arrive in Python as SystemExit.
+# Error messages of Drake, or of a system with another engine, that report failed physics and not wrong wiring. Drake's
+# own assertions arrive in Python as SystemExit.
 _SIMULATION_FAILURE = re.compile(
     r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE
 )
 
-# A state beyond these limits is a failed simulation: largest coordinate of a position [m], and largest joint speed
-# [m/s] or [rad/s], three times that of a ball that falls for the longest episode.
+# A simulation has failed if its state exceeds these limits: largest coordinate of a position [m], and largest joint
+# speed [m/s] or [rad/s], which is three times the speed of a ball that falls for the longest episode.
 MAX_POSITION, MAX_JOINT_SPEED = 10.0, 1e3
 
 
@@ -61,9 +61,10 @@ class DiagramEnv(DrakeGymEnv):
     """Gymnasium environment that runs a `TaskDiagram`.
 
     It keeps `DrakeGymEnv`'s interface and replaces its `reset` and `step`. The diagram is built once. A reset restores
-    the default context, lets the task randomize it from `self.np_random`, writes the neutral action and initializes. A
-    step checks the action before anything moves, advances `action_repeat` control steps by an integer count, and reads
-    every port at the end of each of them, before the events of that instant.
+    the default context, writes the neutral action, lets the task randomize the context with `self.np_random`, and
+    initializes the simulator. A step checks the action before anything moves, and advances `action_repeat` control
+    steps, which are counted by an integer. Every port is read at the end of each control step, before the events of
+    that instant.
 
     `info` has, at every step and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
     `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `contact_force` (maximum of
@@ -81,10 +82,10 @@ class DiagramEnv(DrakeGymEnv):
         task: The `TaskDiagram`.
         action_repeat: Control steps per action.
         trace: `EpisodeTrace` of the current episode.
-        drawn: Values that the task sampled for it.
-        observes_privileged: True if `privileged` is to be read; False by default.
+        drawn: Values that the task sampled for the current episode, by name.
+        observes_privileged: True if `privileged` is updated with each observation; False by default.
         privileged: Privileged observation (m,) that belongs to the last observation, or None.
-        privileged_space: Its space; None if the task has no privileged terms.
+        privileged_space: Space of the privileged observation; None if the task has no privileged terms.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
@@ -115,7 +116,7 @@ class DiagramEnv(DrakeGymEnv):
         view = None if render_mode != "human" or task.query is None else View(task.query)
         self.task = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
-        # The parent class writes into `metadata`: a copy keeps this from all other environments.
+        # The parent class writes into `metadata`, so each environment needs its own copy.
         self.metadata = {
             "render_modes": ["human", "rgb_array"],
             "render_fps": round(1 / (action_repeat * task.control_period)),
@@ -163,7 +164,7 @@ class DiagramEnv(DrakeGymEnv):
         self.privileged: np.ndarray | None = None
         self._control_steps = 0
         self._running = False
-        self._observation: np.ndarray | None = None  # the last valid one
+        self._observation: np.ndarray | None = None  # last valid observation
         self._failure: str | None = None  # message of the failed simulation
         self._violations = (-np.inf, -np.inf)
         self._closed = False
@@ -178,7 +179,7 @@ class DiagramEnv(DrakeGymEnv):
         self._release()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse to copy a simulation in progress."""
+        """Raise an `InputError`, because a simulation cannot be pickled."""
         call = "gymnasium.make" if self.spec is None else f"gymnasium.make({self.spec.id!r}, ...)"
         raise InputError(f"an environment holds a simulation and cannot be pickled: call {call} in the worker instead")
 
@@ -198,7 +199,7 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(
                 f"the options of a reset are values by name, such as {{'held_out': True}}, not {brief(options)}"
             )
-        # The parent's reset initializes before the state is set, and refuses options.
+        # The parent class's reset would initialize the simulator before the state is set, and accepts no options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
         context = self.simulator.get_mutable_context()
@@ -211,7 +212,7 @@ class DiagramEnv(DrakeGymEnv):
         return self._begin_episode()
 
     def _begin_episode(self) -> tuple[np.ndarray | None, dict[str, Any]]:
-        """Return the result of a reset; the simulator is initialized, unless it failed."""
+        """Return observation and info of a reset, after the simulator was initialized or has failed."""
         context = self.simulator.get_context()
         self._control_steps = 0
         self.trace.clear()
@@ -242,7 +243,7 @@ class DiagramEnv(DrakeGymEnv):
             self._failure = str(error)
 
     def _check_plausible(self, context: Context, pose: np.ndarray) -> None:
-        """Raise a `RuntimeError` if the measured pose (O,) or a joint speed cannot be that of a sound simulation."""
+        """Raise a `RuntimeError` if the measured pose (O,) or a joint speed is not finite or exceeds its limit."""
         if not np.isfinite(pose).all():
             raise RuntimeError("the measured pose is not finite")
         if np.abs(pose[:3]).max() > MAX_POSITION:
@@ -256,8 +257,8 @@ class DiagramEnv(DrakeGymEnv):
         """Apply `action` for `action_repeat` control steps, or until the episode ends.
 
         Raises:
-            InputError: If the action is not finite or has the wrong shape; a finite one outside [-1, 1] is clipped. If
-                a reward term or the observation is not finite although the simulation did not fail.
+            InputError: If the action is not finite or has the wrong shape (a finite action outside [-1, 1] is clipped),
+                or if a reward term or the observation is not finite although the simulation did not fail.
         """
         action = self._check_action(action)
         if not self._running:
@@ -284,7 +285,7 @@ class DiagramEnv(DrakeGymEnv):
                 if reason or self._control_steps + 1 == last_step:
                     self._observation = self._observe(context)
             if self._failure is not None:
-                break  # without this control step
+                break  # this control step is dropped
             self._control_steps += 1
             total += reward
             peak_force = max(peak_force, force)
@@ -309,7 +310,7 @@ class DiagramEnv(DrakeGymEnv):
         return self._observation, total, terminated, truncated, info
 
     def _advance(self) -> None:
-        """Advance one control step, by an integer count: a sum of periods would drift across the plant's steps."""
+        """Advance to the end of the next control step, computed from the count because a sum of periods drifts."""
         self.simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
 
     def render(self) -> Any:
@@ -344,7 +345,7 @@ class DiagramEnv(DrakeGymEnv):
             if np.iscomplexobj(action):
                 raise TypeError
             action = np.asarray(action, dtype=float)
-        except (TypeError, ValueError, OverflowError):  # Python's whole numbers can exceed every double
+        except (TypeError, ValueError, OverflowError):  # a Python integer can exceed the range of a double
             raise InputError(f"an action is {self._neutral.size} numbers in [-1, 1], not {brief(action)}") from None
         if action.shape != self._neutral.shape:
             raise InputError(f"an action is an array of shape {self._neutral.shape}, not {action.shape}")
@@ -358,7 +359,7 @@ class DiagramEnv(DrakeGymEnv):
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
         observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
-        # A learner would diverge on it episodes later.
+        # Without this check a learner would diverge, but only episodes later.
         if not np.isfinite(observation).all():
             of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
@@ -397,11 +398,11 @@ def _plants(diagram: Diagram) -> Iterator[MultibodyPlant]:
 
 
 def _do_nothing() -> None:
-    """Release nothing."""
+    """Do nothing; used if no `release` is given."""
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Refuse an unknown render mode.
+    """Check the render mode.
 
     Raises:
         InputError: If `render_mode` is not None, "human" or "rgb_array".

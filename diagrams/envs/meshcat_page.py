@@ -1,7 +1,7 @@
 """Meshcat page behind a gateway: a random token in its address, an allow-list of origins, and checked messages.
 
 Meshcat's own server accepts any connection and parses any bytes: a web page in the same browser could move the sliders,
-and one malformed byte ends the process. `MeshcatPage` lets the gateway connect to it and then closes its port.
+and one malformed byte ends the process. `MeshcatPage` lets the gateway connect to this server and then closes its port.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class MeshcatPage(Meshcat):
     """Meshcat with its page at a secret address; everything else is as in the base class.
 
     The page and its websocket are at a path with a random token. A connection is refused without the token, or with an
-    origin other than this page's. Messages of browsers are parsed here: Meshcat receives only inputs of controls that
-    exist, within their range.
+    origin other than this page's. The gateway parses the messages of browsers: Meshcat receives only inputs of controls
+    that exist, within their range.
 
     Args:
-        is_served: Whether browsers may connect; without it the page only serves `StaticHtml`.
+        is_served: True if browsers may connect; if False, the page can only be exported with `StaticHtml`.
 
     Raises:
         RuntimeError: If the environment forbids Drake to open a network port, or Meshcat's own port cannot be closed.
@@ -42,7 +42,7 @@ class MeshcatPage(Meshcat):
     def __init__(self, *, is_served: bool = True):
         drake_logger = logging.getLogger("drake")
         level = drake_logger.level
-        drake_logger.setLevel(logging.WARNING)  # it would print the address without the token
+        drake_logger.setLevel(logging.WARNING)  # Drake would print the address without the token
         try:
             super().__init__(MeshcatParams(host="localhost"))
         finally:
@@ -54,7 +54,7 @@ class MeshcatPage(Meshcat):
             self._close = weakref.finalize(self, self._gateway.close)
 
     def close(self) -> None:
-        """Disconnect the browsers, and accept no others."""
+        """Disconnect all browsers, and accept no new connections."""
         if self._gateway is not None:
             self._close()
 
@@ -76,11 +76,11 @@ class MeshcatPage(Meshcat):
 
 
 class _Gateway:
-    """Process of the gateway of a page; see `page_gateway`.
+    """Gateway process of a page; see `page_gateway`.
 
     Attributes:
         port: Port of the page.
-        token: Secret part of its address.
+        token: Secret part of the page's address.
     """
 
     def __init__(self, meshcat_port: int):
@@ -135,20 +135,20 @@ class _Gateway:
 
 
 def _close_port(port: int, keep: Sequence[int]) -> None:
-    """Replace this process's listening socket of a port by an unconnected one, and end its connections.
+    """Replace this process's listening socket of a port by an unconnected one, and end the port's connections.
 
-    Drake has no function for this. The descriptor keeps its number, so that Drake can close it at its end.
+    Drake has no function for this. The descriptor keeps its number, so that Drake can still close it.
 
     Args:
         port: Port of the listening socket.
-        keep: Ports of peers whose connections stay.
+        keep: Ports of peers whose connections stay open.
 
     Raises:
         RuntimeError: If there is no such socket.
     """
     is_closed = False
     for descriptor in map(int, os.listdir("/dev/fd")):
-        with suppress(OSError):  # closed since they were listed, as the descriptor of the listed folder is
+        with suppress(OSError):  # the descriptor was closed after it was listed
             if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
                 continue
             with socket.socket(fileno=os.dup(descriptor)) as one, socket.socket() as unconnected:

@@ -1,4 +1,4 @@
-"""Observation of a policy as a diagram: signals one after the other, each centered, scaled and clipped."""
+"""Diagram of a policy's observation: concatenated signals, each centered, scaled and clipped."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from scipy.linalg import block_diag
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
-"""Signals that every observation can have: time since the episode began [s], and the same from −1 to 1."""
+"""Signals that every observation can have: time of the episode [s], and this time scaled to −1 … 1."""
 MOTION_TIME = "motion_time"
-"""Output of guidance whose motion waits for the robot: the clock of observations then is that of the motion [s]."""
+"""Output of guidance whose motion waits for the robot: time of the motion [s], used for `CLOCKS`."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ObservationTerm:
         signal: Name of a port of station, guidance or task, or one of `CLOCKS`.
         center: Finite number, or one per entry (n,), in the signal's unit.
         scale: Finite number, or one per entry (n,), in the signal's unit; not 0.
-        entries: Indices of the signal's numbers; default: all.
+        entries: Indices of the signal's entries that are observed; default: all.
     """
 
     signal: str
@@ -49,7 +49,7 @@ class Observation(Diagram):
         output_ports:
         - observation
 
-    ``observation`` is (n,), its entries in the order of the terms, clipped to ± the clip.
+    ``observation`` is (n,), its entries in the order of the terms, clipped to ±`clip`.
     """
 
     def __init__(
@@ -68,9 +68,9 @@ class Observation(Diagram):
             observed: Terms of the observation, at least one.
             sizes: Sizes of the signals by name.
             duration: Duration of an episode [s].
-            clip: Largest absolute value, positive.
-            of: Name of the task, for messages.
-            waits: True if the clocks are those of the input `motion_time`.
+            clip: Largest absolute value of an entry, positive.
+            of: Name of the task, for error messages.
+            waits: True if `CLOCKS` are computed from the input `motion_time` instead of the simulation time.
 
         Raises:
             InputError: If there is no entry, an index is out of range, or a center or a scale would not map finite
@@ -132,7 +132,7 @@ def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:
 def _add_clock(
     builder: DiagramBuilder, name: str, duration: float, motion_time: Saturation | None = None
 ) -> OutputPort:
-    """Add a clock of the simulation, or of the motion if that is given; return its port."""
+    """Add a clock of simulation time, or of `motion_time` if it is given; return the clock's port."""
     if motion_time is not None:
         scale, offset = (1.0, 0.0) if name == "time" else (2.0 / duration, -1.0)
         clock = builder.AddNamedSystem(name, affine(np.array([[scale]]), [offset]))
@@ -144,7 +144,7 @@ def _add_clock(
 
 
 def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the selection of entries (n, size), their centers (n,) and scales (n,)."""
+    """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
     try:
         selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
         if selection.ndim != 2:

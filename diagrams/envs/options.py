@@ -31,7 +31,7 @@ def _split_list(value: Any) -> Any:
 
 
 def _reject_bool(value: Any) -> Any:
-    """Refuse a bool, which Python would accept as 0 or 1, and unwrap a NumPy number."""
+    """Raise a `ValueError` for a bool, which Python would accept as 0 or 1; convert a NumPy number to Python's."""
     if isinstance(value, bool | np.bool_):
         raise ValueError("give a number")
     return value.item() if isinstance(value, np.number) else value
@@ -44,7 +44,7 @@ Numbers = Annotated[tuple[Number, ...], BeforeValidator(_split_list)]
 
 
 class CommonOptions(Options):
-    """Options of every environment; an empty word stands for the task's default."""
+    """Options of every environment; an empty string selects the task's default."""
 
     guidance: str = Field("", description="guidance between the policy and the robot")
     station: str = Field("", description="station that the task is done on")
@@ -64,7 +64,8 @@ class PrimitiveOptions(Options):
     action_dims: Integers | None = Field(
         None, description="indices of the outputs that an action moves; default: all", examples=[(0, 1)]
     )
-    # Factoring a step costs O(P² + H³) time: the limits keep a task of six outputs below half a minute and 1 GB.
+    # The factorization of a step takes O(P² + H³) time. The limits of P and H keep a task with six outputs below half a
+    # minute and 1 GB.
     history: Integer = Field(10, ge=1, le=200, description="P, past outputs that sKGRL's motion passes through")
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], variance of the past outputs")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="poses that form the history")
@@ -174,7 +175,7 @@ def check_choice(name: str, value: Any, choices: list[str], context: str) -> str
     """Return `value` if it is one of `choices`.
 
     Raises:
-        InputError: If it is not.
+        InputError: If `value` is not one of `choices`.
     """
     if value not in choices:
         raise InputError(f"{context} has no {name} {brief(value)}: {did_you_mean(value, choices)}")
@@ -235,7 +236,7 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any])
 
 
 def _example(field: FieldInfo) -> str:
-    """Return the number of entries that a field of several numbers takes, with an example; "" for another field."""
+    """Return a phrase with the number of entries of a tuple of numbers and an example; "" for any other field."""
     annotations = repr(field.annotation)
     if "float" not in annotations and "int" not in annotations:
         return ""

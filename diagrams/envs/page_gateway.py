@@ -2,10 +2,10 @@
 
 Its first line of input is JSON: the port of Meshcat's server, the token, and the files of the page by name. It prints
 the local ports of its connections to that server, waits for a line, prints the port of the page, and from then on the
-number of browsers at each change. It ends with its input or with Meshcat.
+number of browsers at each change. It exits when its input ends or Meshcat disconnects.
 
-It imports nothing of guiderail. It is no thread of the program that simulates: the garbage collector might delete
-Meshcat in that thread, which ends the process.
+It imports nothing from guiderail. It is not a thread of the simulating program, because the garbage collector might
+delete Meshcat in that thread, which would crash the program.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 HOST = "127.0.0.1"
-MAX_MESSAGE = 10_000  # largest message of a browser [bytes]; a gamepad's has a few hundred
-MAX_WAITING = 100_000  # frames that wait for a slow browser before it is disconnected; it connects again then
-MAX_GAMEPAD = 64  # axes, or buttons, of a gamepad
-ASSET_PERIOD = 3.0  # between requests that keep the connection for assets open; Meshcat closes an idle one [s]
+MAX_MESSAGE = 10_000  # largest message of a browser [bytes]; a gamepad message has a few hundred
+MAX_WAITING = 100_000  # longest queue of a slow browser [frames] before it is disconnected; it then connects again
+MAX_GAMEPAD = 64  # largest number of gamepads, and of axes and buttons of each
+ASSET_PERIOD = 3.0  # period of requests that keep the asset connection open; Meshcat closes an idle one [s]
 
 Controls: TypeAlias = Mapping[str, tuple[float, float] | None]
 """Range of each slider; None for a button."""
@@ -43,12 +43,12 @@ Controls: TypeAlias = Mapping[str, tuple[float, float] | None]
 _ASSET = re.compile(rb"cas-v1/[0-9a-f]{64}")  # texture or mesh that a frame refers to
 _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY"}
 _KINDS = {".js": "text/javascript", ".html": "text/html; charset=utf-8"}
-_QUIET = logging.getLogger(__name__)  # refused connections are no news
+_QUIET = logging.getLogger(__name__)  # refused connections are not logged
 _QUIET.setLevel(logging.CRITICAL)
 
 
 class SceneCache:
-    """Frames that bring a new browser to the present state of the scene, in the order in which they were sent.
+    """Cache of the frames that show a new browser the current scene, in the order in which they were sent.
 
     Attributes:
         controls: Range of each slider that exists; None for a button.
@@ -59,11 +59,11 @@ class SceneCache:
         self._frames: dict[tuple[str, ...], bytes] = {}
 
     def frames(self) -> list[bytes]:
-        """Return the frames."""
+        """Return the cached frames, oldest first."""
         return list(self._frames.values())
 
     def add(self, frame: bytes) -> None:
-        """Take a frame of Meshcat into account."""
+        """Add a frame from Meshcat, and remove the frames that it makes obsolete."""
         key = _key(frame)
         if key[0] == "delete":
             self._remove(lambda other: other[0].startswith("set_") and _is_below(other[1], key[1]))
@@ -74,7 +74,7 @@ class SceneCache:
                 return
             control = msgpack.unpackb(frame)
             self.controls[key[1]] = (control["min"], control["max"]) if "min" in control else None
-        self._frames.pop(key, None)  # the newest is the last
+        self._frames.pop(key, None)  # the newest frame becomes the last
         self._frames[key] = frame
 
     def _remove(self, is_obsolete: Callable[[tuple[str, ...]], bool]) -> None:
@@ -100,7 +100,7 @@ def _is_below(path: str, parent: str) -> bool:
 
 
 def parse_event(message: bytes | str, controls: Controls) -> dict[str, Any] | None:
-    """Return a browser's input in the form that Meshcat expects; None if it is anything else.
+    """Return a browser's message as the event that Meshcat expects; None if the message is invalid.
 
     Args:
         message: Message of a browser, any bytes.
@@ -130,7 +130,7 @@ def parse_event(message: bytes | str, controls: Controls) -> dict[str, Any] | No
 
 
 def _parse_gamepad(gamepad: Any) -> dict[str, Any] | None:
-    """Return a gamepad's state with values in range; empty for a disconnected one, None if it is invalid."""
+    """Return a gamepad's state with clamped values; empty for a disconnected gamepad, None if it is invalid."""
     if gamepad == {}:
         return {}
     if not isinstance(gamepad, dict):
@@ -156,7 +156,7 @@ class Gateway:
     """Server of a page; it is the only client of Meshcat's server.
 
     Args:
-        port: Port of Meshcat's server, and of the page.
+        port: Port of Meshcat's server, used for the page as well if it is still free.
         token: Secret part of the page's address.
         files: Paths of the page's files by name.
     """
@@ -181,7 +181,7 @@ class Gateway:
             self.port = next(iter(server.sockets)).getsockname()[1]
             print(self.port, flush=True)
             reading = asyncio.create_task(self._read(meshcat, assets))
-            asyncio.get_running_loop().add_reader(sys.stdin.fileno(), reading.cancel)  # nothing follows but its end
+            asyncio.get_running_loop().add_reader(sys.stdin.fileno(), reading.cancel)  # called at the end of input
             with suppress(ConnectionClosed, asyncio.CancelledError):
                 await reading
 
@@ -194,7 +194,7 @@ class Gateway:
             self._publish(frame)
 
     async def _listen(self) -> Server:
-        """Listen at the port that Meshcat had, or at another one if it was taken meanwhile."""
+        """Listen on Meshcat's former port, or on any free port if another program has taken it."""
         for port in (self.port, 0):
             with suppress(OSError):
                 return await serve(
@@ -204,7 +204,7 @@ class Gateway:
         raise OSError("no port is free")
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a request for a file; None for a websocket with token and origin."""
+        """Return the response to a request; None accepts a websocket with a valid token and origin."""
         token, _, name = request.path.partition("?")[0].removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.token.encode()):
             return _response(HTTPStatus.NOT_FOUND, "text/plain", b"use the address that the program prints\n")
@@ -234,13 +234,13 @@ class Gateway:
             sender.cancel()
             del self._queues[browser]
             print(len(self._queues), flush=True)
-            if browser is self._gamepad_owner:  # a stick must not stay deflected
+            if browser is self._gamepad_owner:  # no stick may stay deflected
                 self._gamepad_owner = None
                 with suppress(ConnectionClosed):
                     await self._meshcat.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": {}}))
 
     async def _forward(self, event: Mapping[str, Any], browser: ServerConnection) -> None:
-        """Give a browser's input to Meshcat, and a slider's value to the other browsers."""
+        """Forward a browser's event to Meshcat, and a slider's value to the other browsers."""
         await self._meshcat.send(msgpack.packb(event))
         if event["type"] == "gamepad":
             self._gamepad_owner = browser
@@ -258,10 +258,10 @@ class Gateway:
 
 
 class _Assets:
-    """Connection that reads meshes and textures from Meshcat's server, opened before its port is closed.
+    """Connection that reads meshes and textures from Meshcat's server, opened before the server's port is closed.
 
     Attributes:
-        local_port: Port of this end.
+        local_port: Local port of the connection.
     """
 
     def __init__(self, port: int):
@@ -308,8 +308,8 @@ def _response(status: HTTPStatus, kind: str, content: bytes) -> Response:
 
 
 def main() -> None:
-    """Run the program."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the program that simulates
+    """Run the gateway."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the simulating program, and this one with its input
     given = json.loads(sys.stdin.readline())
     asyncio.run(Gateway(**given).run())
 

@@ -19,7 +19,7 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """Station that is commanded by a system with a (6,) output, held for a control period, and recorded."""
+    """Station whose desired pose is a system's (6,) output, sampled once per control period, with a recorder."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class DrivenStation:
         self.simulator.Initialize()
 
     def run(self, num_steps: int | None = None) -> Recording:
-        """Advance `num_steps` control periods, by default all that can be recorded, and return the recording."""
+        """Advance `num_steps` control periods, by default until the recorder is full, and return the recording."""
         recorder_context = self.recorder.GetMyContextFromRoot(self.context)
         done = int(self.recorder.get_num_recorded_output_port().Eval(recorder_context)[0])
         last = self._num_samples if num_steps is None else done + num_steps
@@ -78,14 +78,14 @@ class DrivenStation:
 
 
 def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
-    """Return straight lines between `poses` (N, 6) at `times` (N,), which end at rest."""
+    """Return a source of straight lines between `poses` (N, 6) at `times` (N,) [s]; the last pose is held."""
     return TrajectorySource(PiecewisePolynomial.FirstOrderHold(np.asarray(times), np.asarray(poses).T))
 
 
 def drive_along(
     station: Station, times: np.ndarray, poses: np.ndarray, prepare: Callable[[Any, Any], None] | None = None
 ) -> tuple[DrivenStation, Recording]:
-    """Drive a station along poses (N, 6) at times (N,) [s]; return it with the recording.
+    """Drive a station along poses (N, 6) at times (N,) [s]; return the driven station and the recording.
 
     `prepare` is called with the plant and its context before the start.
     """

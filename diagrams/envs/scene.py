@@ -1,4 +1,4 @@
-"""Drawing of a task: the browser view, viewpoints, and the lines that a picture shows besides the robot."""
+"""Drawing of a task: the browser view, viewpoints, and the lines that a picture shows in addition to the robot."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from guiderail.diagrams.envs.cameras import PUBLISH_PERIOD, open_meshcat
 
 
 class View:
-    """Browser view that publishes a scene from outside of the diagram that simulates it.
+    """Browser view of a scene; it is not a subsystem of the diagram that simulates the scene.
 
-    A diagram with Python in it is never freed, and a publisher inside it would keep its network port, thread and file
-    descriptors as long. A view is not a subsystem, so that they are released with it.
+    A diagram with Python systems is never freed, so a publisher inside it would keep its network port, thread and file
+    descriptors open. Those of a view are released with the view.
 
     Attributes:
         meshcat: Meshcat page.
@@ -40,7 +40,7 @@ class View:
         self._published = -1.0  # time of the last publication [s]
 
     def follow(self, context: Context) -> EventStatus:
-        """Publish at `PUBLISH_PERIOD`; a monitor for `Simulator`, called with the root context."""
+        """Publish every `PUBLISH_PERIOD`; a `Simulator` calls this function as its monitor, with the root context."""
         elapsed = context.get_time() - self._published
         # The time of a new episode restarts at zero. The tolerance covers rounding, far below a simulation step.
         if elapsed < 0 or elapsed > PUBLISH_PERIOD - 1e-6:
@@ -85,7 +85,7 @@ class Scene:
 
 
 def in_plane(poses: np.ndarray) -> np.ndarray:
-    """Return points (n, 3) of poses: (x, y) at height zero, or the position of six numbers."""
+    """Return points (n, 3) of poses (n, O): (x, y, 0) if O is 2, otherwise the first three numbers."""
     poses = np.asarray(poses)
     if poses.shape[1] >= 3:
         return poses[:, :3]

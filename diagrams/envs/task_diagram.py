@@ -32,18 +32,18 @@ PORTS = (
 
 
 def round_period(seconds: float) -> float:
-    """Return the nearest period, at most a picosecond away, with multiples that are exact in double precision.
+    """Round a period by at most a picosecond, so that its multiples are exact in double precision.
 
-    Drake triggers two events together only if their times are equal, and fl(10 k · 0.002), fl(0.02 + k · 0.02) and
-    fl(k · 0.02) often differ in the last bit: the plant would then step once more or once less between two control
-    steps, or a history would shift after the command that it should include. Round the plant's period, and use an
-    integer multiple of it as the control period.
+    Drake triggers two events together only if their times are equal, and the floating-point numbers 10 k · 0.002,
+    0.02 + k · 0.02 and k · 0.02 often differ in the last bit: the plant would then step once more or once less between
+    two control steps, or a history would be updated after the command that it should include. Round the plant's period,
+    and use an integer multiple of it as the control period.
 
     Args:
         seconds: Period [s], positive.
 
     Raises:
-        InputError: If it is not positive and finite.
+        InputError: If `seconds` is not positive and finite.
     """
     if not (np.isfinite(seconds) and seconds > _GRID):
         raise InputError(f"a period must be positive, not {seconds} s")
@@ -56,7 +56,7 @@ def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: M
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Rotations and reflections under which a task is invariant, up to details such as demonstrations' means.
+    """Rotations and reflections under which a task is invariant, except for details such as the demonstrated mean.
 
     Attributes:
         observations: Signed permutation of the observation for each of K symmetries, (K, n, n).
@@ -80,7 +80,7 @@ class Symmetry:
                 raise ValueError("each matrix of a symmetry is a signed permutation")
 
     def padded(self, count: int) -> Symmetry:
-        """Return the same symmetry of an observation with `count` more numbers at its end, which do not change."""
+        """Return the symmetry for an observation with `count` further entries at its end, which it leaves unchanged."""
         if count == 0:
             return self
         size = self.observations.shape[1]
@@ -90,40 +90,40 @@ class Symmetry:
 
     @classmethod
     def of_signs(cls, observation: ArrayLike, action: ArrayLike, privileged: ArrayLike | None = None) -> Symmetry:
-        """Return the symmetry that multiplies each observed number (n,), action (A,) and privileged number by ±1."""
+        """Return the symmetry that multiplies each entry of observation (n,), action (A,) and privileged (m,) by ±1."""
         signs = (observation, action) if privileged is None else (observation, action, privileged)
         return cls(*(np.diag(np.asarray(each, float))[None] for each in signs))
 
 
 @dataclass(frozen=True)
 class TaskDiagram:
-    """Task, wired and built, as `DiagramEnv` runs it.
+    """Built diagram of a task, with the data that `DiagramEnv` needs to run it.
 
     The diagram exports the input ``action`` (A,), in [-1, 1], and these outputs:
 
     ======================= ================================================================================
     ``observation``         observation of the policy: a vector, or an abstract `ImageRgba8U`
-    ``reward``              (1,) of the control step that ends
+    ``reward``              (1,) reward of the control step that ends
     one per reward term     (1,) each, named as in `reward_terms`
     ``termination``         (1,) an index into `guiderail.systems.episode_monitor.TERMINATIONS`
     ``commanded_violation`` (1,) max over the constraints of c - G y of the commanded output; negative is slack
-    ``measured_violation``  (1,) the same of the measured pose
-    ``contact_force``       (1,) N
+    ``measured_violation``  (1,) the same for the measured pose
+    ``contact_force``       (1,) magnitude of the contact force [N]
     ``desired_pose``        (O,) commanded pose
     ``pose``                (O,) measured pose
     ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
-    ``wrench``              of the surroundings on the tool; this port and the next four are optional
-    ``saturation``          (A,) demand on each actuator beyond its limit
+    ``wrench``              (W,) of the surroundings on the tool; this port and the next four are optional
+    ``saturation``          nonzero while an actuator is at its limit; the size is the station's
     ``collision``           (1,) positive during a collision
     ``privileged``          (m,) observation of a privileged critic, which the policy does not have
     ``command_timed_out``   (1,) 1 while the last safe pose is held because commands stopped or are not finite
     ``rgb_image``           an abstract `ImageRgba8U`; only if the diagram was built with a camera
     ======================= ================================================================================
 
-    The environment reads them at the end of each control step, before the events of that instant. Build the plant with
-    ``use_sampled_output_ports=False``, so that systems that sample it at control steps read the same numbers. With
-    sampled output ports the plant's step is an unrestricted update, which Drake runs before the discrete updates of the
-    same instant: they would read the plant one plant step later.
+    The environment reads the outputs at the end of each control step, before the events of that instant. Build the
+    plant with ``use_sampled_output_ports=False``, so that systems that sample the plant at control steps read the same
+    numbers. With sampled output ports the plant's step is an unrestricted update, which Drake runs before the discrete
+    updates of the same instant: these would read the plant's state one plant step later.
 
     Attributes:
         diagram: Root diagram.
@@ -131,15 +131,15 @@ class TaskDiagram:
         num_steps: Control steps after which an episode is truncated.
         observation_space: Space of observations, in the dtype that the environment returns.
         reward_terms: Names of the reward terms, which are ports of the diagram and keys of `info`.
-        randomize: Function of the root context, which was just restored to the default, the environment's random
-            generator and the options of a reset. It samples the episode's conditions, writes them into the context and
+        randomize: Function of the root context (just restored to the default), the environment's random generator and
+            the options of a reset. It samples the episode's conditions, writes them into the context and
             returns them for `info`. It raises an `InputError` for an unknown option.
         push: Function of the root context and a displacement that moves the measured pose; None if the robot cannot be
             pushed.
         query: Query port of the scene, for a browser view.
         view: Browser view of an environment made with `render_mode="human"`.
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
-        near_symmetry: The same, with symmetries that hold only for most of an episode.
+        near_symmetry: Like `symmetry`, with symmetries that hold only for most of an episode.
         declaration: `Task` that the diagram was built from, if there is one.
     """
 

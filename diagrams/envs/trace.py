@@ -1,4 +1,4 @@
-"""Trace of an episode: what was commanded, measured and rewarded in every control step, and its statistics."""
+"""Trace of an episode: commands, measurements and rewards of every control step, and their statistics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Metric:
-    """Number that is computed from an episode, or from a table of episodes.
+    """Definition of a number that is computed from an episode, or from a table of episodes.
 
     Attributes:
-        name: Name of its column.
+        name: Name of the metric's column.
         unit: Unit, or the quantity that is counted; "" if there is none.
         description: Definition in words.
         compute: Function from the episode, or from the table of episodes, to the number.
@@ -27,7 +27,7 @@ class Metric:
 class EpisodeTrace:
     """Record of an episode: one row for every control step, taken at its end.
 
-    The arrays are views of storage that the next episode overwrites: copy what has to outlive a reset.
+    The arrays are views of storage that the next episode overwrites: copy data that are needed after a reset.
     """
 
     def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
@@ -83,7 +83,7 @@ class EpisodeTrace:
     ) -> None:
         """Record one control step: poses (O,), contact force [N], reward and signals.
 
-        NaN is recorded for signals that are left out.
+        NaN is recorded for every signal if `signals` is None.
         """
         n = self._length
         self._commanded[n] = commanded
@@ -95,11 +95,11 @@ class EpisodeTrace:
         self._length = n + 1
 
     def statistics(self) -> dict[str, float]:
-        """Return the statistics of the episode's safety so far.
+        """Return the safety statistics of the episode so far, by name.
 
-        A maximum over no control steps is −∞, and 0 for the force; NaN is the maximum of values that contain it. A
-        collision lasts from its first control step in contact to its last; `collisions` counts them, `collision_steps`
-        their control steps. Without the signal that it is computed from, a violation is −∞ and a count is 0.
+        Before the first control step, the largest violations are −∞ and the peak force is 0. The maximum of values that
+        contain NaN is NaN. `collisions` counts uninterrupted sequences of control steps in collision, `collision_steps`
+        counts these control steps. If the trace lacks its signal, a violation is −∞ and a count is 0.
         """
         collision = self._is_positive("collision")
         return {

@@ -1,4 +1,4 @@
-"""Guidance around a base policy: its chunks as KGRL's or a residual's reference, or guarded and executed."""
+"""Guidance around a base policy: its chunks are KGRL's or a residual's reference, or are executed with a guard."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class BasePolicyOptions(Options):
         if not value:
             return value
         find_base_policy(value)
-        # A run can be resumed from another folder.
+        # A relative path would be wrong if the run is resumed from another folder.
         return value if value in BASE_POLICIES.names() else str(Path(value).resolve())
 
 
@@ -74,11 +74,12 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     """Return the limits of velocity and jerk of a guard, (O,) each.
 
     Args:
-        config: Demonstrations, for the default, and the limits of speed.
-        max_jerk: Limits of jerk: one for all outputs, one for position and one for angles, or O; () for the default.
+        config: Configuration with the demonstrations, for the default limits, and the speed limits.
+        max_jerk: Jerk limits: one for the position (angles have the default), one for position and one for angles, or
+            O; () for the default.
 
     Raises:
-        InputError: If there are other constraints of the motion, or the number of limits does not fit.
+        InputError: If there are other constraints of the motion, or `max_jerk` has another number of entries.
     """
     outputs, motion, period = config.num_outputs, config.motion, config.control_period
     positions = min(outputs, 3)
@@ -105,17 +106,17 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
 
 
 class ChunkExecutionGuidance(PrimitiveGuidance):
-    """Guidance that commands chunks, behind a guard; the action has no effect. Exports ``rate`` too."""
+    """Guidance that commands chunks, with a guard by default; the action has no effect. A guard exports ``rate``."""
 
     def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False):
         """Construct the guidance.
 
         Args:
             prior: Prior knowledge.
-            takes_window: Take the chunks from the input ``reference_window`` in place of the demonstrations' mean.
+            takes_window: True takes the chunks from the input ``reference_window`` instead of the demonstrations' mean.
 
         Raises:
-            InputError: If the guard cannot have the limits and constraints, or the motion waits for the robot.
+            InputError: If the guard does not support the limits and constraints, or the motion waits for the robot.
         """
         super().__init__()
         config, options, builder = primitive_config_of(prior), prior.options, DiagramBuilder()
@@ -124,7 +125,7 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
         _, pose = self._export_inputs(builder, config)
         outputs, points = config.num_outputs, config.horizon + 1
         is_guarded = options["guard"] != "none"
-        # Not a Demultiplexer: Drake assumes that it depends on time, as `add_demonstration` explains.
+        # Not a Demultiplexer: Drake assumes that its output depends on time; see `add_demonstration`.
         means = np.eye(points * outputs if is_guarded else outputs, points * (outputs + outputs**2))
         chunk = builder.AddNamedSystem("chunk", MatrixGain(D=means))
         if takes_window:
@@ -190,7 +191,7 @@ class ResidualBasePolicyGuidance(_ChunkGuidance, ResidualGuidance):
 
 
 class BasePolicyGuidance(_ChunkGuidance, ChunkExecutionGuidance):
-    """Guidance that commands the chunks of a base policy, behind a guard."""
+    """Guidance that commands the chunks of a base policy, with a guard by default."""
 
 
 @register_guidance(
@@ -202,7 +203,7 @@ class BasePolicyGuidance(_ChunkGuidance, ChunkExecutionGuidance):
     options=GuardOptions,
 )
 def base_policy(prior: PriorKnowledge) -> Diagram:
-    """Build the execution of a base policy's chunks behind a guard."""
+    """Build guidance that executes a base policy's chunks, with a guard by default."""
     return BasePolicyGuidance(prior) if prior.options["base_policy"] else ChunkExecutionGuidance(prior)
 
 
@@ -215,7 +216,7 @@ def base_policy(prior: PriorKnowledge) -> Diagram:
     options=BasePolicyOptions,
 )
 def kgrl_base_policy(prior: PriorKnowledge) -> Diagram:
-    """Build KGRL around a base policy; no symmetry is used, because a base policy has none."""
+    """Build KGRL around a base policy; no symmetry is used, because a base policy is not symmetric."""
     return KgrlBasePolicyGuidance(prior) if prior.options["base_policy"] else KgrlGuidance(prior)
 
 

@@ -1,4 +1,4 @@
-"""Guidance by a function of action, measured pose and wrench, without a diagram of its own."""
+"""Guidance defined by a function of action, measured pose and wrench."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, G
 
 
 class FunctionGuidance(Guidance):
-    """Guidance that commands law(action, pose, wrench) once a control step; see `FunctionGuidanceSystem`.
+    """Guidance that commands law(action, pose, wrench) once per control step; see `FunctionGuidanceSystem`.
 
-    The command is not constrained; ``constraint_violation`` is its violation of the task's constraints.
+    The command is not constrained; ``constraint_violation`` is the command's violation of the task's constraints.
     """
 
     def __init__(self, prior: PriorKnowledge, law: GuidanceFunction, action_size: int):

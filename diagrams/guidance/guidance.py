@@ -17,8 +17,8 @@ output                  size   meaning
 `fallback`              1      1 if a safe pose is commanded instead of the requested one
 ======================  =====  =====================================================================================
 
-Guidance may export more; a task's reward can name such a port, for example a template's `progress`. Guidance around a
-base policy has the input `reference_window` too, and makes the system that it comes from (`Guidance.make_reference`).
+Guidance may export further ports; a task's reward can name such a port, for example a template's `progress`. Guidance
+around a base policy also has the input `reference_window`, which a system from `Guidance.make_reference` computes.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class Guidance(Diagram):
         """Set the poses of objects in this episode, by name; guidance without objects does nothing."""
 
     def make_reference(self, observation_size: int) -> System | None:
-        """Return a system from the observation (n,) to the input ``reference_window``, if the guidance has that input.
+        """Return the system that computes ``reference_window`` from the observation (n,), if that is an input.
 
-        It has an input ``observation`` and an output ``reference_window``, and no direct feedthrough, because an
-        observation may contain the command.
+        The system has an input ``observation`` and an output ``reference_window``, and no direct feedthrough, because
+        an observation may contain the command.
         """
         return None
 
@@ -75,9 +75,9 @@ class Guidance(Diagram):
 
 
 def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, kind: str = "") -> None:
-    """Refuse a diagram with ports that do not fit a station with poses (O,) and wrenches (W,).
+    """Check that the ports of a diagram fit a station with poses (O,) and wrenches (W,).
 
-    The message names the `kind` of guidance, or else the diagram.
+    The error message names the `kind` of guidance, or the diagram if `kind` is empty.
 
     Raises:
         InputError: If a port of the contract is missing or has another size.

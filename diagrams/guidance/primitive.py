@@ -48,9 +48,9 @@ class PrimitiveGuidance(Guidance):
     def _constrain(
         self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
     ) -> tuple[OutputPort, OutputPort]:
-        """Return the ports of the command and of the fallback flag, behind the constraints of the motion if any.
+        """Return the ports of the command and the fallback flag, after the motion constraints if there are any.
 
-        The primitive's progress waits for the robot if the configuration has a rule for it.
+        The primitive's progress waits for the robot if the configuration has a progress rule.
         """
         command, fallback = self._limit_motion(builder, config, kmp, pose)
         if config.progress is not None:
@@ -104,14 +104,14 @@ def add_demonstration(
 ) -> LcNsKmpSystem:
     """Add the primitive without actions, constraints or history, which commands the mean of the reference.
 
-    The reference is that of the demonstrations, or the input ``reference_window`` with `takes_window`.
+    The reference is the demonstrations', or the input ``reference_window`` if `takes_window` is True.
     """
     primitive = config.primitive(history=False, constrained=False)
     kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
     if takes_window:
         builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
-    # Not a ConstantVectorSource: Drake assumes that it depends on time, so the primitive would be computed again at
-    # every step of the plant.
+    # Not a ConstantVectorSource: Drake assumes that its output depends on time, so the primitive would be computed
+    # again at every step of the plant.
     zero = builder.AddNamedSystem("no_action", MatrixGain(D=np.zeros((config.num_outputs, config.num_outputs))))
     builder.Connect(action, zero.get_input_port())
     builder.Connect(zero.get_output_port(), kmp.get_null_space_action_input_port())
@@ -146,15 +146,15 @@ class KmpGuidance(PrimitiveGuidance):
     displaces=True,
 )
 class KgrlGuidance(PrimitiveGuidance):
-    """KGRL: actions deviate where the demonstrations did, and every command satisfies the constraints."""
+    """KGRL: actions displace the command where the demonstrations vary, and commands satisfy the constraints."""
 
     def __init__(self, prior: PriorKnowledge, *, constrained: bool = True, takes_window: bool = False):
         """Construct the guidance.
 
         Args:
             prior: Prior knowledge.
-            constrained: Enforce the constraints; without, the guidance is that of `residual_covariance`.
-            takes_window: Take mean and covariance from the input ``reference_window`` in place of the demonstrations.
+            constrained: True enforces the constraints; False gives the guidance `residual_covariance`.
+            takes_window: True takes mean and covariance from the input ``reference_window``, not the demonstrations.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
@@ -191,11 +191,10 @@ def residual_covariance(prior: PriorKnowledge) -> KgrlGuidance:
     displaces=True,
 )
 class SkgrlGuidance(PrimitiveGuidance):
-    """SKGRL: null-space actions through a history of outputs, so that exploration is smooth.
+    """Guidance by sKGRL: null-space actions with a history of outputs, so that exploration is smooth.
 
-    With an adaptive history the motion passes through fewer past outputs during contact, where it reacts to forces as
-    quickly as KGRL, and is smooth elsewhere. The shortest history is one output: every command begins at the last one,
-    whatever the length.
+    With an adaptive history, the motion passes through fewer past outputs during contact, so that it reacts to forces
+    as quickly as KGRL. The shortest history is the last output, so every motion begins there.
     """
 
     def __init__(self, prior: PriorKnowledge):
@@ -229,6 +228,6 @@ class SkgrlGuidance(PrimitiveGuidance):
         builder.Connect(action, kmp.get_null_space_action_input_port())
         builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
         builder.Connect(past, history.get_output_input_port())
-        # A history of either source starts at the robot's pose: a command from elsewhere would be a jump.
+        # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.
         builder.Connect(pose, history.get_initial_output_input_port())
         self._finish(builder, config, command, fallback)

@@ -23,31 +23,31 @@ HISTORY_SOURCES = ("commanded", "measured")
 
 @dataclass(frozen=True)
 class PrimitiveConfig:
-    """Demonstrations, constraints, and the range of a policy around them.
+    """Configuration of a movement primitive: demonstrations, constraints, and the range of a policy's actions.
 
     Attributes:
         reference: Reference trajectory of the demonstrations, in steps of the control period.
         constraints: G y ≥ c on every command.
         motion: Further constraints of the commanded motion, enforced behind the primitive; None if there are none.
         control_period: Control period [s].
-        history: P, past outputs that sKGRL's motion passes through.
+        history: P, number of past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
         adaptive_history: True if sKGRL's history halves, down to a single output, during contact.
-        history_source: "commanded" or "measured". Use commanded poses under impedance control (otherwise a long history
-            at a high rate follows the robot, and its force vanishes), and measured ones if an operator may push a robot
-            that tracks well.
-        horizon: H, future points at which the constraints are satisfied.
+        history_source: "commanded" or "measured" poses. Use commanded poses under impedance control, where a long
+            measured history at a high rate would follow the robot, so that its force vanishes. Use measured poses if an
+            operator may push a robot that tracks well.
+        horizon: H, number of future points at which the constraints are satisfied.
         lambda_: λ of problem 4.5.
         beta: β of problem 4.5.
         kernel: k of the movement primitive.
         action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
         action_dims: Indices of the outputs that an action moves, one entry each; default: all.
-        gains: Raw null-space units per action, (O,); default: computed from κ.
-        isotropic_groups: Indices of outputs of one unit, group by group; a residual moves all outputs of a group by the
-            same amount. Default: one group.
+        gains: Null-space action per unit of the policy's action, (O,); default: computed from κ.
+        isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all
+            outputs of a group. Default: one group.
         solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
         keep_out: Walls that safe residual learning stops at, if the task provides any.
-        progress: Rule by which the motion waits for the robot; None: the clock drives it.
+        progress: Rule by which the motion waits for the robot; None if the clock drives the motion.
         wrench_size: W, size of a measured wrench.
     """
 
@@ -136,7 +136,7 @@ class PrimitiveConfig:
         )
 
     def null_space_gains(self, primitive: LcNsKmp) -> np.ndarray:
-        """Return the raw null-space units of an action of one, (O,).
+        """Return the null-space action per unit of the policy's action, (O,).
 
         Raises:
             InputError: If `gains` are not O finite numbers, or actions have no effect on this primitive.

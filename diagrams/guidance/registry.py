@@ -34,10 +34,10 @@ class GuidanceKind:
         needs: Alternative tuples of names in `REQUIREMENTS`; the task must provide all names of one alternative.
         label: Label in figures.
         color: Color in figures, "#rrggbb".
-        demonstrates: True if an action of zero reproduces the demonstrations or the script, so that their success
-            before learning can be stated.
-        displaces: True if an action displaces the explored outputs, one number for each. A task's symmetry is used
-            for data augmentation only if it does.
+        demonstrates: True if an action of zero reproduces the demonstrations or the scripted approach, so that the
+            success before learning can be evaluated.
+        displaces: True if each entry of an action displaces one explored output. Only then is a task's symmetry used
+            for data augmentation.
         options: Model of further options of the environment, if there are any.
     """
 
@@ -51,7 +51,7 @@ class GuidanceKind:
     options: type[Options] | None = None
 
     def missing_requirements(self, known: Collection[str]) -> tuple[str, ...]:
-        """Return the missing requirements of the alternative that lacks fewest; empty if one is complete.
+        """Return the missing requirements of the alternative with the fewest; empty if an alternative is complete.
 
         `known` are the requirements that the task provides.
         """
@@ -86,7 +86,7 @@ def register_guidance(
     Args:
         name: Value of the option `guidance`.
         needs: See `GuidanceKind`.
-        label: Label in figures; default: its name.
+        label: Label in figures; default: `name`.
         color: Color in figures, "#rrggbb".
         demonstrates: See `GuidanceKind`.
         displaces: See `GuidanceKind`.
@@ -107,7 +107,7 @@ def possible_guidance(known: Collection[str]) -> list[str]:
 
 
 def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
-    """Return the kind of guidance of a name, if it needs no more than the `known` requirements of a task.
+    """Return the kind of guidance with a name, after a check that its requirements are among `known`.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing, which the message names.
@@ -123,7 +123,7 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
 
 
 def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") -> Diagram:
-    """Build the guidance of a name from prior knowledge.
+    """Build a kind of guidance from prior knowledge.
 
     Args:
         name: Name of the kind.

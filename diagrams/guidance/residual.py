@@ -1,4 +1,4 @@
-"""Residual learning (thesis, section 4.4.1): actions add to a motion, equally in every direction and at any time."""
+"""Residual learning (thesis, section 4.4.1): actions are added to a motion, with constant gains."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from guiderail.systems.safety_filter import SafetyFilter
 
 
 class ResidualDescent(Guidance):
-    """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t descends straight.
+    """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t is a straight descent.
 
-    ``action`` is (3,); the command also respects the template's greatest speeds. Exports ``measured_violation`` too.
+    ``action`` is (3,); the command also respects the template's speed limits. Exports ``measured_violation`` too.
     """
 
     def __init__(self, prior: PriorKnowledge):
         """Construct the guidance from an approach and the active constraints of a template.
 
-        The template's only object is the frame in which poses are given.
+        All poses are in the frame of the template's only object.
         """
         super().__init__()
         assert prior.template is not None
@@ -49,7 +49,7 @@ class ResidualDescent(Guidance):
         corners = np.zeros((POSE_SIZE, 2))
         corners[2] = approach.heights
         line = builder.AddNamedSystem("descent", TrajectorySource(PiecewisePolynomial.FirstOrderHold(times, corners)))
-        # Without a hold, all systems behind it would be computed again at every step of the plant.
+        # Without this hold, all systems after it would be computed again at every step of the plant.
         held = builder.AddNamedSystem("descent_hold", ZeroOrderHold(period, POSE_SIZE))
         spread = builder.AddNamedSystem("spread", MatrixGain(D=np.eye(POSE_SIZE, 3)))
         residual = builder.AddNamedSystem("residual", Residual(np.array([approach.reach] * 3 + [0.0] * 3)))
@@ -83,9 +83,9 @@ class ResidualGuidance(PrimitiveGuidance):
 
         Args:
             prior: Prior knowledge.
-            make_filter: Function from the demonstrations and the walls to keep out of to a `SafetyFilter` or a
-                `CommandFilter` behind the sum, if there is one; ``fallback`` is then 1 if it changed the command.
-            takes_window: Take the motion from the input ``reference_window`` in place of the demonstrations.
+            make_filter: Function of the primitive's configuration and the keep-out walls that returns a `SafetyFilter`
+                or `CommandFilter` of the sum, whose changes set ``fallback`` to 1; None for no filter.
+            takes_window: True takes the motion from the input ``reference_window`` instead of the demonstrations.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()

@@ -20,7 +20,7 @@ from guiderail.systems.sct_state_machine import SctStateMachine
 
 
 class ActiveConstraintFilter(Diagram):
-    """Active constraints and state machine of a template, for a requested pose.
+    """Diagram that applies a template's active constraints and state machine to a requested pose.
 
     .. pydrake_system::
 
@@ -81,17 +81,17 @@ class ActiveConstraintFilter(Diagram):
         builder.ExportOutput(self.GetOutputPort("commanded_violation"), "constraint_violation")
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of objects; those that are not named stay. The context is the root diagram's."""
+        """Set the poses of the named objects in the root context; other objects stay."""
         for system in (self._projector, self._machine):
             system.frames.set(system.GetMyMutableContextFromRoot(root_context), frames)
 
 
 class SctGuidance(Guidance):
-    """Shared control: input mapping, then active constraints, both of the state machine's state.
+    """Shared control: input mapping and active constraints of the template's current state.
 
-    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the larger of meters and
-    radians from the projection, 0 inside. In addition to the ports of all guidance it exports ``state``,
-    ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
+    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the distance of the
+    command from its projection, the larger of meters and radians; 0 inside. In addition to the ports of all guidance it
+    exports ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
 
     def __init__(
@@ -108,10 +108,10 @@ class SctGuidance(Guidance):
 
         Args:
             template: Shared control template.
-            frames: Poses X_WF of its objects by name; W is the frame of all poses.
+            frames: Poses X_WF of the template's objects by name; W is the frame of all poses.
             period: Control period [s].
-            input_mapping: Second template that maps the inputs, in its initial state, instead of `template`. The active
-                constraints are then a safety filter, for example for a plain end-effector velocity.
+            input_mapping: Second template, whose initial state maps the inputs instead of `template`. The active
+                constraints of `template` are then a safety filter, for example of an end-effector velocity.
             active_constraints: False commands the requested pose without constraints.
             max_tracking_error: Distance between robot and command beyond which the last command is repeated [m].
         """
@@ -136,7 +136,7 @@ class SctGuidance(Guidance):
 
         builder.ExportInput(hold.get_input_port(), "action")
         builder.ExportInput(self._filter.GetInputPort("pose"), "pose")
-        # The port is unused: all guidance has the same ports.
+        # The wrench is unused, but all guidance has this port.
         wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
         builder.ExportInput(wrench.get_input_port(), "wrench")
         self._filter.export_outputs(builder)
@@ -144,7 +144,7 @@ class SctGuidance(Guidance):
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of objects; those that are not named stay. The context is the root diagram's."""
+        """Set the poses of the named objects in the root context; other objects stay."""
         self._filter.set_frames(root_context, frames)
         mapped = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
         self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), mapped)
@@ -168,7 +168,7 @@ def _build_sct(
 
 @register_guidance("sct", needs=(("template",),), label="RL-SCT", color="#9467bd")
 def sct(prior: PriorKnowledge) -> SctGuidance:
-    """Build RL-SCT: a few inputs through the template, followed by its active constraints."""
+    """Build RL-SCT: the template maps a few inputs to a pose and applies its active constraints."""
     return _build_sct(prior, None, is_constrained_by_default=True)
 
 

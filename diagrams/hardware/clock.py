@@ -1,4 +1,4 @@
-"""Clocks of a hardware station: how its time passes relative to the robot's statuses."""
+"""Clocks of a hardware station, which advance its simulator with the robot's statuses."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ BIN_WIDTH = 1e-4  # width of a histogram's bin [s]
 
 
 class ReceivingStation(Protocol):
-    """Station that takes in the robot's newest status before each step."""
+    """Station that reads the robot's newest status before each step."""
 
     def receive(self, context: Context, clock: float | None = None) -> None:
-        """Take in the newest status at the wall clock time `clock` [s]; `context` is the root context."""
+        """Read the newest status at the wall clock time `clock` [s]; `context` is the root context."""
 
 
 class Clock(Protocol):
-    """Advances a hardware station together with its robot."""
+    """Clock that advances a hardware station together with its robot."""
 
     def begin(self) -> None:
         """Prepare to advance a simulator that has just been initialized with the newest status."""
@@ -41,7 +41,7 @@ def check_rate(rate: float) -> None:
     """Check the rate of the robot's clock relative to the wall clock.
 
     Raises:
-        InputError: If it is not positive, or above 1.
+        InputError: If `rate` is not positive, or above 1.
     """
     if not 0.0 < rate <= 1.0:
         raise InputError(f"the rate of a simulated robot's clock is positive and at most 1, not {rate:g}")
@@ -64,7 +64,7 @@ class IntervalHistogram:
         self.longest = max(self.longest, seconds)
 
     def quantile(self, share: float) -> float:
-        """Return the interval that this share of them does not exceed [s], to 0.1 ms; NaN if there are none."""
+        """Return the quantile of the intervals at `share` [s], with a resolution of 0.1 ms; NaN without intervals."""
         total = self._counts.sum()
         if not total:
             return np.nan
@@ -95,9 +95,9 @@ def garbage_collection_disabled() -> Iterator[None]:
 
 
 class WallClock:
-    """Advance a hardware station by the wall clock: one step per status, when it arrives.
+    """Clock that advances a hardware station in real time: one step when a status arrives.
 
-    A step is made without a status if none arrives for one and a half periods; the station's watchdog then notices.
+    A step is made without a status if none arrives for one and a half periods; the station's watchdog detects this.
     If this program was delayed, only the newest status is used: lost time is not made up for. If statuses arrive more
     often than once a period, some are skipped: the station is never more than half a period ahead of the wall clock.
 
@@ -119,7 +119,7 @@ class WallClock:
         self.intervals = IntervalHistogram()
         self._driver, self._period, self._rate = driver, period or driver.period, rate
         self._num_used, self._last_step = driver.num_statuses, time.monotonic()
-        self._due = self._last_step  # time of the next step
+        self._due = self._last_step  # wall clock time of the next step [s]
 
     def begin(self) -> None:
         """Prepare to advance a simulator that has just been initialized with the newest status."""
@@ -137,7 +137,7 @@ class WallClock:
             self.intervals.add(now - self._last_step)
             self._last_step = now
             self._due = max(self._due, now) + self._period / self._rate
-            # The events of this instant, which Drake has left pending, belong to the status before.
+            # Events of this instant are still pending in Drake, and belong to the previous status.
             simulator.AdvancePendingEvents()
             station.receive(context, now * self._rate)
             simulator.AdvanceTo(start + (step + 1) * self._period)

@@ -1,4 +1,4 @@
-"""Interface to the program that drives a robot: joint states in, joint torques out, and no message type."""
+"""Interface to the program that drives a robot: joint states in, joint torques out, without message types."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from guiderail.systems.torque_safety_limiter import SafetyLimits
 STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers, 5 ms [s]; a control period is an exact multiple
 POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 
-# Shares of the driver's reflex limits that are commanded and tolerated, and of a joint's maximum velocity.
+# Limits of the commanded and the external torque as shares of the driver's reflex limits, and of the joint velocity as
+# a share of its maximum.
 TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
-TORQUE_TOLERANCE_SHARE = 0.02  # error of a joint's torque by friction, gravity compensation and sensor, of its limit
+TORQUE_TOLERANCE_SHARE = 0.02  # largest error of a joint torque by friction, gravity and sensor, relative to its limit
 
 CommandCallback = Callable[[np.ndarray, float], None]
 
@@ -51,8 +52,8 @@ class Driver(ABC):
         name: Prefix of the joint ports of a hardware station, as in Drake's own stations.
         torque_reflex_limits: External torques at which the driver stops by itself under torque control, (n,) [Nm].
         has_command_timeout: True if the driver brings the arm to rest when commands stop.
-        can_hold: True if the driver holds the arm when `hold` is called, without a status or a torque.
-        hold_off: Time after its first status for which the driver must not receive commands [s].
+        can_hold: True if `hold` is implemented: the driver then holds the arm without status or torques.
+        hold_off: Time after its first status during which the driver must not receive commands [s].
         period: Period of statuses and commands [s].
         url: Address that the connection was opened with; empty for the default.
         num_statuses: Number of different statuses received; a repeated one counts once.
@@ -89,7 +90,7 @@ class Driver(ABC):
         raise InputError(f"the driver {self.name} can't hold the arm by itself")
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive what has arrived.
+        """Receive the messages that have arrived.
 
         Args:
             timeout: Longest time to wait for a new status if none has arrived [s].
@@ -119,10 +120,10 @@ class Driver(ABC):
         """Raise `InputError` if the connection cannot receive in this environment."""
 
     def add_listener(self, on_command: CommandCallback) -> None:
-        """Call back for the torques and the time [s] of every readable command of another program.
+        """Register a callback for the torques (n,) [Nm] and time [s] of each command that another program sends.
 
         Raises:
-            InputError: If the driver does not show the commands of other programs.
+            InputError: If the driver cannot read the commands of other programs.
         """
         raise InputError(f"the driver {self.name} cannot be watched by a safety monitor")
 
@@ -141,18 +142,18 @@ class Driver(ABC):
 
 @dataclass(frozen=True)
 class RobotImpedance:
-    """Impedance at the tool center that a robot's own controller runs.
+    """Impedance at the tool center, for a robot with its own impedance controller.
 
     Attributes:
         X_FlangeTool: Pose of the tool center on the flange.
-        stiffness: Stiffness in the axes of the robot's base, (6, 6) [N/m, Nm/rad], force first.
-        damping: Damping, likewise (6, 6) [Ns/m, Nms/rad].
+        stiffness: Stiffness in the axes of the robot's base, (6, 6) [N/m, Nm/rad], translation first.
+        damping: Damping in the same axes and order, (6, 6) [Ns/m, Nms/rad].
         max_wrench: Largest magnitude of each component of the impedance's wrench in the axes of the base,
             (6,) [N, Nm].
-        posture: Joint positions that the nullspace is drawn to, (n,) [rad].
+        posture: Joint positions towards which the null space is controlled, (n,) [rad].
         mass: Mass of tool and workpiece [kg].
-        center_of_mass: Their center of mass in the flange's frame, (3,) [m].
-        inertia: Their inertia about the center of mass in the flange's axes, (3, 3) [kg m²].
+        center_of_mass: Center of mass of tool and workpiece in the flange's frame, (3,) [m].
+        inertia: Inertia of tool and workpiece about the center of mass in the flange's axes, (3, 3) [kg m²].
     """
 
     X_FlangeTool: RigidTransform
@@ -189,7 +190,7 @@ class PoseDriver(Driver):
         """Bring the arm to rest by the robot's own means; repeated calls have no effect."""
 
     def write(self, torque: np.ndarray, time: float) -> None:
-        """Raise an error, because the robot accepts poses."""
+        """Raise an `InputError`, because the robot accepts poses instead of torques."""
         raise InputError(f"the driver {self.name} accepts poses, not torques")
 
 
@@ -214,7 +215,7 @@ def find_driver(robot: Robot | str) -> type[Driver]:
 
 
 def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> SafetyLimits:
-    """Return limits below those at which the driver stops by itself, and below those of the arm's controller plant."""
+    """Return limits of the arm below the driver's reflex limits and within those of the controller plant."""
     reflex_limits = np.array(driver.torque_reflex_limits)
     return SafetyLimits(
         velocity=tuple((VELOCITY_SHARE * plant.GetVelocityUpperLimits()).tolist()),
@@ -230,5 +231,5 @@ def status_limits(plant: MultibodyPlant, driver: Driver | type[Driver], period: 
 
 
 def torque_tolerance(limits: SafetyLimits) -> tuple[float, ...]:
-    """Return the largest error of each joint's torque that a status may show, (n,) [Nm]."""
+    """Return the largest error of each joint torque that is tolerated in a status, (n,) [Nm]."""
     return tuple(TORQUE_TOLERANCE_SHARE * torque for torque in limits.torque)

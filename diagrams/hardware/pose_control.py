@@ -1,4 +1,4 @@
-"""Pose control: parts of a hardware station for a robot that runs the impedance itself."""
+"""Parts of a hardware station for a robot that follows desired poses with its own impedance controller."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from guiderail.systems.pose_rate_limiter import PoseRateLimiter
 
 
 def make_rate_limiter(driver: Driver, period: float) -> PoseRateLimiter:
-    """Return the limiter of desired poses: of the speed, and for a `PoseDriver` of acceleration and jerk as well."""
+    """Return the limiter of desired poses: it limits the speed, for a `PoseDriver` also acceleration and jerk."""
     if isinstance(driver, PoseDriver):
         from guiderail.systems.pose_motion_limiter import PoseMotionLimiter  # its library is in the extra fci
 
@@ -32,7 +32,7 @@ def add_pose_publisher(
     arm_state: OutputPort,
     period: float,
 ) -> None:
-    """Add the publisher of the poses of a port, which stops the robot in the states of the other port."""
+    """Add a publisher that sends `pose` to the robot while `arm_state` permits, and otherwise stops it."""
     X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
     publisher = builder.AddNamedSystem(
         "publisher", PosePublisher(driver.write_pose, driver.stop, X_BaseTarget, period=period)
@@ -42,10 +42,11 @@ def add_pose_publisher(
 
 
 def make_robot_impedance(model: ArmControllerPlant, impedance: Impedance) -> RobotImpedance:
-    """Return the impedance for a robot that runs it itself, with the damping matrix of the nominal posture.
+    """Return the impedance for a robot's own controller, with the damping matrix of the nominal posture.
 
     Raises:
-        InputError: If the target's axes are not the base's, because the bounds of the wrench would turn with them.
+        InputError: If the axes of target and base differ: the wrench is limited along the target's, the robot uses the
+            base's.
     """
     plant, arm = model.plant, model.arm
     context = plant.CreateDefaultContext()

@@ -57,24 +57,24 @@ class HardwareOptions(Options):
 class HardwareStation(Station):
     """A real arm under the impedance controller of this program, behind a `Driver`.
 
-    Torques are the commands, joint states the statuses. The robot's own controller compensates gravity in torque mode,
-    so nothing does here. The wrench is estimated from the external joint torques; there is no wrist sensor. `start`
-    waits for the first status. Nothing is sent until statuses have been sound for the settling time; then the torques
-    are blended in, and the arm stays where it is.
+    Commands are joint torques, statuses are joint states. The robot's own controller compensates gravity in torque
+    mode, so this station does not. The wrench is estimated from the external joint torques; there is no wrist sensor.
+    `start` waits for the first status. Nothing is sent until statuses have been valid for the settling time; then the
+    torques are blended in, and the arm stays where it is.
 
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
-    `TorqueSafetyLimiter` measurements and torques. They stop the arm, the output ``fault`` has the reason, and `resume`
-    ends the stop. A `Clock` calls `receive` before each step. Besides every station's ports there are these outputs;
-    those of the joints have the names of Drake's own stations, after the driver's name and a dot:
+    `TorqueSafetyLimiter` measurements and torques. Each of them can stop the arm; the output ``fault`` is then the
+    reason, and `resume` ends the stop. A `Clock` calls `receive` before each step. In addition to every station's ports
+    there are these outputs. As in Drake's own stations, the driver's name and a dot precede the names of joint ports:
 
     =====================  =====  =====================================================================================
     output                 size   meaning
     =====================  =====  =====================================================================================
     `fault`                1      reason of a stop, a code of `Fault`
-    `arm_state`            1      a number of `ArmState`
+    `arm_state`            1      lifecycle state of the arm, a number of `ArmState`
     `position_measured`    n      joint positions [rad]
     `velocity_estimated`   n      joint velocities [rad/s]
-    `state_estimated`      2n     both
+    `state_estimated`      2n     joint positions and velocities
     `torque_external`      n      torques of the surroundings on the joints [Nm], with the same sign for every driver
     `torque_commanded`     n      torques that are sent [Nm]
     =====================  =====  =====================================================================================
@@ -111,8 +111,8 @@ class HardwareStation(Station):
 
         Args:
             workcell: Target frame and held workpiece; the fixture is real.
-            driver: Connection to the robot, or the name of a driver that is opened at `robot_url`; by default that with
-                the robot's name.
+            driver: Connection to the robot, or the name of a driver that is opened at `robot_url`; by default the
+                driver with the robot's name.
             impedance: Impedance at the tool center.
             period: Period of a command [s]; the driver's by default.
             wrench_time_constant: Time constant of the wrench estimate's low-pass filter [s].
@@ -123,13 +123,13 @@ class HardwareStation(Station):
             limits: Limits of measurements and torques; `safety_limits` by default.
             status_limits: Limits of a status; by default they follow from the joints' velocities, the period and the
                 driver's hold-off.
-            tare: Subtract the wrench that is measured after the start, when the tool must be free, from the output
-                `wrench`. The limits of safety use the wrench without it.
+            tare: True subtracts the wrench that is measured after the start, when the tool must be free, from the
+                output `wrench`. The safety limits apply to the wrench before the subtraction.
             control_period: Time between commands of a skill [s], a whole multiple of `period`.
 
         Raises:
             InputError: If the robot has no driver, the address is unusable, the settling time is shorter than the
-                driver's hold-off, or the control period is no multiple of the driver's.
+                driver's hold-off, or the control period is no multiple of `period`.
         """
         super().__init__()
         robot = find_robot(robot)
@@ -159,7 +159,7 @@ class HardwareStation(Station):
             "status",
             StatusWatchdog(model.plant, self.status_limits, torque_tolerance(self.limits), period=period),
         )
-        # Heartbeats come as often as statuses, and may be late by as much again.
+        # Heartbeats are sent with the statuses, and may be twice as late.
         self._heartbeat = builder.AddNamedSystem(
             "heartbeat", HeartbeatMonitor(period=period, timeout=2.0 * MAX_MISSED_MESSAGES * period)
         )
@@ -220,7 +220,7 @@ class HardwareStation(Station):
         if isinstance(self.driver, PoseDriver):
             limited_pose, arm_state = rate_limiter.get_limited_pose_output_port(), limiter.get_arm_state_output_port()
             add_pose_publisher(builder, self.driver, model, limited_pose, arm_state, period)
-            # The robot's own controller has the torques: velocities are compared with positions only.
+            # The torques of the robot's own controller are unknown: velocities are compared with positions only.
             no_torque = builder.AddSystem(ConstantVectorSource(np.zeros(n)))
             builder.Connect(no_torque.get_output_port(), status.get_torque_input_port())
         else:
@@ -263,7 +263,7 @@ class HardwareStation(Station):
     get_arm_state_output_port = output_getter("arm_state", "arm's state, (1,), a number of `ArmState`")
 
     def start(self, simulator: Simulator) -> None:
-        """Initialize a simulator that contains this station: wait for the robot, and hold its pose.
+        """Wait for the robot's first status, and initialize a simulator that contains this station.
 
         Raises:
             InputError: If no status arrives in time.
@@ -280,7 +280,7 @@ class HardwareStation(Station):
         simulator.Initialize()
 
     def receive(self, context: Context, clock: float | None = None) -> None:
-        """Take in the newest status and heartbeat before a step.
+        """Read the newest status and heartbeat before a step.
 
         Args:
             context: The root context.
@@ -310,11 +310,11 @@ class HardwareStation(Station):
         return self._heartbeat.is_alive(self.GetSubsystemContext(self._heartbeat, context))
 
     def copy_state_from(self, context: Context, other: HardwareStation, other_context: Context) -> None:
-        """Continue the control of the arm where another station on the same driver has left off, without a gap.
+        """Copy the state of another station on the same driver, so that it continues to control the arm without a gap.
 
         Args:
             context: This station's own context, initialized.
-            other: A `clone` of this station, or its original.
+            other: Station that has controlled the arm: a `clone` of this station, or the original of this clone.
             other_context: The other station's own context.
         """
         context.SetStateAndParametersFrom(other_context)
@@ -357,10 +357,10 @@ class HardwareStation(Station):
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 
     def max_torque_shares(self, positions: np.ndarray) -> np.ndarray:
-        """Return the share of each joint's torque limit that the impedance's wrench needs at most, (n,).
+        """Return the largest joint torques of the impedance's wrench, as shares of their limits, (n,).
 
         The wrench is limited along and about each axis of the target separately; the worst corner of that box counts.
-        Above 1 the torque limiter clips; the driver would stop at more than 1 / `TORQUE_SHARE`.
+        The torque limiter clips at 1; without it, the driver's reflex would stop the arm at 1 / `TORQUE_SHARE`.
 
         Args:
             positions: Joint positions, (n,) [rad].

@@ -45,7 +45,7 @@ from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.wrench_sensor import WrenchSensor
 
-WRENCH_ESTIMATE_TIME_CONSTANT = 0.05  # of the filter of a wrench that is estimated from joint torques [s]
+WRENCH_ESTIMATE_TIME_CONSTANT = 0.05  # filter time constant of a wrench estimated from joint torques [s]
 # Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.
 MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
@@ -83,7 +83,7 @@ def add_arm(
 ) -> ArmModel:
     """Add the arm at the world's origin, the tool, and the workpiece to a plant that is not finalized.
 
-    Robot and end effector are given themselves or by name; `as_rigid` makes an open gripper one body.
+    `robot` and `end_effector` are objects or names; `as_rigid` makes an open gripper one rigid body.
     """
     robot, end_effector = find_robot(robot), find_end_effector(end_effector)
     arm = add_robot(plant, robot)
@@ -103,10 +103,10 @@ def controller_model(
     robot: Robot | str = DEFAULT_ROBOT,
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
 ) -> tuple[MultibodyPlant, ArmModel]:
-    """Return a plant with the arm only, for its controller: without fixture, offsets and joints of the tool.
+    """Return the controller's plant: arm, tool and workpiece without fixture, offsets and joints of the tool.
 
     Raises:
-        InputError: If the robot's model has other joints than the arm's.
+        InputError: If the robot's model has other joints than those in `Robot.joints`.
     """
     robot = find_robot(robot)
     plant = MultibodyPlant(0.0)
@@ -124,7 +124,7 @@ def controller_model(
 class ArmControllerPlant(ControllerPlant):
     """Model of an arm for its controller.
 
-    The posture is half way through the workpiece's quarter turn, so that both ends are equally far.
+    The posture is half way through the workpiece's quarter turn, equally far from both ends of the turn.
 
     Attributes:
         arm: The arm in the plant.
@@ -136,7 +136,7 @@ class ArmControllerPlant(ControllerPlant):
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
     ):
-        """Construct the model; robot and end effector are given themselves or by name."""
+        """Construct the model; `robot` and `end_effector` are objects or names."""
         plant, self.arm = controller_model(workcell, robot, end_effector)
         super().__init__(plant, self.arm.target, self.arm.tool_center, np.array(find_robot(robot).home))
         self.posture = self.solve(MID_TURN_POSE, self.posture)
@@ -181,8 +181,8 @@ class ArmOptions(ContactOptions):
 class ArmStation(Station):
     """Arm under a Cartesian impedance controller, and a workcell.
 
-    The rotors' reflected inertia makes the arm slower than the gantry, and stable with a controller that is as slow as
-    the plant's step. With a gripper as the end effector, the station has two more ports:
+    The rotors' reflected inertia makes the arm slower than the gantry, so that it is stable with a controller that is
+    evaluated only once per plant step. With a gripper as the end effector, the station has two more ports:
 
     ==================  =========  ====================================================================================
     port                size       meaning
@@ -191,10 +191,10 @@ class ArmStation(Station):
     `gripper_state`     2n         output: their positions and velocities
     ==================  =========  ====================================================================================
 
-    A gripper's force is limited by its actuators. For controller and wrench sensor it is a rigid, open tool.
+    A gripper's force is limited by its actuators. Controller and wrench sensor model it as a rigid, open tool.
 
-    With `joint_torque`, `wrench` is estimated from joint torques that have errors, as by a `HardwareStation`, and the
-    wrist's exact wrench is the port `exact_wrench`.
+    If `joint_torque` is given, `wrench` is estimated from joint torques with errors, as in a `HardwareStation`, and the
+    port `exact_wrench` is the exact wrench at the wrist.
 
     Attributes:
         estimates_wrench: True if the wrench is estimated from joint torques.
@@ -219,8 +219,8 @@ class ArmStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of plant and controller [s]; `PLANT_PERIOD` by default, half of it with a gripper:
-                its fingers would penetrate the workpiece.
+            time_step: Time step of plant and controller [s]; `PLANT_PERIOD` by default, half of it with a gripper,
+                whose fingers would otherwise penetrate the workpiece.
             wrench_time_constant: Time constant of the wrench sensor's low-pass filter [s].
             robot: The arm, or its name: see `robot_names()`.
             end_effector: The tool, or its name: see `end_effector_names()`.
@@ -281,7 +281,7 @@ class ArmStation(Station):
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
     def joint_range(self, margin: float, min_singular_value: float) -> JointRange:
-        """Return constraints on a commanded pose by the joints that it takes near the null-space posture."""
+        """Return constraints on the joint positions that belong to a commanded pose; see `JointRange`."""
         model = self._controller_plant
         return JointRange(model.plant, model.target, model.tool_center, model.posture, margin, min_singular_value)
 

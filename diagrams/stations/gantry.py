@@ -1,4 +1,4 @@
-"""Gantry station: tool center on six impedance-controlled joints; faster than real time because it has no arm."""
+"""Gantry station: tool center on six impedance-controlled joints, which simulate faster than an arm."""
 
 from __future__ import annotations
 
@@ -103,12 +103,12 @@ class GantryStation(Station):
             impedance: Impedance at the tool center.
             time_step: Time step of the plant [s]; default: half of `CONTROL_PERIOD`, a quarter for "cartesian".
             wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
-            impedance_control: "joint" or "cartesian", see above.
+            impedance_control: "joint" or "cartesian", see `GantryStation`.
             control_period: Time between commands [s], a whole multiple of the time step.
 
         Raises:
             InputError: If the time step is too long for a Cartesian controller with this impedance, or the control
-                period is no multiple of it.
+                period is no multiple of the time step.
         """
         super().__init__()
         builder = DiagramBuilder()

@@ -1,4 +1,4 @@
-"""Impedance of a station: that of a Cartesian controller, or that of joints which have springs and dampers."""
+"""Impedance control of a station: by a Cartesian controller, or by joints with springs and dampers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from guiderail.systems.energy_tank import EnergyTank
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.reference_governor import ReferenceGovernor
 
-TANK_CAPACITY = 5.0  # [J] a multiple of the work of an insertion; only an adversary empties it
-# Least mass [kg] and moment of inertia [kg m²] that a damper is designed for: less dissipation refills a tank less.
+TANK_CAPACITY = 5.0  # capacity of the energy tank [J], a multiple of the work of an insertion
+# Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. The damping for them is a lower bound of the
+# dissipation that refills a tank.
 LEAST_MASS, LEAST_INERTIA = 1.5, 2e-3
 
 
@@ -57,7 +58,7 @@ def add_controller(
 def add_energy_tank(
     builder: DiagramBuilder, impedance: Impedance, period: float, pose: OutputPort
 ) -> EnergyTank | None:
-    """Add the tank in front of a bounded impedance, sampled with `period` [s]; without a bound there is none."""
+    """Add the energy tank of a bounded impedance, sampled with `period` [s]; return None if there is no bound."""
     if impedance.bound is None:
         return None
     stiffness, masses = np.array(impedance.stiffness), np.repeat([LEAST_MASS, LEAST_INERTIA], 3)
@@ -80,7 +81,8 @@ def add_impedance_control(
 ) -> OutputPort:
     """Add the controller of a robot, sampled with `period` [s], and export the ports of a station.
 
-    The ports are the joints' positions and velocities, (2n,), and the wrench, (6,). Returns that of the torques, (n,).
+    `state` is the port of the joint positions and velocities, (2n,), and `wrench` that of the measured wrench, (6,).
+    Returns the port of the joint torques, (n,).
     """
     controller, monitor = add_controller(
         builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity
@@ -129,7 +131,7 @@ def add_joint_impedance(
         pose: Port of the joint positions, (6,).
         state: Port of the joint positions and velocities, (12,).
         wrench: Port of the measured wrench, (6,).
-        impedance_wrench: Port of the forces of the joints, (6,).
+        impedance_wrench: Port of the forces and torques of the joints, (6,).
         control_period: Time between commands [s].
 
     Returns:

@@ -45,11 +45,12 @@ class MujocoContact:
     """Parameters of MuJoCo's contact and integration, equal for all objects.
 
     Attributes:
-        time_step: Time step [s], rounded so that the station's is a multiple of it.
+        time_step: Time step of the engine [s], rounded so that the station's time step is a multiple of it.
         time_constant: Time constant of a contact [s]; the engine needs at least two time steps.
         impedance: Constraint impedance of a contact, between 0 and 1.
         friction_ratio: Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
-        spring_step: Natural frequency times time step of a spring; its body is heavy enough for explicit integration.
+        spring_step: Natural frequency of a spring times time step. It determines the mass of the spring's body, which
+            must be heavy enough for explicit integration.
     """
 
     time_step: float = 0.001
@@ -69,7 +70,7 @@ def mujoco_model(
 ) -> mujoco.MjModel:
     """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
-    Surfaces and inertia of a body are in its frame. A `period` [s] is a whole number of steps.
+    Surfaces and inertia of a body are in its frame. The engine's time step divides the station's `period` [s].
 
     Raises:
         InputError: If MuJoCo is not installed, or there are more kinds of pairs than a contact mask has bits.
@@ -86,13 +87,13 @@ def mujoco_model(
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     option = spec.option
     option.timestep = period / max(round(period / contact.time_step), 1)
-    option.gravity = [0.0, 0.0, 0.0]  # as in the gantry in Drake
+    option.gravity = [0.0, 0.0, 0.0]  # as in Drake's gantry station
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = contact.friction_ratio
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations, option.tolerance = 100, 1e-10
-    option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # [m]; these contacts are 1 µm deep
+    option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # tolerance [m]; these contacts are 1 µm deep
 
     # The tool is added first, so that its joints are the first.
     tool = spec.worldbody.add_body(
@@ -210,7 +211,7 @@ class MujocoStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine's is shorter.
+            time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine steps faster.
             wrench_time_constant: Time constant of the wrench's low-pass filter [s].
             contact: Parameters of contact and integration.
             control_period: Time between commands [s], a whole multiple of the time step.
@@ -270,7 +271,7 @@ def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Work
     """Add fixture, tool and workpiece to a plant without joints, and finalize it."""
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     workcell.add_fixture(plant)
-    if plant.num_bodies() != 2:  # with the world
+    if plant.num_bodies() != 2:  # world and fixture
         raise InputError(f"station='mujoco' has a fixture of one body, and {type(workcell).__name__} adds another")
     fixture = plant.get_body(BodyIndex(1))
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))

@@ -24,7 +24,7 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
 
-OBSTACLE_Z = -0.035  # below the robot, which passes over the drawn obstacle [m]
+OBSTACLE_Z = -0.035  # height of drawn obstacles, below the robot that passes over them [m]
 OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
 
 
@@ -34,8 +34,8 @@ class PlaneConfig:
 
     The robot is a light ball on two prismatic joints, each with a limited proportional force against viscous friction
     that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
-    mm, is much less than a wall's thickness. Otherwise it is critically damped: it reaches a command within a control
-    step and does not overshoot.
+    mm, is much less than a wall's thickness. Otherwise its position control is critically damped: the
+    robot reaches a command within a control step and does not overshoot.
 
     Attributes:
         plant_period: Time step of the plant [s].
@@ -85,7 +85,7 @@ class PlaneStation(Station):
     the force of each joint beyond its limit [N]. ``query`` is the scene graph's, for cameras.
 
     `walls` and `robot_radius` of the world are simulated; `goal`, `goal_radius`, `zone_x`, `obstacle`,
-    `obstacle_radius`, `obstacles` and `obstacles_move` are only drawn, and have their effect by constraints,
+    `obstacle_radius`, `obstacles` and `obstacles_move` are only drawn; they act through the constraints,
     terminations and rewards of a task.
     """
 
@@ -97,7 +97,7 @@ class PlaneStation(Station):
         A `control_period` [s], a whole multiple of the plant's period, replaces that of the `config`.
 
         Raises:
-            InputError: If it is no such multiple.
+            InputError: If `control_period` is no whole multiple of the plant's period.
         """
         super().__init__()
         if control_period is not None:
@@ -107,7 +107,7 @@ class PlaneStation(Station):
         self.world, self.config = world, config
         self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
-        # updates of the same instant, and a system that samples the pose would get it one plant step late.
+        # updates of the same instant, so a system that samples the pose would get that of the next plant step.
         plant_config = MultibodyPlantConfig(
             time_step=config.plant_period,
             discrete_contact_approximation="lagged",
@@ -194,7 +194,7 @@ def _add_robot(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfi
 
 
 def _add_walls(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> None:
-    # `walls` are those for the robot's center, larger than the real ones by its radius.
+    # `walls` bound the robot's center, so they are larger than the real walls by the robot's radius.
     for name, lower, upper in zip(("left_wall", "right_wall"), *world.walls, strict=True):
         size = upper - lower - 2 * world.robot_radius
         X_WG = RigidTransform([*(lower + upper) / 2, 0.0])

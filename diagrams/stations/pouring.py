@@ -30,7 +30,7 @@ MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 # Above the speed of any guidance, so that the controller does not limit it.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
 
-WRENCH_TIME_CONSTANT = 0.02  # of the wrench sensor's low-pass filter [s]
+WRENCH_TIME_CONSTANT = 0.02  # time constant of the wrench sensor's low-pass filter [s]
 
 METAL = (0.55, 0.58, 0.62, 1.0)
 WOOD = (0.80, 0.68, 0.50, 1.0)
@@ -50,7 +50,7 @@ class PouringConfig:
         num_balls: Number of balls.
         p_WStand: Point of the table's surface under the nominal mug [m].
         stand_height: Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
-        grip: Distance of the thermos's axis from the flange [m]; both axes are perpendicular.
+        grip: Distance of the thermos's axis from the flange [m]; the axes of thermos and flange are perpendicular.
         grip_height: Distance of the grip from the thermos's tip [m].
         plant_period: Time step of the plant [s].
         substeps: Plant steps per control step.
@@ -85,11 +85,11 @@ class PouringConfig:
     def stack(self) -> np.ndarray:
         """Return the positions of the balls in the upright thermos, in the frame of its tip, (n, 3) [m].
 
-        They are at the left and right wall alternately, each as low as possible.
+        The balls touch the left and right wall alternately, each as low as possible.
         """
         radius = self.ball.diameter / 2
         offset = self.thermos.inner_diameter / 2 - radius
-        # Each ball touches the previous one, or the one before that, which is below it.
+        # Each ball touches the previous ball or, directly below it, the ball before the previous one.
         step = max(np.sqrt(max(self.ball.diameter**2 - (2 * offset) ** 2, 0.0)), radius)
         i = np.arange(self.num_balls)
         return np.stack([offset * (-1.0) ** i, 0.0 * i, -self.thermos.depth + radius + i * step], axis=1)
@@ -149,7 +149,7 @@ class PouringStation(Station):
         self.config = config
         self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
-        # updates of the same instant, and a system that samples a pose would get it one plant step late.
+        # updates of the same instant, so a system that samples a pose would get that of the next plant step.
         plant_config = MultibodyPlantConfig(
             time_step=config.plant_period,
             contact_model="point",
@@ -282,7 +282,7 @@ def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
     """Return a mug with these dimensions [m].
 
     Raises:
-        InputError: If a ball does not fit, or the arm cannot reach.
+        InputError: If the balls do not fit into the mug, or the mug is too large for the arm.
     """
     if not ball.diameter * 1.25 <= inner_diameter <= 0.2 or not ball.diameter * 1.5 <= depth <= 0.25:
         raise InputError(

@@ -19,9 +19,9 @@ class StationKind:
 
     Attributes:
         name: Name for `station=`.
-        build: Function from a world and options by name to a station.
-        world: Kind of world that it works on, such as "workcell" for a workpiece and a fixture.
-        options: Model of its environment options; None if it has none.
+        build: Function that builds the station from a workcell and options by name.
+        world: Kind of workcell that the station needs, such as "workcell" for a workpiece and a fixture.
+        options: Class of the station's environment options; None if it has none.
         description: Summary in one line.
         is_simulated: True for a simulation: a reset can set its state.
     """
@@ -45,12 +45,12 @@ STATIONS: Registry[StationKind] = Registry(
 def register_station(
     name: str, *, world: str, options: type[Options] | None = None, is_simulated: bool = True
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
-    """Return a decorator that registers a class or function, which builds a station from a world and options.
+    """Return a decorator that registers a class or function that builds a station from a workcell and options.
 
     Args:
         name: Name for `station=`.
-        world: Kind of world that it works on.
-        options: Model of its environment options.
+        world: Kind of workcell that the station needs.
+        options: Class of the station's environment options.
         is_simulated: True for a simulation.
     """
 
@@ -63,5 +63,5 @@ def register_station(
 
 
 def stations_for(world: str) -> list[str]:
-    """Return the names of the stations that work on a kind of world."""
+    """Return the names of the stations for a kind of workcell."""
     return [name for name in STATIONS.names() if STATIONS.declared(name, "world") == world]

@@ -4,14 +4,15 @@ Data sheets and papers that the numbers come from, by their number in docs/bibli
 
 - An arm with joint torque sensors [25]: at the tool a noise of 0.035 N and 0.005 Nm, a repeatability of 0.15 N and
   0.05 Nm, and an accuracy of 0.8 N and 0.15 Nm.
-- Another one [26]: pose repeatability of 0.15 mm, joint torques accurate to 2 % of the largest ones.
+- Another such arm [26]: pose repeatability of 0.15 mm, joint torques accurate to 2 % of the largest torque.
 - An arm with a sensor at its flange [27]: precision of 3.5 N and 0.2 Nm, accuracy of 4 N and 0.3 Nm.
 - A wrist sensor [28]: resolution of 0.0125 N and 0.00075 Nm, uncertainty of about 1 % of the range.
 - An identified dynamic model of the first arm, with friction [29].
 
 Noise of 0.01 % of a joint's largest torque gives the first arm's tool the noise of its data sheet; friction of 0.02 %
 stays within its repeatability. Offsets and errors of the model are much larger before the tare: newtons at the tool.
-Strain gauges drift with their temperature, hardly within one episode. docs/robot.md has what results for each arm.
+Strain gauges drift with temperature, but hardly within one episode. docs/concepts/robustness.md has the resulting
+errors of each arm.
 """
 
 from __future__ import annotations
@@ -24,19 +25,21 @@ from guiderail.models.common.transforms import MM
 Sensing = Literal["exact", "wrist", "robot"]
 
 TARE_SKIPPED, TARE_AVERAGED = 3, 5
-"""Control steps before and during the tare. Every shipped task begins in free motion that lasts longer."""
+"""Numbers of control steps before and during the tare. Every shipped task begins with a longer free motion."""
 
 
 @dataclass(frozen=True)
 class JointTorqueAccuracy:
-    """Errors of an arm's external joint torques; uniformly sampled every episode up to these values.
+    """Errors of an arm's external joint torques.
+
+    Except for the standard deviations, each value is the limit of an error that is sampled uniformly every episode.
 
     Attributes:
         gain: Relative error of a torque.
         offset: Offset of a sensor, as a fraction of the joint's largest torque.
-        friction: Friction that a sensor measures, as such a fraction.
-        drift: Standard deviation of a sensor's drift after `DRIFT_TIME`, as such a fraction.
-        noise: Standard deviation of a sensor's noise, as such a fraction.
+        friction: Friction that a sensor measures, as a fraction of that torque.
+        drift: Standard deviation of a sensor's drift after `DRIFT_TIME`, as a fraction of that torque.
+        noise: Standard deviation of a sensor's noise, as a fraction of that torque.
         mass: Relative error of the mass of each link.
         center: Error of the center of mass of each body in each direction [m].
         payload: Error of the mass of tool and workpiece [kg].
@@ -59,16 +62,16 @@ class SensorErrors:
     Attributes:
         wrench_scale: Smallest and largest factor of the measured wrench, sampled every episode.
         wrench_bias: Largest offset of each component, sampled every episode.
-        wrench_drift: Standard deviation of a random walk after `DRIFT_TIME`.
+        wrench_drift: Standard deviation of the wrench's random walk after `DRIFT_TIME`.
         wrench_gradient: Largest change of the bias per radian that the tool turns about each axis.
         wrench_noise: Standard deviation of white noise.
         wrench_delay: Smallest and largest delay in control steps, sampled every episode.
-        calibration_error: Largest constant error of the arm's kinematics, sampled every episode. Commands and
-            measurements have it, so that the tool is elsewhere than the arm measures.
-        pose_resolution: Resolution of a measured pose, from that of the encoders.
+        calibration_error: Largest constant error of the arm's kinematics, sampled every episode. It affects commands
+            and measurements alike, so that the actual pose of the tool differs from the measured pose.
+        pose_resolution: Resolution of a measured pose, which follows from the encoders' resolution.
         tare: Subtract the wrench of the episode's first control steps, which are free motion.
-        joint_torque: On an arm, errors of joint torques, in place of scale, bias, drift, gradient and noise; None for a
-            wrench sensor at the wrist.
+        joint_torque: Errors of an arm's joint torque sensors, which replace the scale, bias, drift, gradient and noise
+            of the wrench on an arm; None if the wrench is measured at the wrist.
     """
 
     wrench_scale: tuple[float, float] = (1.0, 1.0)
@@ -110,4 +113,4 @@ SENSING: dict[Sensing, SensorErrors] = {
         **_KINEMATICS,
     ),
 }
-"""Errors of each setting. Without an arm, "robot" has the errors at the tool that joint torques cause on one."""
+"""Errors of each setting. On a station without an arm, "robot" has wrench errors like those of joint torque sensors."""

@@ -67,11 +67,11 @@ CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
 MAX_HALVINGS = 7
 TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
-COMMAND_TIMEOUT = 0.1  # age above which a command with a time stamp is stale, or two control periods if longer [s]
+COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; two control periods if that is longer
 
-# Limits of the force along x, y and z in relation to a limit of its norm: the box lies inside the ball.
+# Force limits along x, y and z as fractions of the limit of the norm; the box of these limits lies inside the ball.
 FORCE_SHARES = (0.45, 0.45, 0.75)
-CONTACT_STIFFNESS = 1e5  # [N/m] of workpiece, grasp and fixture in series, in an impact
+CONTACT_STIFFNESS = 1e5  # stiffness of workpiece, grasp and fixture in series during an impact [N/m]
 
 
 class ContactOptions(Options):
@@ -92,7 +92,7 @@ class ContactOptions(Options):
                 f"it is the control period, {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} "
                 "times halved"
             )
-        # Its multiples are exact: see `round_period`.
+        # Multiples of this value are exact: see `round_period`.
         return CONTROL_PERIOD / 2 ** round(halvings)
 
 
@@ -104,8 +104,8 @@ class Impedance:
         stiffness: Stiffness [N/m], [Nm/rad].
         damping_ratio: Damping ratio of every mode.
         limits: Largest forces [N] and torques [Nm].
-        bound: Bound of the wrench and of the approach speed inside the limits, along [x y z Rx Ry Rz]; None: the
-            limits alone.
+        bound: Bound of the wrench and of the approach speed, within `limits`, in the order [x y z Rx Ry Rz]; None:
+            only `limits` apply.
     """
 
     stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)
@@ -124,8 +124,8 @@ class Impedance:
     def with_max_force(self, force: float) -> Impedance:
         """Return the same impedance, bounded so that the norm of its force is below `force` [N].
 
-        A limit is never raised. The shares of the axes favor z, along which workpieces are inserted. The approach speed
-        is limited for contacts of `CONTACT_STIFFNESS`.
+        No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed is
+        limited for contacts of `CONTACT_STIFFNESS`.
         """
         from guiderail.models.control.wrench import WrenchBound
 
@@ -137,10 +137,10 @@ class Impedance:
 
 
 def whole_multiple(period: float, unit: float, name: str = "control_period") -> float:
-    """Return the exact multiple of `unit` [s] that a period [s] of a given name is.
+    """Return a period [s] as an exact multiple of `unit` [s]; `name` is its name in error messages.
 
     Raises:
-        InputError: If it is none.
+        InputError: If the period is not a whole multiple of `unit`.
     """
     number = round(period / unit)
     if number < 1 or abs(number * unit - period) > 1e-6:
@@ -149,7 +149,7 @@ def whole_multiple(period: float, unit: float, name: str = "control_period") -> 
 
 
 def command_timeout(period: float) -> float:
-    """Return the age above which a command is stale [s], where commands come with `period` [s]."""
+    """Return the age [s] above which a command is stale, for commands that are sent every `period` [s]."""
     return max(COMMAND_TIMEOUT, 2.0 * period)
 
 
@@ -168,7 +168,7 @@ class Station(Diagram):
         plant: The simulated plant.
         scene_graph: Its scene graph.
         control_period: Time between commands [s].
-        wraps_angles: True if the pose's angles are in (−π, π] and jump there; those of a gantry are unbounded.
+        wraps_angles: True if the pose's angles jump at the ends of (−π, π]; the angles of a gantry are unbounded.
     """
 
     plant: MultibodyPlant
@@ -222,9 +222,9 @@ class Station(Diagram):
         raise InputError("joint_margin needs the joints of an arm: choose station=arm, or leave it out")
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiply friction and modulus of all contacts until the next reset; `context` is the root context.
+        """Multiply the friction and modulus of all contacts by factors until the next reset, in the root context.
 
-        The modulus is the hydroelastic one, or another engine's stiffness.
+        The modulus is Drake's hydroelastic modulus, or the contact stiffness of another engine.
         """
         own = self.scene_graph.GetMyMutableContextFromRoot(context)
         inspector = self.scene_graph.model_inspector()
@@ -290,7 +290,7 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
 
 
 def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:
-    """Add a plant with hydroelastic contact of compliant primitives.
+    """Add a plant with hydroelastic contact that falls back to point contact.
 
     Raises:
         InputError: If the time step is not positive.
@@ -338,7 +338,7 @@ def export_station_ports(
     command_timed_out: OutputPort,
     max_wrench: InputPort | None = None,
 ) -> None:
-    """Export the ports of every station, and `max_wrench` if it has a bounded impedance."""
+    """Export the ports of every station, and `max_wrench` if the station has a bounded impedance."""
     if max_wrench is not None:
         builder.ExportInput(max_wrench, "max_wrench")
     builder.ExportInput(desired_pose, "desired_pose")

@@ -40,7 +40,7 @@ class Workcell(Protocol):
 
 @runtime_checkable
 class ConvexWorkcell(Protocol):
-    """Interface of a workcell whose contacts engines other than Drake can compute, too."""
+    """Interface of a workcell that engines other than Drake can simulate, such as MuJoCo."""
 
     def fixture_surfaces(self) -> list[Surface]:
         """Return the contact surfaces of the fixture, in its body's frame."""
@@ -76,7 +76,7 @@ class MovableWorkcell(ABC):
 
     @property
     def X_WT(self) -> RigidTransform:
-        """Pose of the target: the workpiece in the nominal fixture."""
+        """Pose of the target in the world: that of the workpiece assembled in the nominal fixture."""
         return self.X_WF @ self.X_FT
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
@@ -93,12 +93,12 @@ class MovableWorkcell(ABC):
         return body
 
     def set_fixture_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
-        """Move the fixture so that the task is done at X_TTactual instead of at the target."""
+        """Move the fixture so that the task is done at the pose X_TTactual relative to the nominal target."""
         X_WF = self.X_WT @ X_TTactual @ self.X_FT.inverse()
         plant.GetFrameByName("fixture_mount").SetPoseInParentFrame(plant_context, X_WF)
 
     def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PWorkpiece: RigidTransform) -> None:
-        """Move the workpiece in the tool."""
+        """Place the workpiece at X_PWorkpiece relative to the tool center."""
         plant.GetFrameByName("grasp").SetPoseInParentFrame(plant_context, X_PWorkpiece)
 
     def workpiece_in_target(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
@@ -114,7 +114,7 @@ def exclude_contacts(
     workpiece: str,
     pairs: Iterable[tuple[Iterable[str], Iterable[str]]],
 ) -> None:
-    """Exclude contact between pairs of surfaces of the fixture's and the workpiece's body, named in this order.
+    """Exclude contact between surfaces of fixture and workpiece; each pair names the fixture's surfaces first.
 
     `drake:collision_filter_group` in an SDF file filters whole bodies only.
     """

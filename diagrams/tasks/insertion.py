@@ -29,8 +29,8 @@ MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one
 
 
 FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]
-# Center and scale of an observed force limit [N]; they do not depend on the range, so that a policy can be evaluated
-# with another one.
+# Center and scale of an observed force limit [N]; they do not depend on `force_limit_range`, so that a policy can be
+# evaluated with another range.
 LIMIT_CENTER, LIMIT_SCALE = 20.0, 10.0
 
 
@@ -70,7 +70,7 @@ class ForceOptions(Options):
 
 
 def max_wrench(force_limit: float) -> np.ndarray:
-    """Return the value (8,) of a station's `max_wrench` with which its force stays below a limit [N]."""
+    """Return the value (8,) of a station's `max_wrench` that keeps the impedance's force below a limit [N]."""
     bound = Impedance().with_max_force(force_limit).bound
     assert bound is not None
     return bound.numbers
@@ -106,7 +106,7 @@ class InsertionTask(Task):
     Attributes:
         workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
         fixture: Name of the fixture's body.
-        simulated_rewards: Rewards that need components of this signal that a robot cannot measure.
+        simulated_rewards: Rewards that use components of the workpiece's pose that a robot cannot measure.
         offsets: Sampler of the offsets; it stores the hidden values of a run.
     """
 
@@ -121,8 +121,8 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
-        On hardware `observable_success` computes it from the robot's own pose, if the task defines it. A sampled force
-        limit is the signal `force_limit`, and it bounds the station's force.
+        On hardware the pose is estimated from the robot's own pose, if the task defines `observable_success`. A sampled
+        force limit is the signal `force_limit`, and it bounds the station's force.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -130,7 +130,7 @@ class InsertionTask(Task):
         sampled = self._force_limit_range
         if sampled is None:
             return {}
-        # The smallest one applies until a reset samples another, as on hardware.
+        # The smallest force limit applies until a reset samples another one.
         limit = EpisodeConstant(builder, "force_limit", 1, np.array(sampled[:1]))
         self.episode_constants["force_limit"] = limit
         if station.HasInputPort("max_wrench"):
@@ -144,7 +144,7 @@ class InsertionTask(Task):
         return getattr(self.options, "force_limit_range", None)
 
     def force_limit_terms(self) -> tuple[ObservationTerm, ...]:
-        """Return the observation of a sampled force limit, or nothing; symmetry transformations leave it unchanged."""
+        """Return the term of a sampled force limit, or no term; symmetry transformations leave the limit unchanged."""
         return () if self._force_limit_range is None else (ObservationTerm("force_limit", LIMIT_CENTER, LIMIT_SCALE),)
 
     def _add_workpiece_pose(self, builder: DiagramBuilder, station: Station) -> dict[str, OutputPort]:
@@ -168,12 +168,12 @@ class InsertionTask(Task):
     def observable_success(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return D (6, 6) and y0 (6,) of the estimate D X_TP + y0 of the workpiece's pose from the robot's pose X_TP.
 
-        With None, the default, the task cannot be learned on hardware.
+        If it returns None, the default, the task cannot be learned on hardware.
         """
         return None
 
     def impedance(self) -> Impedance | None:
-        """Return an impedance with a force below the force limit, unless `bounded_force` is an option and off."""
+        """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""
         if not getattr(self.options, "bounded_force", True):
             return None
         return Impedance().with_max_force(self.collision.above)
@@ -240,14 +240,14 @@ class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal."""
 
     isotropic_groups = ((0, 1, 2), (3, 4, 5))
-    options: Any  # with `start_offset_max`
+    options: Any  # must have `start_offset_max`
 
     @abstractmethod
     def constraints(self) -> LinearConstraints:
         """Return the bounds of every commanded pose."""
 
     def keep_out(self) -> KeepOut:
-        """Return no walls: safe residual learning is projected to the constraints alone."""
+        """Return no walls: safe residual learning is limited by the constraints alone."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:

@@ -60,7 +60,7 @@ def reference_of_file(path: Path, components: int | None, floor: tuple[float, ..
     return _REFERENCES[key]
 
 
-# A fit takes seconds. The key has the digest of the file: `create-task` moves its folder.
+# Fitted trajectories, because a fit takes seconds. A key has the file's digest, as `create-task` moves the folder.
 _REFERENCES: dict[tuple[bytes, int | None, tuple[float, ...]], ReferenceTrajectory] = {}
 
 
@@ -91,8 +91,8 @@ class HiddenOffsets(ABC):
         self._run: Any = None
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the offsets (2,) [m] of fixture and workpiece; `options` are an instance of `InsertionReset`."""
-        # Every reset takes the same samples, used or not, so that the samples of an episode depend only on its seed.
+        """Return the offsets (2,) [m] of fixture and workpiece; `options` is an instance of `InsertionReset`."""
+        # Every reset draws the same samples, used or not, so that the samples of an episode depend only on its seed.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)
         if self._run is None or options.new_run:
@@ -114,7 +114,7 @@ class HiddenOffsets(ABC):
         """Return the offsets for the option `offset`."""
 
 
-_HELD_OUT_STREAM = 0x8E1D  # last seed word of the held-out stream; that of training is 0
+_HELD_OUT_STREAM = 0x8E1D  # last seed word of the held-out stream; the training stream has 0
 
 
 def episode_stream(rng: np.random.Generator, held_out: bool) -> np.random.Generator:

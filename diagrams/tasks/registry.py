@@ -34,8 +34,8 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
         name: Name of the task; it may have a namespace of its own, as in "lab/Peg".
 
     Raises:
-        InputError: When it decorates, if another task has that name, a required method is missing, or a declaration has
-            the wrong type.
+        InputError: When the decorator is applied, if another task has that name, a required method is missing, or a
+            declaration has the wrong type.
     """
 
     def add(task: TaskClass) -> TaskClass:
@@ -55,7 +55,7 @@ def known_tasks() -> list[str]:
 
 
 def check_task_name(name: object) -> None:
-    """Refuse a name without a task, without importing any task.
+    """Check that a task with this name exists, without importing any task.
 
     Raises:
         InputError: If there is no such task.
@@ -65,7 +65,7 @@ def check_task_name(name: object) -> None:
 
 
 def _check(name: str, task: type[Task]) -> None:
-    """Refuse a task class that lacks a method or declares something of the wrong type."""
+    """Raise an InputError if a task class lacks a method or declares something of the wrong type."""
     from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions
 
     if inspect.isabstract(task):
@@ -89,7 +89,7 @@ def _check(name: str, task: type[Task]) -> None:
 
 
 def check_num_steps(name: str, num_steps: Any) -> None:
-    """Refuse a number of control steps that an episode cannot have.
+    """Check a task's number of control steps in an episode.
 
     Raises:
         InputError: If it is not a whole number of at least 1.

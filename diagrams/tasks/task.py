@@ -39,7 +39,7 @@ class EpisodeConstant:
     """Episode-constant signal, set at reset, usable by observations, rewards and terminations."""
 
     def __init__(self, builder: DiagramBuilder, name: str, size: int, default: np.ndarray | None = None):
-        """Add its source to the builder; until a reset sets them, the values are `default`, (size,), or zero."""
+        """Add the source; until a reset sets the values, they are `default`, (size,), or zero."""
         values = np.zeros(size) if default is None else np.array(default, dtype=float)
         self._source = builder.AddNamedSystem(name, ConstantVectorSource(values))
 
@@ -81,14 +81,14 @@ class Task(ABC):
 
     `build_task_diagram` wires what a subclass declares. Reward terms, termination terms and observation terms name
     signals. A signal is an output port of the station, of the guidance or of `signals`, or `action` or `termination`.
-    With the prefix "last_" it is the value one control step earlier.
+    A name with the prefix "last_" is the signal's value one control step earlier.
 
     Attributes:
         name: Name, set by `register_task`.
         workcell_kind: Kind of the workcell; only stations that are registered for it can be used.
-        excluded_stations: Names of stations for this kind that cannot be used nevertheless.
-        Options: Model of the task's own options, a subclass of `guiderail.Options`.
-        Reset: Model of the options of a reset, a subclass of `guiderail.ResetOptions`.
+        excluded_stations: Names of stations for this kind of workcell that the task cannot use.
+        Options: Class of the task's own options, a subclass of `guiderail.Options`.
+        Reset: Class of the options of a reset, a subclass of `guiderail.ResetOptions`.
         rewards: Values of the option `reward`; the first is the default.
         observations: Values of the option `observation`; the first is the default.
         defaults: Options of the environment by name, in place of their usual defaults, such as the guidance.
@@ -98,19 +98,19 @@ class Task(ABC):
         num_steps: Control steps of an episode; set in the class or in `__init__`.
         clip: Largest absolute value in an observation.
         collision: Signal and limit of the statistic `collisions`; default: any contact force. An evaluation omits the
-            statistic if the task does not declare it. A `TerminationTerm` that ends an episode as a collision is not
+            statistic if the task declares no signal. A `TerminationTerm` that ends an episode as a collision is not
             counted by itself.
-        statistics: Statistics of a table of episodes that only this task has; studies name them.
-        isotropic_groups: Indices of outputs of one unit, group by group; residual learning moves all outputs of a group
-            by the same amount. None: one group of all.
+        statistics: Statistics of a table of episodes that only this task has; a study may name them.
+        isotropic_groups: Groups of outputs with the same unit, as indices; in residual learning, an action of 1
+            displaces each output of a group by the same amount. None: one group of all outputs.
         pushable: True if `DiagramEnv.push` may displace the robot.
-        time_unit: A control period is a whole multiple of it [s].
+        time_unit: Time of which every control period is a whole multiple [s].
         default_control_period: Control period without the option `control_period` [s].
         config: Configuration of the environment.
         options: The task's own options, an instance of `Options`.
         control_period: Control period [s].
-        has_held_out_distribution: True if `reset` samples from a held-out distribution if `options.held_out` is true.
-            Otherwise an evaluation repeats conditions of training, and reports so.
+        has_held_out_distribution: True if `reset` can sample from a held-out distribution, with `options.held_out`.
+            Otherwise an evaluation repeats conditions of training, and its report states this.
         episode_constants: Constants that `signals` adds to a diagram and a reset sets, by name. A later environment
             with the same options reuses the diagram together with them, so no other attribute may hold systems.
     """
@@ -148,7 +148,7 @@ class Task(ABC):
         self.episode_constants: dict[str, EpisodeConstant] = {}
 
     def steps_of(self, nominal_steps: int) -> int:
-        """Return the control steps, at least one, that last as long as steps of the default control period."""
+        """Return the number of control steps, at least one, with the duration of `nominal_steps` default steps."""
         return max(round(nominal_steps * self.default_control_period / self.control_period), 1)
 
     def on_clock(self, reference: ReferenceTrajectory, time_scale: float = 1.0) -> ReferenceTrajectory:
@@ -213,8 +213,8 @@ class Task(ABC):
     def privileged_terms(self) -> Sequence[ObservationTerm]:
         """Return the terms that only a privileged critic observes, such as hidden values; none by default.
 
-        Training uses them in simulation. The policy never does. Besides the signals of other terms there is
-        `exact_wrench`, the wrench without errors of sensors.
+        Only training in simulation uses them; the policy never does. In addition to the signals of other terms, they
+        can name `exact_wrench`, the wrench without sensor errors.
         """
         return ()
 
@@ -227,9 +227,9 @@ class Task(ABC):
         """Return the terms that end an episode; the first true one is the reason."""
 
     def symmetry(self) -> Symmetry | None:
-        """Return rotations and reflections under which the task is invariant; actions displace the explored outputs.
+        """Return rotations and reflections under which the task is invariant, for actions that displace outputs.
 
-        They are ignored with guidance that is not registered with `displaces=True`.
+        They are ignored if the guidance is not registered with `displaces=True`.
         """
         return None
 
@@ -245,8 +245,8 @@ class Task(ABC):
     ) -> dict[str, Any]:
         """Sample an episode's conditions, write them into the root context and return them by name for `info`.
 
-        Rewards and terminations read the conditions as signals: they may belong to a diagram that was built for an
-        earlier environment with the same options. Attributes of the task may only hold what its next reset needs.
+        Rewards and terminations must read the conditions as signals, because an earlier environment with the same
+        options may have built their diagram. Attributes of the task may only hold what its next reset needs.
 
         Args:
             station: Station.
@@ -259,8 +259,8 @@ class Task(ABC):
     def start_within(self) -> np.ndarray | float:
         """Return the largest start offset of a reset, training or held-out, which certificates assume.
 
-        It is the distance from the demonstrations' first pose for each output, (O,), or one number for all of them.
-        Poses that a reset's options name are not included. Default: the option `start_offset_max`, or 0.
+        It is the distance from the demonstrations' first pose for each output, (O,), or one number for all outputs.
+        Starts given by reset options are not included. Default: the option `start_offset_max`, or 0.
         """
         return float(getattr(self.options, "start_offset_max", 0.0))
 

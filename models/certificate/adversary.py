@@ -1,8 +1,8 @@
 """Adversary: a search for action sequences that bring a primitive as close to its certified bounds as possible.
 
 A third of the sequences are the signs of impulse responses, which reach a bound exactly if no constraint is active. A
-third are full deflections that change sign at random. A third are variations of the worst sequence so far, which are
-kept if they are worse.
+third are actions of ±1 that change sign periodically or at random. A third are variations of one of the worst sequences
+so far, which replace this sequence if they are worse.
 """
 
 from dataclasses import dataclass, field
@@ -24,13 +24,14 @@ class AttackResult:
             and acceleration in the outputs' units per s and s².
         lower: Least commands (N, O).
         upper: Greatest commands (N, O).
-        excess: (2, A), amount by which corrections exceeded actions of ±1, in actions: at one step, and in total.
-        residue: (2, O), displacement by corrections of outputs that no action moves, beyond that of the action which
-            moves the other outputs as far: at one step, and in total.
+        excess: (2, A), excess over ±1 of the actions that are equivalent to corrected commands: at one step, and in
+            total over a sequence.
+        residue: (2, O), displacement of outputs that no action moves, by which corrected commands differ from the
+            commands of the equivalent actions: at one step, and in total over a sequence.
         steps: Number of executed steps.
         corrected: Number of steps with a correction.
-        worst: Worst value, its actions (N, A) and its start (O,) for each quantity, output, and whether a constraint
-            can be active.
+        worst: Worst value, its actions (N, A) and its start (O,), by quantity, output, and True for steps at which a
+            constraint can be active.
     """
 
     largest: dict[str, np.ndarray]
@@ -51,7 +52,7 @@ class Adversary:
         can_be_corrected: Mask (N,) of the steps at which a constraint can be active; the worst sequences are searched
             for these and for the other steps.
         seed: Seed of all random numbers.
-        attacks_budgets: If True, the variations increase the budgets of corrections, not the quantities.
+        attacks_budgets: If True, only sequences with the largest excess or residue are varied.
     """
 
     def __init__(self, loop: CertifiedLoop, can_be_corrected: np.ndarray, seed: int = 0, attacks_budgets: bool = False):
@@ -139,7 +140,7 @@ class Adversary:
         }
 
     def _sample_start(self) -> np.ndarray:
-        """Sample a corner of all starts; with a history, every other time, any start."""
+        """Sample a corner of the box of starts or, with a history, any start in the box with probability 0.5."""
         loop, rng = self._loop, self._rng
         place = rng.choice([-1.0, 1.0], len(loop.start))
         if self._past and loop.start_within.any() and rng.uniform() < 0.5:
@@ -147,7 +148,7 @@ class Adversary:
         return loop.start + place * loop.start_within
 
     def _deflections(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sample full deflections that change sign: periodically in all outputs, or at random in each."""
+        """Sample actions of ±1 that change sign: periodically for all outputs together, or at random for each."""
         steps, size = self._loop.primitive.num_steps, len(self._moved)
         dwell = self._rng.choice(DWELLS)
         if self._rng.uniform() < 0.5:
@@ -173,7 +174,7 @@ class Adversary:
         return np.where(signs == 0.0, fill, signs), start
 
     def _farthest_target(self, order: int, o: int, steps: np.ndarray) -> tuple[int, int, int, float]:
-        """Return order, output, step and side of the largest value without constraints among `steps`."""
+        """Return derivative order, output, step and sign of the largest value without constraints among `steps`."""
         steps = steps[steps >= order] if (steps >= order).any() else np.array([order])
         middle = np.diff(self._middle[:, o], order)[self._past + steps - order] * (order > 0)
         size = np.abs(np.diff(self._generators[:, o], order, axis=0)).sum(axis=1)[self._past + steps - order]

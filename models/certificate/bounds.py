@@ -4,20 +4,20 @@ Without active constraints the loop history → next command is affine and its r
 are the impulse responses. Its half-width along a direction is the sum of the absolute values of the generators along
 that direction. Three regimes are certified:
 
-- *free*: all sequences, until a constraint becomes active. Exact.
+- *free*: all sequences, until a constraint becomes active. These bounds are exact.
 - *always*: all sequences. Before the first step at which a constraint can be active in the window (history and
   horizon), the bounds are those of *free*. From then on, a constrained output is bounded by the constraints themselves.
   Without a history (KGRL), a command depends on one action only, and the actions are divided into cells. An action in
   a cell is a convex combination of the corners, with weights λ_i. The same combination v̄ = Σ λ_i v_i of the corners'
-  corrections v_i is feasible for it. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², where the
-  multipliers at a corner bound ‖v‖ from below (weak duality). So an output is within this radius, times the output's
-  largest displacement per unit of correction, of the range of the outputs at the corners. With a history, corrections
-  feed back: an output that no constraint bounds, and that is coupled to a constrained one, has no bound in this regime.
+  corrections v_i is feasible for this action. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖²,
+  where the multipliers at a corner bound ‖v‖ from below (weak duality). So an output exceeds the range of the outputs
+  at the corners by at most ‖v − v̄‖ times the output's largest displacement per unit of correction. With a history,
+  corrections feed back: an unconstrained output that is coupled to a constrained one has no bound in this regime.
 - *budgeted*, with a history: all sequences whose corrections satisfy a budget. A corrected command equals the command
   of another action, possibly outside ±1, plus a residue in the outputs that no action moves. The budget limits the
-  excess of these actions over ±1, and the residue, at one step and summed over the sequence. Both are small, because a
-  correction counteracts the action that violates a constraint. The worst case puts the corrections at the steps with
-  the largest response. The budget is an assumption about the sequence; it is not proven.
+  excess of these actions over ±1, and the residue, at one step and summed over the sequence. Excess and residue are
+  small, because a correction counteracts the action that violates a constraint. In the worst case, the corrections
+  occur at the steps with the largest response. The budget is an assumption about the sequence; it is not proven.
 """
 
 import itertools
@@ -33,8 +33,8 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 CELLS = {1: 16, 2: 24, 3: 3}  # number of actions → number of cells along each; 1 for more actions
 MAX_ACTIONS = 6  # largest number of actions whose corners are enumerated
-ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
-BORDER = 1e-6  # slack, relative to its terms, up to which a constraint counts as active
+ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
+BORDER = 1e-6  # slack of a constraint, relative to its terms, up to which the constraint counts as active
 CORNER_MARGIN = 1e-8  # margin of the corrections at corners, so that the checker's rounding cannot make them infeasible
 
 
@@ -138,7 +138,7 @@ def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.n
         spread = history_map @ generators[n : past + n].reshape(history_map.shape[1], generators.shape[2])
         spread[:, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
         size = np.abs(spread).sum(axis=1)
-        # A constraint that is almost reached counts, so that the checker's rounding cannot decide.
+        # A constraint that is almost reached counts as active, so that the result does not depend on rounding.
         limits = np.array([lower, upper])
         near = BORDER * (np.abs(value - np.where(np.isfinite(limits), limits, value)) + size)
         can_be_active[n] = bool((value - size < lower + near[0]).any() or (value + size > upper - near[1]).any())
@@ -153,7 +153,7 @@ def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.nda
     for n in map(int, np.flatnonzero(can_be_active)):
         predictions = [primitive.predict(n, action) for action in actions]
         multipliers.append([prediction.multipliers for prediction in predictions])
-        rows, lower, upper = loop.primitive.free_constraints(n)  # without the margin, for the least norms
+        rows, lower, upper = loop.primitive.free_constraints(n)  # without `CORNER_MARGIN`, for `_min_norms`
         rank = next((len(one.correction) for one in predictions if one.correction is not None), 0)
         corrections = np.array([np.zeros(rank) if one.correction is None else one.correction for one in predictions])
         free, sizes = actions @ rows.T, primitive.output_sizes(n)
@@ -173,7 +173,7 @@ def _with_margin(primitive: LcNsKmp) -> LcNsKmp:
     """Return the primitive with constraints tightened by `CORNER_MARGIN`.
 
     Raises:
-        InputError: If constraints leave no room for it.
+        InputError: If the constraints leave no room for this margin.
     """
     constraints = primitive.constraints
     tighter = np.where((constraints.G != 0.0).any(axis=-1), constraints.c + CORNER_MARGIN, constraints.c)
@@ -182,7 +182,7 @@ def _with_margin(primitive: LcNsKmp) -> LcNsKmp:
     except InputError as error:
         raise InputError("constraints that leave less than 20 nm of room can't be certified: widen them") from error
     settings = {name: getattr(primitive, name) for name in ("lambda_", "beta", "horizon", "solver")}
-    # The motion without constraints is that of the primitive, whose deviation was accepted.
+    # The deviation is not checked again: the motion without constraints is that of `primitive`, which was accepted.
     return LcNsKmp(primitive.reference, primitive.kernel, constraints=tightened, max_deviation=np.inf, **settings)
 
 
@@ -199,7 +199,7 @@ def _min_norms(
 
 
 def _squared_radius(corrections: np.ndarray, min_norms: np.ndarray) -> float:
-    """Return a bound on the squared distance of a correction in a cell from the interpolation v̄ of the corners'."""
+    """Return a bound on ‖v − v̄‖², with a correction v in a cell and the interpolation v̄ of those at the corners."""
     squared = np.sum(corrections**2, axis=1)
     distances = np.sum((corrections[:, None] - corrections) ** 2, axis=2)
     between = 0.5 * max(float(np.max((min_norms[:, None] - min_norms) ** 2 - distances)), 0.0)
@@ -220,7 +220,7 @@ def _find_coupled(primitive: LcNsKmp) -> np.ndarray:
 
 
 def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarray) -> Bounds:
-    """Combine the bounds without constraints and those of corrected commands (2, N, O), NaN where there is none."""
+    """Combine the bounds without constraints and those of corrected commands (2, N, O), NaN at other commands."""
     is_corrected = ~np.isnan(corrected_bounds[0])
     low, high = single_output_bounds(loop)
     lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)

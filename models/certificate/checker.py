@@ -1,12 +1,12 @@
-"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0: yes, 1: no, 2: no such files.
+"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0: yes, 1: no, 2: unreadable.
 
-It bounds all sequences of actions. W h is the window's mean given the history h, and C the kernel given h:
+It bounds the commands y for all actions a. W h is the window's mean given the history h, and C the kernel given h:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
-must leave room for it (docs/concepts/robustness.md has the argument). All content of the files is checked, or
-compared with the skill by `guiderail certify SKILL --verify FOLDER`: what the certificate is about, the primitive, the
-impedance and the budget. The digest detects accidents only, as anyone can compute it; a signature needs the key.
+must leave room for these errors (see docs/concepts/robustness.md). `guiderail certify SKILL --verify FOLDER` also
+compares with the skill what this program only reads: the certificate's subject, primitive, impedance and budget.
+The digest detects accidental changes only, as anyone can compute it; a signature needs the key.
 """
 
 import hashlib
@@ -26,13 +26,13 @@ Real = np.longdouble
 KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / (2 * length * length)).exp()}
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 BUDGETS = ("excess", "residue")
-AGREEMENT = 1e-4  # largest excess of a claim over what it has to be, relative to the largest value of the quantity
-BORDER = 1e-5  # slack, relative to its terms, up to which a constraint may be called active
-COMMAND_TOLERANCE = 1e-9  # largest violation of a command, as the primitive checks it, rows of unit norm
-ROUNDING = 1e-6  # smallest squared radius, relative to the squared correction
+AGREEMENT = 1e-4  # largest excess of a claim over the computed value, relative to the largest value of the quantity
+BORDER = 1e-5  # slack of a constraint, relative to its terms, up to which it may be claimed active
+COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit norm, that the primitive accepts
+ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec = 60
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
-MAX_BYTES = 2**30  # of the arrays of one file
+MAX_BYTES = 2**30  # largest size of the arrays of one file
 # First half of the SHA-256 of the assumptions: six sentences always, one for a budget, one for another period
 ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
 # Arrays of each file: kind, and shape in terms of steps, outputs, rows of constraints and rounds of multipliers
@@ -61,7 +61,7 @@ def require(condition: Any, words: str) -> None:
 
 
 def canonical(claims: dict[str, Any], *left_out: str) -> str:
-    """Return the only accepted text of claims, without some of the fields."""
+    """Return the canonical text of claims, the only accepted one, without the fields `left_out`."""
     return json.dumps({k: v for k, v in claims.items() if k not in left_out}, sort_keys=True, allow_nan=False)
 
 
@@ -111,7 +111,7 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, may_be_null: bool = F
 
 
 def fields(value: Any, names: tuple[str, ...], what: str) -> Any:
-    """Return a dictionary with exactly these keys."""
+    """Return a value that is a dictionary with exactly these keys; reject any other value."""
     require(type(value) is dict and sorted(value) == sorted(names), f"{what} has not the fields {', '.join(names)}")
     return value
 
@@ -126,7 +126,7 @@ def solve(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 def cholesky(A: np.ndarray) -> np.ndarray:
-    """Compute the lower factor of a positive definite matrix in its precision."""
+    """Compute the lower Cholesky factor of a positive definite matrix in its precision."""
     L = np.zeros_like(A)
     for j in range(len(A)):
         L[j:, j] = (A[j:, j] - L[j:, :j] @ L[j, :j]) / np.sqrt(A[j, j] - L[j, :j] @ L[j, :j])
@@ -150,7 +150,7 @@ def extended(matrix: np.ndarray) -> np.ndarray:
 
 
 class Primitive:
-    """Problem 4.5 at every step."""
+    """Optimization problem of a primitive (thesis, 4.5) at every step."""
 
     def __init__(self, p: Arrays, kernel: str):
         self.means, self.covariances, self.G, self.c = p["means"], p["covariances"], p["G"], p["c"]
@@ -192,9 +192,10 @@ class Primitive:
         return columns
 
     def window(self, n: int) -> tuple[Any, ...]:
-        """Compute the window's maps of history and action, offset, L with S = L Lᵀ, rows, bounds and a bound on errors.
+        """Compute the window's maps of history and action, offset, L with S = L Lᵀ, rows, c and two bounds on errors.
 
-        The last one is a function of the history without actions and its generators (P outs), (P outs, K).
+        The first is a function of the history without actions, (P outs,), and its generators, (P outs, K). The second
+        is multiplied by the size of the actions.
         """
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         eye, precision, r = np.eye(outs, dtype=Real), self.precisions[at], self.F.shape[1] * self.outputs
@@ -241,7 +242,7 @@ class Primitive:
         middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
         corrected, maps = np.full((2, N, outs), np.nan), np.zeros((N, outs, P * outs), dtype=Real)
         echo = np.zeros((P + N, outs, N * outs))
-        wrong, made = np.zeros((P + N, outs)), np.zeros(N * outs)  # errors of commands, and those made at each step
+        wrong, made = np.zeros((P + N, outs)), np.zeros(N * outs)  # errors of commands, and errors added at each step
         require(claimed.sum() == len(witness["multipliers"]) or P > 0, "there are not multipliers for each active step")
         for n in range(N):
             history, action, offset, L, rows, c, error, action_error = self.window(n)
@@ -281,7 +282,7 @@ class Primitive:
         return middle, spread, wrong, corrected, maps
 
     def bounds(self, p: Arrays, found: tuple[np.ndarray, ...], period: float) -> dict[str, Arrays]:
-        """Compute the quantities (N, outs) of the first two regimes."""
+        """Compute the quantities (N, outs) of the regimes "free" and "always"."""
         (middle, spread, wrong, corrected, _), P, N, outs = found, self.past, self.steps, self.outputs
         wrong = wrong + 4 * spread.shape[2] * EXTENDED * (np.abs(middle) + np.abs(spread).sum(axis=2))
         size, off, (least, greatest) = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0]), self.caps()
@@ -305,7 +306,7 @@ class Primitive:
         return {"free": free, "always": always}
 
     def budgeted(self, p: Arrays, w: Arrays, budgets: list[np.ndarray], reached: Any, period: float) -> Arrays:
-        """Compute the quantities of the third regime; any multipliers of constraints at other steps prove bounds."""
+        """Compute the quantities of the regime "budgeted"; any multipliers of constraints prove valid bounds."""
         (middle, spread, wrong, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
         first, U = int(np.argmax(w["active"])), np.flatnonzero(p["gains"] == 0)
         A, late, more = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)), dtype=Real)
@@ -341,7 +342,7 @@ class Primitive:
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
-    """Bound the commands of step n by cells; v is within ‖v̄‖² − ‖v‖² of the mean v̄ of the corners' corrections."""
+    """Bound the commands of step n by cells: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖² for the interpolation v̄ of corrections v."""
     (rows_L, rows, c, room), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / max(A, 1))) - 1
     fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
@@ -349,7 +350,7 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
     places = np.array(list(itertools.product(range(along + 1), repeat=A)))
     free = y + (2.0 * places / along - 1.0) @ by.T
     v, short = alphas @ rows_L, c - free @ rows.T
-    # Feasible in spite of rounding: the interpolation of feasible corrections is feasible for the actions between.
+    # The corrections at corners are feasible in spite of rounding; then their interpolation is feasible in the cell.
     sizes = np.abs(alphas) @ (np.abs(rows_L) @ np.abs(rows_L).T)
     require(
         (v @ rows_L.T - short >= room + 8 * len(c) * EPS * sizes).all(), f"step {n}: a correction violates a constraint"
@@ -382,7 +383,7 @@ def compare(claims: dict[str, Arrays], found: dict[str, Arrays]) -> None:
 
 
 def check_forces(impedance: Any, found: dict[str, Arrays] | None, regimes: tuple[str, ...], outputs: int) -> None:
-    """Reject forces that do not follow from the impedance and the bounds on commands, which may be unknown yet."""
+    """Reject forces that do not follow from the impedance and the bounds on commands; None: not computed yet."""
     if impedance is None:
         return
     fields(impedance, ("stiffness", "limits", "force", "rest_force"), "impedance")
@@ -404,7 +405,7 @@ def check_forces(impedance: Any, found: dict[str, Arrays] | None, regimes: tuple
 def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
     """Raise `Rejected` unless the certificate in a folder holds, and is signed with the key if there is one.
 
-    Returns the claims. Which skill they are about is compared by `guiderail certify SKILL --verify FOLDER`.
+    Returns the claims. `guiderail certify SKILL --verify FOLDER` compares them with a skill.
     """
     p, witness, claims = read(folder, key)
     require(claims["format"] == "guiderail certificate 4", "wrong format")

@@ -51,13 +51,13 @@ def certificate_files(
     Args:
         loop: Certified loop.
         certified: Bounds of the loop.
-        stiffness: Stiffness (6,) of the impedance that executes it; None if the robot has none.
-        limits: Limits (6,) of the impedance's wrench; None if the robot has none.
-        about: Task, and further information such as the run that the certificate is about; texts.
+        stiffness: Stiffness (6,) of the impedance that executes the commands; None if the robot has no impedance.
+        limits: Limits (6,) of the impedance's wrench; None if the robot has no impedance.
+        about: Texts by name that identify the skill: its task, and others such as its run.
         key: Key of the signature, at least 16 bytes; None for no signature.
 
     Raises:
-        InputError: If the checker does not know the primitive's kernel, or its clock is not even.
+        InputError: If the checker does not support the primitive's kernel, or the primitive's time steps are not equal.
     """
     name = _checked_kernel(loop)
     primitive_arrays, constraint_arrays = _subject_arrays(loop)
@@ -123,15 +123,15 @@ def compare_subject(
 ) -> str | None:
     """Return the name of the first difference between a certificate and a skill, or None.
 
-    All assumptions of the checker are compared, except for the budget: the description of the skill, its kernel,
-    period, impedance, primitive, gains, start and constraints.
+    All that the checker assumes is compared, except for the budget: the skill's description, kernel, period,
+    impedance, primitive, gains, start and constraints.
 
     Args:
         files: Content of each file of a certificate that the checker accepts.
-        loop: As in `certificate_files`, of the skill.
-        stiffness: As in `certificate_files`.
-        limits: As in `certificate_files`.
-        about: As in `certificate_files`.
+        loop: Loop of the skill.
+        stiffness: Stiffness of the skill's impedance, as in `certificate_files`.
+        limits: Limits of the skill's impedance, as in `certificate_files`.
+        about: Texts about the skill, as in `certificate_files`.
     """
     claims = json.loads(files[CERTIFICATE])
     claimed = {name: claims[name] for name in ("about", "kernel", "period")}
@@ -147,7 +147,7 @@ def compare_subject(
 
 
 def _checked_kernel(loop: CertifiedLoop) -> str:
-    """Return the name of the primitive's kernel, and refuse one without a checker."""
+    """Return the name of the primitive's kernel; raise an InputError if the checker does not support it."""
     kernel: Any = loop.primitive.kernel
     name = kernel_name(kernel)
     if name is None or name not in checker.KERNELS:

@@ -1,9 +1,9 @@
 """Bounds on commands whose corrections satisfy a budget, tightened by Lagrange multipliers of the constraints.
 
-The largest value of a direction over a zonotope is the sum of the absolute values of its generators along it. A command
-at another step satisfies its own constraints: subtracting a multiple of it from the direction, the multiplier, and
-adding the multiplier times the margin of its constraint gives another valid bound. Any multipliers prove a bound; they
-are feasible points of the dual of a linear program, which is not solved. Good ones are found by a greedy search.
+The largest value of a direction over a zonotope is the sum of the absolute values of the generators along this
+direction. Commands at other steps satisfy constraints, too: subtracting α times such a command from the direction and
+adding |α| times the margin of its constraint gives another valid bound, where α is the multiplier. Any multipliers
+prove a bound; they are feasible points of the dual of a linear program. A greedy search finds good multipliers.
 """
 
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ import numpy as np
 
 from guiderail.models.certificate.loop import Bounds, CertifiedLoop, single_output_bounds
 
-ROUNDS = 4  # constraints at other steps that tighten one bound
-MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps, and their spacing
+ROUNDS = 4  # number of constraints at other steps that tighten one bound
+MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps from the step of the bound, and their spacing
 NUM_CANDIDATES = 6  # constraints tried in each round, by their correlation with the direction
 FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares one
 
@@ -23,8 +23,8 @@ class Budget:
     """Budget of corrections: largest value at one step, and largest sum over a sequence.
 
     Attributes:
-        excess: (2, A), amount by which corrections exceed actions of ±1, in actions.
-        residue: (2, O), displacement of outputs that no action moves.
+        excess: (2, A), excess over ±1 of the actions that are equivalent to corrected commands.
+        residue: (2, O), displacement of outputs that no action moves, by corrections.
     """
 
     excess: np.ndarray
@@ -120,7 +120,7 @@ class MultiplierSearch:
         self._steps, outputs = loop.primitive.num_steps, loop.primitive.num_outputs
         moved = loop.gains != 0.0
         self._actions = self._steps * int(moved.sum())
-        self._free = self._actions + outputs  # generators without a budget: actions, then the start
+        self._free = self._actions + outputs  # number of generators without a budget: actions, then the start
         low, high = single_output_bounds(loop)
         self._margins = np.stack([middle[self._past :] - low, high - middle[self._past :]])
         self._bounded = np.flatnonzero(np.isfinite(low).any(axis=0) | np.isfinite(high).any(axis=0))

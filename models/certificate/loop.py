@@ -30,13 +30,13 @@ class CertifiedLoop:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of one regime at every step; infinite where there is none.
+    """Bounds of one regime at every step; infinite at commands without a bound.
 
     Attributes:
         lower: Least command (N, O).
         upper: Greatest command (N, O).
-        speed: Largest speed (N, O) of the change to a step from the one before [unit of the output/s].
-        acceleration: Largest acceleration (N, O), likewise [unit of the output/s²].
+        speed: Largest speed (N, O) from the previous step to this step [unit of the output/s].
+        acceleration: Largest acceleration (N, O) over this step and the two before it [unit of the output/s²].
     """
 
     lower: np.ndarray
@@ -71,7 +71,7 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds (N, O) by the constraints that involve a single output, and their tolerance."""
+    """Return bounds (N, O) by the constraints on a single output, lower and upper, widened by their tolerance."""
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))
     lower, upper = np.full((2, primitive.num_steps, primitive.num_outputs), [[[-np.inf]], [[np.inf]]])

@@ -1,4 +1,4 @@
-"""Conversion to arrays of numbers, and the cross product of two vectors."""
+"""Conversion to arrays of numbers, and small functions of vectors and sequences."""
 
 import math
 from collections.abc import Iterable

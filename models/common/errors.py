@@ -1,4 +1,4 @@
-"""Exceptions with messages for users; missing optional dependencies name the extra that installs them."""
+"""Exceptions with messages for users, and errors of missing dependencies that name the extra to install."""
 
 import reprlib
 from importlib.util import find_spec
@@ -9,7 +9,7 @@ class InputError(ValueError):
     """Error in user input: data, a file, an argument or a name.
 
     Its message is one sentence that names the problem and the remedy; the command prints it and exits with code 2. All
-    errors in user input have this type, which tells them from errors in the program.
+    errors in user input have this type, which distinguishes them from program errors.
     """
 
 
@@ -55,7 +55,7 @@ EXTRAS = {
     "onnxruntime": ("ONNX Runtime", "onnx"),
     "wandb": ("Weights & Biases", "wandb"),
 }
-"""Name of the software and of the extra by the name of the module."""
+"""Names of the software and of the extra that installs it, by the name of the module."""
 
 
 class MissingExtraError(InputError, ImportError):
@@ -63,7 +63,7 @@ class MissingExtraError(InputError, ImportError):
 
 
 def explain_missing(error: ImportError) -> MissingExtraError | None:
-    """Return the error with the remedy for a module that an extra installs; None for another module."""
+    """Return an error that names the extra to install; None if no extra installs the missing module."""
     extra = EXTRAS.get((error.name or "").partition(".")[0])
     if extra is None:
         return None
@@ -72,7 +72,7 @@ def explain_missing(error: ImportError) -> MissingExtraError | None:
 
 
 def require_extra(module: str) -> None:
-    """Refuse to go on without a module of an extra; it is not imported, because importing takes time.
+    """Check that a module of an extra is installed, without importing it, because importing takes time.
 
     Raises:
         MissingExtraError: If it is not installed.

@@ -1,4 +1,4 @@
-"""Functions run in a process of their own, because compiled libraries may abort or never return."""
+"""Execution of a function in a process of its own, because compiled libraries may abort or never return."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import resource
 from collections.abc import Callable
 from typing import Any
 
-_WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # wall time allowed per CPU time, and in addition [s]
+_WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # limit of wall time: multiple of the limit of CPU time, plus a constant [s]
 
 
 class IsolatedError(Exception):
-    """The isolated function raised, aborted, or exceeded its time limit; the message gives the reason."""
+    """Exception, abort or exceeded time limit of an isolated function; the message gives the reason."""
 
 
 def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int) -> Any:
@@ -20,8 +20,8 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
 
     Args:
         function: Function; it needs no import in the child process, which is a copy of this one.
-        arguments: Its arguments, which are not pickled.
-        cpu_seconds: Limit of its CPU time [s].
+        arguments: Arguments of the function, which are not pickled.
+        cpu_seconds: Limit of the function's CPU time [s].
 
     Raises:
         IsolatedError: If the function raised, or its process aborted or exceeded the limit.

@@ -18,8 +18,8 @@ _DIRECTIVES = (".yaml", ".yml")
 def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
     """Add the only model of a local SDF or URDF file to a plant.
 
-    Drake's `Parser` registers the remote package `drake_models`, and its constructor raises an error if
-    DRAKE_ALLOW_NETWORK forbids remote packages. The files that are read here refer to no remote package.
+    The constructor of Drake's `Parser` registers the remote package `drake_models`, and raises an error if
+    DRAKE_ALLOW_NETWORK forbids it. The variable is therefore changed meanwhile; no remote package is downloaded.
     """
     (model,) = add_models(plant, path)
     return model

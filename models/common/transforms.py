@@ -3,7 +3,7 @@
 The templates use the transforms, so that they run without Drake; they accept Drake's objects as well. Rotations are
 computed by Drake's formulas in the same order of operations, and agree with Drake's to the last bit.
 
-A pose is [x y z Rz Ry Rx], in which the thesis records and commands.
+A pose is [x y z Rz Ry Rx], the coordinates of recorded and commanded poses in the thesis.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class RotationMatrix:
         return self._R
 
     def col(self, index: int) -> np.ndarray:
-        """Return the axis of B (3,) with that number, expressed in A."""
+        """Return the axis of B with this index, (3,), expressed in A."""
         return self._R[:, index]
 
     def multiply(self, other: RotationMatrix) -> RotationMatrix:
@@ -104,7 +104,7 @@ class RigidTransform:
         return RigidTransform(R.multiply(other.rotation()), self._p + R.matrix() @ other.translation())
 
     def __matmul__(self, other: Any) -> Any:
-        """Return X_AB X_BC for a transform, or the points (3,) or (3, n) [m] expressed in A."""
+        """Return X_AB X_BC for a transform X_BC, or points (3,) or (3, n) [m] in B transformed to A."""
         if hasattr(other, "translation"):
             return self.multiply(other)
         points = self._rotation.matrix() @ np.asarray(other, dtype=float)
@@ -137,7 +137,7 @@ def rpy_rotation(roll: float, pitch: float, yaw: float) -> RotationMatrix:
 
 
 def _sin_cos(angle: float) -> tuple[float, float]:
-    """Return sine and cosine [rad]; NaN if the angle is infinite, for which `math` raises an error."""
+    """Return sine and cosine of an angle [rad]; NaN if it is not finite, because `math.sin` rejects infinity."""
     return (math.sin(angle), math.cos(angle)) if math.isfinite(angle) else (math.nan, math.nan)
 
 
@@ -196,7 +196,7 @@ def axis_angle_rotation(axis: ArrayLike, angle: float) -> RotationMatrix:
 
 
 def axis_angle(R: RotationMatrix) -> tuple[np.ndarray, float]:
-    """Return the unit axis (3,) and the angle [rad] in [0, π] of a rotation; x if the angle is zero."""
+    """Return the unit axis (3,) and the angle [rad] in [0, π] of a rotation; the axis is x if the angle is zero."""
     M = R.matrix()
     trace = float(M[0, 0]) + (float(M[1, 1]) + float(M[2, 2]))
     vector = np.empty(3)
@@ -234,7 +234,7 @@ def pose_to_transform(pose: np.ndarray) -> RigidTransform:
 
 
 def transform_to_pose(X: RigidTransform) -> np.ndarray:
-    """Return the pose (6,) of a transform, Drake's included, with a and c in (−π, π] and b in [−π/2, π/2] [m, rad]."""
+    """Return the pose (6,) of a transform, also one of Drake, with a and c in (−π, π], b in [−π/2, π/2] [m, rad]."""
     return np.concatenate([X.translation(), rpy_angles(X.rotation())[::-1]])
 
 
@@ -248,8 +248,8 @@ def pose_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Convert a generalized force along the coordinates of a pose to the wrench (6,) at P in T that does the same work.
 
-    The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These are linearly
-    dependent for b = ±π/2, near which the result is large.
+    The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are
+    linearly dependent for b = ±π/2, near which the result is large.
 
     Args:
         pose: X_TP as [x y z a b c] (6,) [m, rad].

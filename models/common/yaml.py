@@ -1,7 +1,7 @@
 """Reader of YAML files: templates, tasks, run configurations and studies.
 
 Files hold numbers, texts, lists and mappings of YAML 1.2's core schema: `yes` is a text, `1e-3` a number, and `010` a
-text instead of eight. Reading takes bounded time and memory for any content.
+text and not the number 8. Reading takes bounded time and memory for any content.
 """
 
 import re
@@ -20,9 +20,9 @@ from ruamel.yaml.resolver import VersionedResolver
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import read_bytes
 
-MAX_SIZE = 100_000  # [bytes]; a template has five thousand
-MAX_ENTRIES = 10_000  # aliases are counted as their content
-MAX_DEPTH = 30  # nested lists and mappings
+MAX_SIZE = 100_000  # largest size of a file [bytes]; a template has about 5,000
+MAX_ENTRIES = 10_000  # largest number of entries; an alias counts as many as its content
+MAX_DEPTH = 30  # largest depth of nested lists and mappings
 
 _TAG = "tag:yaml.org,2002:"
 _PATTERNS = {
@@ -33,7 +33,7 @@ _PATTERNS = {
         r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
         list("-+.0123456789"),
     ),
-    "timestamp": (r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}([Tt ].*)?", list("0123456789")),  # to be refused
+    "timestamp": (r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}([Tt ].*)?", list("0123456789")),  # recognized, then refused
     "merge": (r"<<", ["<"]),
 }
 
@@ -65,7 +65,7 @@ def parse_yaml(text: str, where: str = "text") -> Any:
         where: Name of the document for messages.
 
     Raises:
-        InputError: If it is not YAML, it has a tag, a date, a duplicate key or a key that is no text, or it is too
+        InputError: If it is not YAML, it has a tag, a date, a duplicate key or a key that is not text, or it is too
             large or too deep.
     """
     if len(text) > MAX_SIZE:
@@ -77,7 +77,7 @@ def parse_yaml(text: str, where: str = "text") -> Any:
     except ReaderError as error:
         raise InputError(f"{where} is not YAML: it holds a character that can't be printed") from error
     except MarkedYAMLError as error:
-        problem = str(error.problem).partition(" with value ")[0]  # of a duplicate key
+        problem = str(error.problem).partition(" with value ")[0]  # ends the message of a duplicate key
         mark = error.problem_mark or error.context_mark
         line = f" in line {mark.line + 1}" if mark is not None else ""
         words = shorten(", ".join(part for part in (error.context, problem) if part), 200)
@@ -87,7 +87,7 @@ def parse_yaml(text: str, where: str = "text") -> Any:
 
 
 class _Resolver(VersionedResolver):
-    """Resolver of plain scalars by `_PATTERNS`, whatever version of YAML a document claims."""
+    """Resolver of plain scalars by `_PATTERNS`, regardless of the YAML version that a document declares."""
 
     processing_version = (1, 2)
     versioned_resolver: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 (ruamel.yaml's interface)
@@ -106,11 +106,11 @@ def _make_yaml() -> YAML:
 
 
 class _RefusedError(Exception):
-    """Valid YAML that exceeds the reader's limits or uses a feature that it refuses."""
+    """Error for valid YAML that exceeds the reader's limits or uses a feature that is not accepted."""
 
 
 class _Collection:
-    """List or mapping that is being read: number of children, of entries below, and of levels below."""
+    """List or mapping that is being read: its numbers of children, of nested entries, and of nested levels."""
 
     def __init__(self, event: Any):
         self.anchor, self.is_mapping = event.anchor, isinstance(event, MappingStartEvent)

@@ -13,17 +13,17 @@ from guiderail.models.control.wrench import WrenchBound, bounded_wrench
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 
-# Towards a singular posture, the effective mass at the tool grows in the direction that is lost. Up to the first mass
-# [kg] only the impedance acts in a direction, from the second on only the posture's torque; usual are 1 to 50 kg.
+# Towards a singular posture, the effective mass at the tool grows in the lost direction. In a direction with a mass up
+# to LIGHT [kg] only the impedance acts, above HEAVY [kg] only the posture's torque; masses are usually 1 to 50 kg.
 LIGHT, HEAVY = 300.0, 3000.0
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
-_ROUNDING = 1e-9  # [N, Nm] smaller differences of wrenches are no limitation
+_ROUNDING = 1e-9  # [N, Nm] a wrench that changes by no more than this is not limited
 _SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 
 
 @dataclass(frozen=True)
 class JointTorques:
-    """Result of the law.
+    """Result of the impedance law.
 
     Attributes:
         torque: Joint torques to command (n,) [Nm].
@@ -40,8 +40,8 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
     """Compute the wrench (6,) of the potential ½ eᵀ K e with e = [p_error, 2ε].
 
     The rotational part is E(η, ε)ᵀ times that of K e with E = η I + [ε]× (Caccavale, Natale, Siciliano, Villani 1999).
-    This is the gradient of the potential, so that the spring is passive. For small errors it is K times the rotation
-    vector.
+    The wrench is the gradient of the potential, so that the spring is passive. For small errors, 2ε is the rotation
+    vector and the wrench is K e.
 
     Args:
         K: Stiffness (6, 6), symmetric, positive definite.
@@ -60,7 +60,7 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
     Args:
         K: Stiffness (6, 6), symmetric, positive definite.
         Lambda_inverse: Inverse inertia at the tool, Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6).
-        damping_ratio: ζ.
+        damping_ratio: Damping ratio ζ.
     """
     L_modes, eigenvalues = _modes(K, _root_of_inverse(Lambda_inverse))
     return (L_modes * _dampings(eigenvalues, damping_ratio)) @ L_modes.T
@@ -92,7 +92,7 @@ def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
     """Compute Λ without the directions that a singular arm has lost.
 
     Each eigenvalue, a mass m, is multiplied by a factor that falls smoothly with log m, from 1 at `LIGHT` to 0 at
-    `HEAVY`. The result equals Λ for a regular arm. It lets the posture's torque act where the tool's wrench cannot.
+    `HEAVY`. For a regular arm the result equals Λ. In lost directions, the posture's torque then acts on the tool.
 
     Args:
         Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6), positive definite, [translational, rotational].
@@ -123,18 +123,18 @@ def impedance_torques(
 ) -> JointTorques:
     """Compute τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to the torque limits.
 
-    Without a bound, the sum of spring and damper is clipped per axis: the tool never pushes with more, and it can still
-    follow a fast command, for which the two cancel. With a bound, see `bounded_wrench`. N = I − Jᵀ Λ J M⁻¹ removes the
-    part of the posture's torque that accelerates the tool.
+    Without a bound, the sum of spring and damper is clipped per axis: the tool never pushes beyond the limits, and can
+    still follow a fast command, for which spring and damper cancel. With a bound, `bounded_wrench` limits the sum.
+    N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the tool.
 
     Args:
         K: Stiffness (6, 6) in the axes of the stiffness frame.
-        damping_ratio: ζ of every mode.
+        damping_ratio: Damping ratio ζ of every mode.
         wrench_limits: Limits (6,) along the axes of the stiffness frame [N, Nm].
-        R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None if they are equal.
+        R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None: the same frame.
         p_error: Position error (3,), as in `spring_wrench`.
-        eta: Orientation error, as in `spring_wrench`.
-        epsilon: Orientation error (3,), as in `spring_wrench`.
+        eta: Scalar part of the orientation error, as in `spring_wrench`.
+        epsilon: Vector part (3,) of the orientation error, as in `spring_wrench`.
         J: Geometric Jacobian of the tool center (6, n).
         M: Mass matrix (n, n), including the reflected rotor inertia.
         v: Joint velocities (n,) [rad/s].
@@ -184,7 +184,7 @@ def impedance_torques(
 
 
 def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:
-    """Return the mass [kg] that an obstacle feels which stops the velocity (3,) of a tool that is free to turn."""
+    """Return the effective mass [kg] at the tool in the direction of its velocity (3,); the tool is free to turn."""
     square = float(velocity @ velocity)
     return square / float(velocity @ Lambda_inverse[:3, :3] @ velocity) if square > 0.0 else 0.0
 

@@ -1,4 +1,4 @@
-"""Guard of chunks: bounds, velocity and jerk of the poses that any policy commands, by projection or slowdown."""
+"""Guard of action chunks: keeps commanded poses within bounds, velocity and jerk limits, by projection or slowdown."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.qp import UnsolvableError, find_solver, solve_least_norm
 
 MODES = ("projection", "slowdown")
-RATES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)  # speeds along the chunk that a slowdown tries
-SAMPLES = 10  # of the path, per step of a chunk
-MIN_STEPS = 4  # of a chunk: it ends at rest
-MARGIN = 1e-4  # share of each limit that is left to the solver's rounding errors
+RATES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)  # relative speeds along the chunk that a slowdown tries
+SAMPLES = 10  # samples of the path per step of a chunk
+MIN_STEPS = 4  # least number of steps of a chunk, which must end at rest
+MARGIN = 1e-4  # share of each limit that is reserved for the solver's rounding errors
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class GuardedChunk:
 
     Attributes:
         outputs: Outputs (K, O).
-        rate: Speed along the chunk, relative to the chunk's; 1 with a projection.
-        is_fallback: True if no chunk within the limits was found, and the rest of the previous one is repeated.
+        rate: Speed along the path of the requested chunk, relative to the requested speed; 1 with a projection.
+        is_fallback: True if no chunk within the limits was found; `outputs` is then the rest of the previous result.
     """
 
     outputs: np.ndarray
@@ -36,18 +36,18 @@ class GuardedChunk:
 
 
 class ChunkGuard:
-    """Filter from a policy's chunk to a chunk within bounds, velocity and jerk limits, from one chunk to the next.
+    """Filter that keeps a policy's chunks, and the steps between chunks, within bounds, velocity and jerk limits.
 
     With y₋₂ … y₀ the last executed outputs and y₁ … y_K the chunk, the result is the nearest chunk (in units of the
     velocity limit) with
 
         G y_k ≥ c,   |y_k − y_{k−1}| ≤ v T,   |y_k − 3 y_{k−1} + 3 y_{k−2} − y_{k−3}| ≤ j T³,   at rest at its end,
 
-    for every output. Because a chunk ends at rest inside the bounds, the rest of it, held at its end, is within the
-    limits whatever happens; it is repeated if the solver finds no other. The mode "slowdown" preserves the path: it
-    advances along the chunk at the greatest of `RATES` whose projection stays within a tolerance of the path.
+    for every output. Because a chunk ends at rest inside the bounds, its remaining steps, followed by its last output,
+    are always within the limits; they are commanded if the solver finds no chunk. The mode "slowdown" preserves the
+    path: it advances along the chunk at the greatest of `RATES` whose projection stays within a tolerance of the path.
 
-    The limits couple the steps of an output, and outputs only where a constraint has several of them: each group of
+    The limits couple the steps of an output; a constraint on several outputs couples these outputs. Each group of
     coupled outputs has a quadratic program of its own.
 
     Args:
@@ -105,14 +105,14 @@ class ChunkGuard:
         self._past, self._plan = np.tile(start, (3, 1)), start[None]
 
     def guard(self, chunk: np.ndarray, num_executed: int | None = None) -> GuardedChunk:
-        """Return the chunk within the limits, and continue after its first steps.
+        """Return the chunk within the limits, and record its first `num_executed` steps as executed.
 
         Args:
             chunk: Requested outputs (K, O), from the next control step on; values that are not finite are refused.
             num_executed: Steps of the result that are executed before the next call; all by default.
 
         Raises:
-            InputError: If the chunk has the wrong shape or is not finite, or fewer than four steps.
+            InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite.
         """
         result = self.limit(chunk, self._past, self._plan)
         number = len(result.outputs) if num_executed is None else num_executed
@@ -121,7 +121,7 @@ class ChunkGuard:
         return result
 
     def limit(self, chunk: np.ndarray, past: np.ndarray, plan: np.ndarray) -> GuardedChunk:
-        """Return the chunk within the limits after a given past, without a change of the guard.
+        """Return the chunk within the limits after a given past, without changing the guard's state.
 
         Args:
             chunk: Requested outputs (K, O), from the next control step on.
@@ -155,7 +155,7 @@ class ChunkGuard:
             projected = self._project(path[SAMPLES::SAMPLES], past)
             if projected is None:
                 continue
-            # The result may lag behind on the path: a motion from rest does.
+            # The result may lag behind on the path, as a motion from rest does.
             is_near = (np.abs(projected[:, None] - path[None]) <= self._tolerance).all(axis=2)
             if is_near.any(axis=1).all():
                 return projected, rate

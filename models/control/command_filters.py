@@ -1,7 +1,7 @@
-"""Filters of commanded positions that depend on the last command: a barrier function, and a tangent space.
+"""Filters of commanded positions that depend on the last command: a control barrier function, and ATACOM.
 
-Both bound the change of a command from one control step to the next by constraints with rows of unit norm,
-h(y) = G y − c ≥ 0, which hold at the first command and then at every later one.
+Each filter bounds the change of a command from one control step to the next by constraints with rows of unit norm,
+h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one.
 """
 
 from typing import Protocol
@@ -13,7 +13,7 @@ from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.qp import solve_least_norm
 
-_TOLERANCE = 1e-9  # [unit of a position] by which a constraint may be violated by rounding
+_TOLERANCE = 1e-9  # largest violation that counts as rounding [unit of a position]
 
 
 class CommandLaw(Protocol):
@@ -22,11 +22,11 @@ class CommandLaw(Protocol):
     num_outputs: int
 
     def start(self, pose: np.ndarray) -> np.ndarray:
-        """Return the state (S,) of a motion that begins at a pose (O,); its first O numbers are the last command."""
+        """Return the initial state (S,) of a motion from a pose (O,); a state begins with the last command (O,)."""
         ...
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the next state (S,) for the last one and a desired command (O,), and True if it was changed."""
+        """Return the next state (S,) for the last one and a desired command (O,), and True if that was changed."""
         ...
 
 
@@ -45,7 +45,7 @@ class BarrierFilter(_LastCommand):
 
         h(y_{k+1}) ≥ (1 − γ) h(y_k)
 
-    A box to keep out of has the barrier of the face with the most clearance at the last command (a nonsmooth barrier:
+    The barrier of a box to keep out of is that of its face with the most clearance at the last command (nonsmooth:
     Glotfelter, Cortés and Egerstedt, 2017). With γ = 1 the filter is a projection.
 
     Args:
@@ -56,7 +56,7 @@ class BarrierFilter(_LastCommand):
         InputError: If γ is out of range.
 
     Attributes:
-        num_outputs: O.
+        num_outputs: Number of outputs O.
     """
 
     def __init__(self, keep_out: KeepOut, decay: float = 0.2):
@@ -66,9 +66,9 @@ class BarrierFilter(_LastCommand):
         self.num_outputs = keep_out.num_outputs
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the safe command (O,), and True if it is another than the desired one.
+        """Return the safe command (O,), and True if it differs from the desired one.
 
-        A last command outside the constraints is repeated where no allowed command is found.
+        If the last command violates a constraint and no allowed command is found, the last command is repeated.
         """
         G, c = self._keep_out.half_spaces(last)
         bounds = c + (1.0 - self._decay) * (G @ last - c)
@@ -91,18 +91,18 @@ class TangentSpaceFilter(_LastCommand):
         y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
 
     Far from a constraint this is the desired command; at a constraint it moves along it only. Constraints that the step
-    moves away from are left out, so that it can leave them. A step that would be too long for the projection at its
-    start ends at the constraint.
+    moves away from are left out, so that the command can leave them. The projection is only accurate near the
+    start of a step: a step that would cross a constraint ends at it.
 
     Args:
-        keep_out: Boxes and constraints, with their margin. A box has the face with the most clearance.
+        keep_out: Boxes and constraints, with their margin. A box is replaced by its face with the most clearance.
         width: σ, slack at which half of a motion towards a constraint remains, positive [unit of a position].
 
     Raises:
         InputError: If σ is not positive.
 
     Attributes:
-        num_outputs: O.
+        num_outputs: Number of outputs O.
     """
 
     def __init__(self, keep_out: KeepOut, width: float):
@@ -114,7 +114,7 @@ class TangentSpaceFilter(_LastCommand):
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if the step had to be shortened at a constraint.
 
-        Outside a constraint the error c − G y is corrected by the same pseudoinverse, as in the method's own law.
+        Outside a constraint the error c − G y is corrected by the same pseudoinverse, as in ATACOM.
         """
         G, c = self._keep_out.half_spaces(last)
         if not c.size:
@@ -123,14 +123,14 @@ class TangentSpaceFilter(_LastCommand):
         is_approached = (G @ step < 0.0) | (slack < -_TOLERANCE)
         near, slack = G[is_approached], slack[is_approached]
         damped = near @ near.T + np.diag((np.maximum(slack, 0.0) / self._width) ** 2)
-        error = near @ step - np.maximum(-slack, 0.0)  # the step towards the constraints, and what is missing to them
+        error = near @ step - np.maximum(-slack, 0.0)  # step towards the constraints minus their violation
         goal = last + step - near.T @ np.linalg.lstsq(damped, error, rcond=None)[0]
         is_inside = bool((G @ goal - c >= -_TOLERANCE).all())
         return (goal, False) if is_inside else (_last_allowed(last, goal, G, np.minimum(c, G @ last)), True)
 
 
 def _last_allowed(last: np.ndarray, goal: np.ndarray, G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the last point on the line from `last` to `goal`, (O,), where G y ≥ c, which holds at `last`."""
+    """Return the point (O,) nearest to `goal` with G y ≥ c on the line from `last`, which satisfies G y ≥ c."""
     slack, change = G @ last - c, G @ (goal - last)
     share = np.min(np.divide(slack, -change, out=np.ones_like(slack), where=slack + change < 0.0), initial=1.0)
     return np.asarray(last + max(share, 0.0) * (goal - last))

@@ -14,8 +14,8 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
 
     Each singular value σ below σ₀ = `REGULAR` is inverted as σ / (σ² + λ²) with λ² = σ₀² − σ², which is σ / σ₀²
     (numerical filtering after Maciejewski and Klein 1988). The result is continuous and bounded, and for a regular
-    posture it is that of the pseudoinverse. In directions that the tool has lost, the joints follow the preferred
-    velocities, so that a singular posture is left again.
+    posture it is that of the pseudoinverse. In singular directions, the joints follow the preferred
+    velocities, so that the arm leaves a singular posture.
 
     Args:
         J: Jacobian (6, n), [rotational, translational], of six joints or more.
@@ -33,7 +33,7 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
 
 
 def is_following(J: np.ndarray, v: np.ndarray, V: np.ndarray) -> bool:
-    """Return True if joint velocities v (n,) move the tool along V (6,): not elsewhere, and not a hundredth as fast."""
+    """Return True if v (n,) moves the tool along V (6,): more than 1 % of V along it and at most 10 % across it."""
     actual, desired = TOOL_SCALE * (J @ v), TOOL_SCALE * V
     squared = float(desired @ desired)
     if squared < STILL**2:

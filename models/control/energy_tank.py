@@ -1,4 +1,4 @@
-"""Energy that a moving reference and a changing bound add to a clipped spring, and its limit."""
+"""Energy that a moving reference and changing force limits add to a clipped spring, and a limit of this energy."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) -> float:
     """Return the energy [J] of springs K e that are clipped at a limit F each, the sum of Huber's functions.
 
-    ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond.
+    The energy of a spring is ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond.
 
     Args:
         stiffness: K (n,) [N/m, Nm/rad], positive.
         limits: F (n,) [N, Nm], not negative.
         error: e (n,) [m, rad].
     """
-    # A few numbers: NumPy's overhead exceeds the computation, and this runs several times at every step of a plant.
+    # Plain numbers, as NumPy's overhead would exceed the computation, which runs several times per plant step.
     energy = 0.0
     for K, F, e in zip(stiffness.tolist(), limits.tolist(), error.tolist(), strict=True):
         distance = abs(e)
@@ -30,15 +30,15 @@ def admissible_share(
     errors: tuple[np.ndarray, np.ndarray],
     energy: float,
 ) -> float:
-    """Return a share from 0 to 1 of a change of reference and limits that adds at most `energy` [J].
+    """Return the largest share from 0 to 1 of a change of reference and limits that adds at most `energy` [J].
 
-    The energy is convex in the reference, so it is searched by bisection. The share is 1 if the whole change is
-    admissible. A limit must not fall: a lower one applies at once, which takes energy from the spring.
+    The energy is convex in the reference, so the share is found by bisection. The share is 1 if the whole change is
+    admissible. No limit may decrease: a lower limit is applied at once, which removes energy from the spring.
 
     Args:
         stiffness: Stiffness (n,).
-        limits: Limits (n,) before and after.
-        errors: Reference minus measured pose (n,) before and after.
+        limits: Limits (n,) before and after the change.
+        errors: Reference minus measured pose (n,) before and after the change.
         energy: Energy that may be added [J].
     """
     before = spring_energy(stiffness, limits[0], errors[0])

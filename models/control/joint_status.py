@@ -8,7 +8,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 
-MAX_SENDERS = 8  # safety monitors whose heartbeats are told apart
+MAX_SENDERS = 8  # largest number of safety monitors whose heartbeats are distinguished
 MAX_MISSED_MESSAGES = 6  # consecutive status messages that may be missing before the arm is stopped
 
 
@@ -35,7 +35,7 @@ class Fault(IntEnum):
     """Reason for stopping the arm, in order of precedence.
 
     Attributes:
-        description: Description for messages.
+        description: Description of the fault for messages.
     """
 
     description: str
@@ -143,7 +143,7 @@ class StatusLimits:
         max_lead: Largest time by which a status may be ahead of the local clock [s], positive.
         position_jump: Largest position change beyond `velocity` times the time between two messages [rad], positive.
         velocity_jump: Largest velocity change between two messages [rad/s], positive; a collision causes changes up
-            to 1.
+            to 1 rad/s.
         position_tolerance: Largest difference between positions and integrated velocities [rad], positive.
         velocity_noise: Largest error of a velocity [rad/s], positive.
         settling_time: Time for which messages must have been valid before they are used [s], not negative. A driver

@@ -68,9 +68,9 @@ class KeepOut:
         return target, was_in_box
 
     def half_spaces(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return half spaces without the boxes that contain a position outside of them, with the margin.
+        """Return half-spaces that exclude the boxes with their margin, selected at a position.
 
-        They are the constraints, and of each box the face with the most clearance at the position.
+        The half-spaces are the constraints and, for each box, that of its face with most clearance at the position.
 
         Args:
             position: Position (O,).
@@ -130,13 +130,13 @@ class KeepOut:
             for a, b, x, y in zip(lower, upper, start, end, strict=True):
                 a, b, way = a - margin, b + margin, y - x
                 if way == 0:
-                    # Parallel to two faces: always between them, or never.
+                    # The line is parallel to two faces: always between them, or never.
                     if not a < x < b:
                         leave = -math.inf
                     continue
                 first, second = (a - x) / way, (b - x) / way
                 enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
-            # The start is outside, so that a negative value is a rounding error, or the box is behind it.
+            # The start is outside the box: a negative `enter` is a rounding error, or the box is behind the start.
             if -1e-9 <= enter < min(leave, free):
                 free = max(enter, 0.0)
         return free

@@ -1,39 +1,39 @@
-"""Sequences of messages on a bus: statuses that are not of one robot, commands that are not of one program."""
+"""Detection of a second robot or a second commanding program by the sequence of messages on a bus."""
 
 import numpy as np
 
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, JointStatus
 
-REVERSAL = 1.5  # largest change of a velocity between statuses [rad/s], as in a collision
+REVERSAL = 1.5  # largest change of a joint velocity between statuses, in a collision [rad/s]
 RESOLUTION = 1e-4  # largest error of a position, from noise and resolution [rad]
-RETURN_TIME = 1.0  # time in which a second program's commands are attributed to it [s]
-EQUAL_TIME = 0.1  # time in which two commands with the time stamp of their predecessors are a contradiction [s]
-LEAK = 1.2  # commands of one program per period, at most
-MAX_LEVEL = MAX_MISSED_MESSAGES + 2  # commands that may arrive late, at once
+RETURN_TIME = 1.0  # time within which a return to the time stamps before a jump is a contradiction [s]
+EQUAL_TIME = 0.1  # time within which a second command with its predecessor's time stamp is a contradiction [s]
+LEAK = 1.2  # largest mean number of commands of one program per period
+MAX_LEVEL = MAX_MISSED_MESSAGES + 2  # largest number of late commands that may arrive at once
 
 
 class StatusSequence:
-    """Counts the statuses that contradict their predecessors, whichever of them are read.
+    """Counter of the arriving statuses that contradict their predecessors.
 
-    A status contradicts its predecessors if it has the time stamp of one and other values, or if a position goes to and
-    fro faster than a joint can: the velocities from three consecutive statuses have opposite signs and differ by more
-    than `REVERSAL`, with `RESOLUTION` allowed for each position. Or if within two periods two of the intervals between
-    time stamps are shorter than half a period. The statuses of two robots alternate like this.
+    A status contradicts its predecessors in three cases. It has the time stamp of the last status but other values. Or
+    a joint reverses faster than it can: the velocities from three consecutive statuses have opposite signs and differ
+    by more than `REVERSAL`, with `RESOLUTION` allowed for each position. Or two intervals between time stamps within
+    two periods are shorter than half a period. Alternating statuses of two robots cause such contradictions.
 
     Attributes:
         num_conflicts: Number of contradictions.
     """
 
     def __init__(self, period: float):
-        """Construct the sequence; `period` is the nominal one [s]."""
+        """Construct the sequence of statuses with the nominal period `period` [s]."""
         self.num_conflicts = 0
         self._period, self._max_interval = period, MAX_MISSED_MESSAGES * period
         self._short_time = -np.inf  # time stamp after the last short interval [s]
         self._last: JointStatus | None = None
-        self._motion: tuple[np.ndarray, float] | None = None  # velocity from the last two positions, its margin [rad/s]
+        self._motion: tuple[np.ndarray, float] | None = None  # velocity from two positions, its margin [rad/s]
 
     def add(self, status: JointStatus) -> None:
-        """Add the next status as it arrives; one that cannot be decoded is compared with no other."""
+        """Add a status when it arrives; a status that cannot be decoded is not compared."""
         last, motion = self._last, self._motion
         self._last, self._motion = status, None
         if last is None or len(last.positions) != len(status.positions):
@@ -54,13 +54,13 @@ class StatusSequence:
 
 
 class CommandSequence:
-    """Counts the commands that cannot be of the program that sent the previous ones.
+    """Counter of commands that cannot be from the program that sent the previous ones.
 
     The commands of one program have increasing time stamps and arrive once per period; a restart sets its clock once,
-    and the network may delay commands by a few periods. These contradict that:
+    and the network may delay commands by a few periods. Three patterns contradict this:
 
-    - *Return*: time stamps that jump relative to the local clock, and then back to where the first clock has to be.
-    - *Equal time*: within `EQUAL_TIME`, two commands with the time stamp of their predecessor and other torques.
+    - *Return*: time stamps that jump relative to the local clock, and within `RETURN_TIME` jump back.
+    - *Equal time*: within `EQUAL_TIME`, two commands with the time stamp of their predecessor but other torques.
     - *Rate*: more than `LEAK` commands per period, with `MAX_LEVEL` at once.
 
     Attributes:
@@ -68,11 +68,11 @@ class CommandSequence:
     """
 
     def __init__(self, period: float):
-        """Construct the sequence; `period` is that of one program's commands [s]."""
+        """Construct the sequence of commands that one program sends every `period` [s]."""
         self.num_conflicts = 0
         self._period, self._reach = period, MAX_MISSED_MESSAGES * period
         self._last = (np.nan, -np.inf)  # time stamp of the last command, and local time of its arrival [s]
-        self._left = (np.nan, np.nan)  # the same before the last jump
+        self._left = (np.nan, np.nan)  # `_last` before the last jump of the time stamps
         self._torque = np.empty(0)
         self._equal_time = -np.inf  # local time of the last command with its predecessor's time stamp [s]
         self._level = 0.0
@@ -85,7 +85,7 @@ class CommandSequence:
             return  # the same message again
         self._level = max(self._level - LEAK * (now - received) / self._period, 0.0) + 1.0
         is_contradictory = self._level > MAX_LEVEL
-        self._level = min(self._level, MAX_LEVEL)  # so that it falls when one program is left
+        self._level = min(self._level, MAX_LEVEL)  # so that the level falls when only one program is left
         if is_equal:
             is_contradictory |= now - self._equal_time <= EQUAL_TIME
             self._equal_time = now

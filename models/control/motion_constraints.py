@@ -17,11 +17,11 @@ from guiderail.models.primitives import LinearConstraints, UnsolvableError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.qp import solve_least_norm
 
-# Distances from a shape, and from the plane of a linear constraint, that a QP aims at and that every command keeps: in
-# between there is room for the solver's tolerance.
+# Distance that the QP aims at and smaller distance that every command keeps, from a shape and from the plane of a
+# linear constraint. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
-_CUTS = 4  # linearizations of a shape to stay inside of
-_BISECTIONS = 12  # of the way from braking to the nearest command
+_CUTS = 4  # number of times that the shapes to stay inside of are linearized
+_BISECTIONS = 12  # number of bisections between the braking command and the nearest command
 
 
 class StateConstraints(Protocol):
@@ -43,9 +43,9 @@ class MotionConstraints:
     Attributes:
         linear: G y ≥ c on every command (O,), the same at every step.
         outside: Convex shapes that the commanded positions, the first D outputs, stay outside of.
-        inside: Convex shapes that they stay inside of.
-        max_speed: Largest speed of each output, (O,) [unit/s]; infinite for none, which is the default.
-        max_acceleration: Largest acceleration of each output, (O,) [unit/s²]; infinite for none, which is the default.
+        inside: Convex shapes that the commanded positions stay inside of.
+        max_speed: Largest speed of each output, (O,) [unit/s]; infinite by default.
+        max_acceleration: Largest acceleration of each output, (O,) [unit/s²]; infinite by default.
         state: Further constraints, such as joint limits.
 
     Raises:
@@ -82,7 +82,7 @@ class MotionConstraints:
         return None
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Return the largest violation of a command (O,) by itself: linear, shapes and state; negative inside."""
+        """Return the largest violation of linear, shape and state constraints by one command (O,); negative inside."""
         shapes = [-shape.distance(output[: shape.num_dims]) for shape in self.outside]
         shapes += [shape.distance(output[: shape.num_dims]) for shape in self.inside]
         further = (constraint.violation(output) for constraint in self.state)
@@ -90,20 +90,20 @@ class MotionConstraints:
 
 
 class MotionConstraintFilter:
-    """Nearest command to the desired one within `MotionConstraints`, and from which the motion can still stop.
+    """Filter that finds the nearest command within `MotionConstraints` from which the motion can still stop.
 
-    All constraints are linear in one step: the shapes to stay outside of are half-spaces, linearized at the last
-    command (`ConvexShape`: the true constraint holds, between two commands too), speed and acceleration are boxes
+    In one step all constraints are linear. The shapes to stay outside of become half-spaces, linearized at the last
+    command, so that the true constraint also holds between two commands. Speed and acceleration become boxes
 
         |y − p| ≤ v h        |y − 2 p + p'| ≤ a h²
 
     for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if a motion that
     brakes from it on a straight line at the largest deceleration stays within the constraints; otherwise the last safe
-    point of the line from braking now to that command is. Braking was verified one step earlier, so that there always
-    is a command: constraints cannot contradict each other later. If nothing but braking is left, the flag is true.
-    Without a largest acceleration braking is to repeat the last command.
+    command on the line from the braking command to the nearest one is executed. Braking was verified one step earlier,
+    so that a safe command always exists. The flag is True if only braking is left. Without a largest acceleration,
+    braking repeats the last command.
 
-    A start outside of the constraints (after a push, or where the constraints moved) is led back inside; from
+    A start outside of the constraints (after a push, or because the constraints moved) is led back inside; from
     then on every command satisfies all of them.
 
     Args:
@@ -114,8 +114,8 @@ class MotionConstraintFilter:
         InputError: If the period is not positive.
 
     Attributes:
-        num_outputs: O.
-        constraints: Argument.
+        num_outputs: Number of outputs O.
+        constraints: The constraints.
     """
 
     def __init__(self, constraints: MotionConstraints, period: float):
@@ -134,7 +134,7 @@ class MotionConstraintFilter:
     def apply(self, state: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the next state (2 O,), which begins with the command, and True if only braking was left.
 
-        A desired command (O,) that is not finite is one to brake.
+        The motion brakes if the desired command (O,) is not finite.
         """
         last, velocity = state[: self.num_outputs], state[self.num_outputs :]
         share, rest_share = self._braking(velocity)
@@ -151,7 +151,7 @@ class MotionConstraintFilter:
         upper = np.maximum(np.minimum(last + self._max_step, last + velocity + self._max_change), brake)
         goals = [c + aim]
         if (is_outside := slack < keep).any():
-            # A constraint that does not hold yet is approached almost as fast as possible, or at least not left.
+            # A violated constraint is approached almost as fast as possible, or at least not violated more.
             best = np.where(G > 0.0, G, 0.0) @ _finite(upper) + np.where(G < 0.0, G, 0.0) @ _finite(lower)
             towards = 0.9 * np.minimum(best, c + aim) + 0.1 * (c + slack)
             goals = [np.where(is_outside, towards, c + aim), kept]
@@ -163,7 +163,7 @@ class MotionConstraintFilter:
         further = [(one, max(0.0, one.violation(rest))) for one in self.constraints.state]
 
         def is_safe(command: np.ndarray) -> bool:
-            """Return True if the constraints hold from the last command to where a motion that brakes now ends."""
+            """Return True if the constraints hold from the last command via `command` to where braking ends."""
             displacement = command - last
             rest_share = self._braking(displacement)[1]
             end = command + rest_share * displacement
@@ -184,10 +184,10 @@ class MotionConstraintFilter:
         return np.concatenate([command, command - last]), safe == 0.0
 
     def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
-        """Return the shares of a displacement per step (O,) that follow when braking: of the next step, and until rest.
+        """Return the displacements of the next step and until rest when braking, as shares of the last step's (O,).
 
-        The displacement decreases by the same amount in each step, a share φ of what it is now, as large as the
-        acceleration of every output allows: the following ones are 1 − φ, 1 − 2 φ, … of it.
+        The displacement decreases by the same amount in each step, a share φ of the last step's displacement. φ is the
+        largest share that the acceleration limits of all outputs allow: the next steps are 1 − φ, 1 − 2 φ, … of it.
         """
         share = math.inf
         if self._has_acceleration:
@@ -199,7 +199,7 @@ class MotionConstraintFilter:
         return 1.0 - share, steps - 0.5 * share * steps * (steps + 1)
 
     def _linearize(self, last: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows G (F, O) and c (F,) that contain the line from the last command to where braking ends."""
+        """Return constraints G y ≥ c, G (F, O) and c (F,), for the way from the last command to where braking ends."""
         given = self.constraints
         shapes = (*given.outside, *given.inside)
         rows, bounds = np.zeros((len(shapes), self.num_outputs)), np.zeros(len(shapes))
@@ -214,7 +214,7 @@ class MotionConstraintFilter:
     def _nearest(
         self, desired: np.ndarray, G: np.ndarray, c: np.ndarray, lower: np.ndarray, upper: np.ndarray
     ) -> np.ndarray | None:
-        """Return the command (O,) nearest to the desired one with G y ≥ c, in the box, and inside of the shapes."""
+        """Return the command (O,) nearest to the desired one with G y ≥ c, in the box and in the shapes, or None."""
         cuts_G, cuts_c, command = G, c, desired
         for _ in range(_CUTS):
             missing = cuts_c - cuts_G @ desired
@@ -239,7 +239,7 @@ class MotionConstraintFilter:
         return command
 
     def _cut(self, command: np.ndarray) -> list[tuple[np.ndarray, float]]:
-        """Return half-spaces that contain the shapes to stay inside of, and not the command, which is outside."""
+        """Return half-spaces that contain the shapes to stay inside of and exclude a command outside of them."""
         cuts = []
         for shape in self.constraints.inside:
             distance, normal = shape.surface(command[: shape.num_dims])
@@ -251,5 +251,5 @@ class MotionConstraintFilter:
 
 
 def _finite(bounds: np.ndarray) -> np.ndarray:
-    """Return bounds (O,) with large numbers in place of infinite ones, which a zero can be multiplied by."""
+    """Return bounds (O,) with large numbers in place of infinite ones, because zero times infinity is NaN."""
     return np.nan_to_num(bounds, posinf=1e9, neginf=-1e9)

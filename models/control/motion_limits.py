@@ -25,7 +25,7 @@ class MotionLimits:
         """Check the limits.
 
         Raises:
-            InputError: If a limit is not positive and finite, or the angular acceleration or jerk leaves nothing for
+            InputError: If a limit is not positive and finite, or the angular limits leave no acceleration or jerk for
                 the rotation vector (`rotation_vector_limits`).
         """
         if not all(np.isfinite(limit) and limit > 0.0 for limit in (*self.linear, *self.angular)):

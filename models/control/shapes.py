@@ -3,11 +3,11 @@
 The signed distance d to a convex set is a convex function (negative inside), and its unit normal n at a point p is a
 subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, for steps of any length:
 
-- Outside: the half-space nᵀ(y − p) ≥ −d(p) has d(y) ≥ 0 everywhere. It contains p if p is outside, hence also the
-  straight line from p to every other point of it.
+- Outside: d(y) ≥ 0 everywhere in the half-space nᵀ(y − p) ≥ −d(p). The half-space contains p if p is outside the set,
+  hence also the straight line from p to every other point of the half-space.
 - The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the command keeps at least the distance that
-  the linear constraint promises. For a sphere whose center is r away from p it is at most ‖y − p‖² / (2 r), which is
-  what the half-space costs.
+  the linear constraint promises. For a sphere whose center is r away from p the error is at most ‖y − p‖² / (2 r),
+  by which the half-space is conservative.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from guiderail.models.primitives.constraints import LinearConstraints
 
 CLEARANCE = 1e-8
 """Distance that linearized constraints keep from a shape, more than the tolerance of a solver [unit of the output]."""
-_HALVINGS = 60  # of an interval until its ends are neighboring numbers
+_HALVINGS = 60  # bisections of an interval until its ends are neighboring floating-point numbers
 
 
 class ConvexShape(ABC):
@@ -48,9 +48,9 @@ class ConvexShape(ABC):
         return self.surface(p)[0]
 
     def separate(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return a half-space outside of the shape that contains the straight line from p to q, if one does.
+        """Return a half-space outside of the shape that contains the straight line from p to q, if one exists.
 
-        It is linearized at p or q if that contains both, otherwise at the point of the line nearest to the shape.
+        It is linearized at p or q if the result contains both, otherwise at the point of the line nearest to the shape.
         """
         for at, other in ((p, q), (q, p)):
             n, c = self.half_space(at)
@@ -96,7 +96,7 @@ class Sphere(ConvexShape):
         self.num_dims = len(self.center)
 
     def surface(self, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return distance and normal; at the center, where every direction is one, that along the first axis."""
+        """Return distance and normal; at the center, where the normal is not unique, the first axis."""
         offset = p - self.center
         length = math.sqrt(offset @ offset)
         normal = offset / length if length > 0.0 else np.eye(self.num_dims)[0]
@@ -185,14 +185,15 @@ def linearize(
 ) -> LinearConstraints:
     """Return linear constraints to stay outside of shapes, linearized around a reference path.
 
-    Step n has, of each shape, the half-spaces of the path's points n and n + 1. Consecutive commands therefore have a
+    Step n has two half-spaces per shape, of the path's points n and n + 1. Consecutive commands therefore have a
     half-space in common, and the straight line between them is outside of the shape too. The constraints keep
     `CLEARANCE`, so that a command that satisfies them up to the tolerance of the solver is outside.
 
     Args:
         shapes: Shapes to stay outside of.
-        path: Reference means (N, O), of which the first D outputs are positions. A point inside of a shape is
-            linearized at the nearest point of the surface; a path through the middle of a shape has no side to pass on.
+        path: Reference means (N, O), of which the first D outputs are positions. For a point inside
+            of a shape, the half-space touches the nearest point of the surface. A path through the middle of a shape
+            does not determine on which side to pass.
         linear: Further constraints of every step; none by default.
 
     Raises:

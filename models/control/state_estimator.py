@@ -12,23 +12,24 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.models.control.message_sequence import RESOLUTION
 
-ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # the status itself is valid
-# The message is dropped, and the next one is compared with its predecessor. After every other fault statuses are in
-# doubt: one is accepted only if it agrees with the prediction, until all have been valid for the settling time.
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # faults with a valid status
+# Faults after which the message is dropped, and the next one is compared with the last readable status. After all other
+# faults, statuses are in doubt: one is accepted only if it agrees with the prediction, until all have been valid for
+# the settling time.
 DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
-FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping by a velocity does not oscillate
-AGREEMENT = 0.1  # largest difference from the predicted velocity of a status that is accepted in doubt [rad/s]
+FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping with a measured velocity does not oscillate
+AGREEMENT = 0.1  # largest difference from the predicted velocity for a status in doubt to be accepted [rad/s]
 # Fraction by which the clock offset follows a status that arrives earlier than expected. With 1, a single stray message
 # would make all others late.
 EARLY_FRACTION = 0.2
-EARLY_WINDOW = 0.5  # decay time of the sum of these corrections [s]
-MAX_EARLY = 1.0 / 3.0  # largest sum of these corrections, in maximum leads: the robot's clock is too fast
+EARLY_WINDOW = 0.5  # decay time of the sum of these offset corrections [s]
+MAX_EARLY = 1.0 / 3.0  # largest sum of these corrections, in maximum leads; above it the robot's clock is too fast
 POSITION_WINDOW = 0.1  # decay time of the difference between positions and integrated velocities [s]
 REACTION_WINDOW = 0.02  # time in which the external torque must explain a change of velocity [s]
 MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
-MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # of a joint whose values must change [rad], [rad/s]
-MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # statuses with the same value of a moving joint that are a fault
-MAX_EQUAL_STATUSES = 4  # the same with all values of a joint while another joint is moving
+MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # motion [rad] and speed [rad/s] above which a joint's values must change
+MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # repetitions of a moving joint's value that are a fault
+MAX_EQUAL_STATUSES = 4  # repetitions of all values of a joint that are a fault while another joint is moving
 MODEL_ERROR, SENSOR_ERROR = 0.3, 0.1  # largest relative error of inertia times acceleration, and of external torque
 EXTERNAL_STEP = 2.0  # largest change of the predicted external torque between statuses, in torque tolerances
 LAG = 1.0  # largest delay of a velocity's filter [periods]
@@ -53,9 +54,9 @@ class EstimatorState:
         conflicts: `JointStatus.conflicts` of the last status.
         foreign_commands: `JointStatus.foreign_commands` of the last status.
         last_time: Time stamp of the last readable status [s]; NaN before the first.
-        last_offset: Its offset from the robot's clock to the local clock [s].
+        last_offset: Offset from the robot's clock to the local clock after the last readable status [s].
         accepted_time: Time stamp of the accepted status [s]; NaN before the first.
-        accepted_offset: Its clock offset [s].
+        accepted_offset: Clock offset after the accepted status [s].
         last_values: `JointStatus.values` of the last readable status, valid or not, (3n,).
         accepted_values: `JointStatus.values` of the accepted status, (3n,), with its velocity limited to the interval
             of the other two sources of the velocity; zero before the first.
@@ -67,11 +68,11 @@ class EstimatorState:
         external: External torque in the prediction, which follows the accepted one at a limited rate, (n,) [Nm].
         torque: Torques in effect until the next check, (n,) [Nm].
         variation: Last change of torques and external torques, (n,) [Nm].
-        predicted: Recent impulse of the torques, (n,) [Nms].
-        commanded: The same without the external torques, (n,) [Nms].
+        predicted: Recent impulse of all torques, (n,) [Nms].
+        commanded: Recent impulse of the torques without the external ones, (n,) [Nms].
         measured: Recent change of momentum, (n,) [Nms].
         reaction: Recent changes of velocity, (n,) [rad/s], not negative.
-        tolerance: Largest difference of predicted and measured by errors of the torques, (n,) [Nms].
+        tolerance: Largest difference of `predicted` and `measured` that errors of the torques explain, (n,) [Nms].
         bias: Learned constant error of the torques, (n,) [Nm].
     """
 
@@ -112,7 +113,7 @@ class EstimatorState:
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
-        """Return the state that `vector` returned as a vector."""
+        """Return the state from its vector, the result of `vector`."""
         values, vectors = np.split(vector[12:], [6 * num_joints])
         return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(14, -1))
 
@@ -154,8 +155,8 @@ class StateEstimator:
     `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
     with a model, for each joint:
 
-    - *Equal values*: a joint that moves, by its velocity or its positions, has the same position, or the same velocity,
-      to the bit in consecutive statuses; or any joint has the same position, velocity and external torque while another
+    - *Equal values*: no joint that moves, by its velocity or its positions, repeats its position or its velocity to the
+      bit in consecutive statuses, and no joint repeats position, velocity and external torque together while another
       joint moves.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
       the position tolerance.
@@ -168,12 +169,12 @@ class StateEstimator:
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
     One wrong source cannot move it out of the interval of the other two. While no status is accepted, the third source
     continues alone, so that damping removes the momentum once and then ends; a status that is accepted in doubt only
-    makes it smaller. The accepted velocity, with which the arm is controlled, is the reported one, limited to the
-    interval of the other two and their noise.
+    decreases the estimate. The accepted velocity, with which the arm is controlled, is the reported one, limited to the
+    interval of the other two sources, widened by the velocity noise.
 
     The clocks are synchronized with the first status. Afterwards the offset follows early statuses quickly and late
     ones slowly; after a fault or a timeout the clocks are synchronized again. Delays of this program are not attributed
-    to the robot; one that is too long is a fault of its own.
+    to the robot; a delay that is too long is reported as `DEADLINE_MISSED`.
 
     Args:
         limits: Plausibility limits of a status.
@@ -220,7 +221,7 @@ class StateEstimator:
             return self._finish(state, before, fault, now)
 
         if fault == Fault.CONFLICT and not is_doubted:
-            # The last statuses may be of the other robot; the sums contain by how much the torques contradict them.
+            # The last statuses may be from a second robot: the effect of the torques that they lack is added.
             reported = before.last_values[self._velocities]
             state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values
@@ -232,7 +233,7 @@ class StateEstimator:
         if is_comparable and not is_doubted and state.torque.any():
             state = self._update_momentum(state, M, change[self._velocities], elapsed)
         else:
-            # The sums begin with the last status.
+            # The momentum sums restart at this status.
             is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
         fault = fault or self._find_contradiction(state, M)
@@ -245,11 +246,11 @@ class StateEstimator:
             values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
             reported, velocity = velocity, np.median((velocity, *others), axis=0)
             if fault == Fault.INCONSISTENT:
-                # Two of the sources are of this status. It may be an old one, with the velocity of that time.
+                # Two of the sources come from this status, which may be old and have an outdated velocity.
                 is_old = np.abs(np.array((reported, others[0])) - state.velocity).min(axis=0) > AGREEMENT
                 velocity = np.where(is_old, state.velocity, velocity)
             if is_doubted:
-                # Damping by a late velocity drives the arm: the predicted one limits it.
+                # Damping with a late velocity would drive the arm: the predicted velocity limits it.
                 size = np.minimum(np.abs(velocity), np.abs(state.velocity))
                 velocity = np.where(velocity * state.velocity > 0.0, np.sign(velocity) * size, 0.0)
         if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING) and not is_doubted:
@@ -275,7 +276,7 @@ class StateEstimator:
     def _predict(self, before: EstimatorState, now: float, M: np.ndarray, drag: np.ndarray) -> EstimatorState:
         """Return the state with the effect of the torques since the last check."""
         step = max(now - before.check_time + self._period, 0.0)
-        # Without a recent status the external torque is unknown, and a wrong one may be what put statuses in doubt.
+        # Without a recent status the external torque is unknown, and a wrong one may be why statuses are in doubt.
         age = now - step - (before.accepted_time + before.accepted_offset)
         is_known = np.isfinite(age) and not np.isfinite(before.doubt_time)
         freshness = np.clip(2.0 - age / self._period, 0.0, 1.0) if is_known else 0.0
@@ -314,7 +315,7 @@ class StateEstimator:
         return bool((is_moving_as_predicted & (np.abs(deviation) <= self._limits.position_tolerance)).all())
 
     def _deviation(self, values: np.ndarray, change: np.ndarray, elapsed: float) -> np.ndarray:
-        """Return by how much the change of each position is not explained by the velocities, (n,) [rad]."""
+        """Return the part of each position's change that the velocities do not explain, (n,) [rad]."""
         acceleration = change[self._velocities]
         error = change[self._positions] - elapsed * (values[self._velocities] - 0.5 * acceleration)
         return np.sign(error) * np.maximum(np.abs(error) - LAG * elapsed * np.abs(acceleration), 0.0)
@@ -324,7 +325,7 @@ class StateEstimator:
     ) -> EstimatorState:
         speed, is_equal = np.abs(values[self._velocities]), change == 0.0
         equal_positions = is_equal[self._positions] & (speed * elapsed > MIN_MOTION)
-        # A velocity can be frozen close to zero, and then the positions tell that the joint moves.
+        # If a velocity is frozen close to zero, the positions show that the joint moves.
         moved = (np.abs(change[self._positions]) - 2.0 * RESOLUTION) / elapsed
         equal_velocities = is_equal[self._velocities] & (np.maximum(speed, moved) > MIN_SPEED)
         equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
@@ -338,7 +339,7 @@ class StateEstimator:
         )
 
     def _restart(self, state: EstimatorState) -> EstimatorState:
-        """Return the state without a predecessor of the status."""
+        """Return the state with the comparisons of consecutive statuses reset."""
         zero = self._zeros
         return replace(state, residual=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
 
@@ -358,7 +359,7 @@ class StateEstimator:
         )
 
     def _update_rest(self, state: EstimatorState, change: np.ndarray) -> EstimatorState:
-        """Return the state without a momentum to compare; without command its change is due to other torques."""
+        """Return the state with zero momentum sums; the bias is learned from `predicted` minus `change` (n,) [Nms]."""
         bias = self._limited_bias(state.bias - (state.predicted - change) / REST_BIAS_TIME)
         zero = self._zeros
         state = replace(state, bias=bias, predicted=zero, commanded=zero, measured=zero)
@@ -369,10 +370,10 @@ class StateEstimator:
         return np.clip(bias, -limit, limit)
 
     def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the reported velocity misses of the recent torques, (n,) [rad/s], and where it misses any.
+        """Return the effect of recent torques that the reported velocity lacks, (n,) [rad/s], and where it lacks any.
 
-        A wrong velocity misses the effect of the torques with and without the external ones; the smaller one counts. If
-        only one of the two is missing, or they differ in sign, the external torque is wrong.
+        A wrong velocity lacks the effect of the torques both with and without the external ones; the smaller effect
+        counts. If only one of the two effects is missing, or they differ in sign, the external torque is wrong.
         """
         missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
         is_missing = np.prod(np.sign(missing), axis=1) > 0.0
@@ -413,16 +414,16 @@ class StateEstimator:
     def _finish(
         self, state: EstimatorState, before: EstimatorState, fault: Fault, now: float, age: float | None = None
     ) -> Estimate:
-        """Return the result of a check; `age` is that of a status that is accepted now [s]."""
+        """Return the result of a check; `age` [s] is that of the status accepted at this check, or None."""
         is_new = age is not None
         if age is None:
             accepted_at = before.accepted_time + before.accepted_offset
             age = max(now - accepted_at, 0.0) if np.isfinite(accepted_at) else np.inf
-        # The controller of a robot that returns after a timeout with its clock set back has restarted.
+        # If a robot returns after a timeout with its clock set back, its controller has restarted.
         has_restarted = fault == Fault.OUT_OF_ORDER and before.fault == Fault.STALE
         if age > MAX_PREDICTION_TIME or has_restarted or not np.isfinite(state.velocity).all():
             state = replace(state, velocity=self._zeros)
-        # Added up instead of read from a context, so that the state can be copied to a diagram with another time.
+        # Computed and not read from a context, so that the state can be copied to a diagram with another time.
         check_time = now + self._period
         state = replace(state, check_time=check_time)
         if fault:

@@ -1,6 +1,6 @@
 """Wrenches in contact: measured on a tool, and bounded so that neither a push nor an impact exceeds a force.
 
-Vectors of six of the bound are [translational, rotational], in its axes. See `docs/concepts/forces.md`.
+Six-vectors of a bound are [translational, rotational], in the bound's axes. See `docs/concepts/forces.md`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 from guiderail.models.common.arrays import cross
 from guiderail.models.common.errors import InputError
 
-_POSE_ORDER = [0, 1, 2, 5, 4, 3]  # coordinates [x y z Rz Ry Rx] of a pose among those of a wrench
+_POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench
 
 MAX_WRENCH_SIZE = 8
-"""Numbers of a bound as a signal: six along and about the axes, and the norms of force and torque."""
+"""Size of a bound as a signal: six along and about the axes, and the norms of force and torque."""
 
 
 @dataclass(frozen=True, eq=False)  # arrays do not compare to one truth value
 class WrenchBound:
-    """Largest wrench of an impedance, per axis and as norms, and the stiffness of the contacts that it expects.
+    """Largest wrench of an impedance controller, per axis and as norms, and the contact stiffness that it assumes.
 
     Attributes:
         axes: Limits (6,) along and about the axes [N, Nm], not negative.
@@ -55,14 +55,14 @@ class WrenchBound:
         return replace(self, axes=self.axes[_POSE_ORDER])
 
     def lowered_to(self, max_wrench: np.ndarray) -> WrenchBound:
-        """Return the smaller one of this bound and another, (8,), in each number; a negative or NaN number counts as 0.
+        """Return the element-wise minimum of this bound and another (8,), whose negative or NaN numbers count as 0.
 
         A bound that arrives at run time can therefore only lower the one that a robot was configured with.
         """
         return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
 
 
-@lru_cache(maxsize=16)  # several systems ask for the same bound at every step of a plant
+@lru_cache(maxsize=16)  # several systems request the same bound at every plant step
 def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
     requested = np.frombuffer(max_wrench)
     lowest = np.minimum(bound.numbers, np.where(requested > 0.0, requested, 0.0))
@@ -85,7 +85,7 @@ def slow_down(
 ) -> np.ndarray:
     """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates to at most F / √(k m).
 
-    d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is that of `approach_impedance`. Only a force
+    d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
     that does positive work is reduced, so that no energy is added: while it moves to its rest position, the spring
     returns at most what it stored.
 
@@ -167,8 +167,8 @@ def governed_error(
     """Compute the pose error (6,) that a spring and damper may be commanded for one step of a simulation.
 
     The damper belongs to the plant, which solves it implicitly: its force in the step is K e − (K h + D) v₁ with the
-    velocity v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, the force is inside the bound if the spring's K e is,
-    reduced by (K h + D) |v₀|.
+    velocity v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, the force is inside the bound if K e is inside
+    the bound reduced by (K h + D) |v₀|.
 
     Args:
         stiffness: Stiffness (6,) K of each coordinate.
@@ -210,8 +210,8 @@ def external_wrench(
 ) -> np.ndarray:
     """Compute the external wrench on a rigid tool, F_external = M A + bias(V) − M [0, g] − F_reaction.
 
-    Spatial vectors are [rotational, translational] (6,), about one point P of the tool, and expressed in one frame,
-    which may be any.
+    Spatial vectors are [rotational, translational] (6,), about one point P of the tool, and all expressed in
+    the same arbitrary frame.
 
     Args:
         F_reaction: Wrench of the wrist on the tool (6,).

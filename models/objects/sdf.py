@@ -95,11 +95,11 @@ DRAKE_NAMESPACE = 'xmlns:drake="drake.mit.edu"'
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Hydroelastic contact parameters of a surface; they are those of the contact model, not of a material.
+    """Parameters of the hydroelastic contact model of a surface; they are not properties of a real material.
 
     Attributes:
         friction: Coefficient of static and dynamic friction.
-        modulus: Pressure at full depth [Pa]; None: rigid.
+        modulus: Pressure at full depth [Pa]; None for a rigid surface.
         resolution: Edge length of a curved primitive's mesh [m].
         dissipation: Hunt-Crossley dissipation [s/m].
         margin: Distance at which a compliant surface enters the contact computation [m], so that no step penetrates
@@ -132,27 +132,27 @@ def _proximity(material: ContactMaterial) -> str:
 
 
 def cylinder(radius: float, length: float) -> str:
-    """Return a cylinder [m] about z."""
+    """Return the SDF geometry of a cylinder about z; radius and length in [m]."""
     return f"<cylinder><radius>{radius:g}</radius><length>{length:g}</length></cylinder>"
 
 
 def box(x: float, y: float, z: float) -> str:
-    """Return a box with the given sizes [m]."""
+    """Return the SDF geometry of a box with the given sizes [m]."""
     return f"<box><size>{x:g} {y:g} {z:g}</size></box>"
 
 
 def mesh(file: str) -> str:
-    """Return a surface from an OBJ file in the folder of the SDF file."""
+    """Return the SDF geometry of a surface from an OBJ file in the folder of the SDF file."""
     return f"<mesh><uri>{file}</uri></mesh>"
 
 
 def convex_mesh(file: str) -> str:
-    """Return a convex solid, which may be compliant, from an OBJ file in the folder of the SDF file."""
+    """Return the SDF geometry of a convex solid, compliant or not, from an OBJ file in the folder of the SDF file."""
     return f"<mesh><uri>{file}</uri><drake:declare_convex/></mesh>"
 
 
 def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, pitch: float = 0.0) -> str:
-    """Return a pose in the link [m, rad]."""
+    """Return the SDF text of a pose in the link [m, rad]."""
     return f"{x:g} {y:g} {z:g} 0 {pitch:.6g} 0"
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from guiderail.models.common.transforms import MM
 
 # A seam between convex pieces that only meet would catch a sliding body, because the shortest way out of a piece is
-# sideways there. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, which makes
-# an angle of nine degrees.
+# sideways there. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, at an angle
+# of nine degrees.
 SHOULDER, BELOW = 0.3 * MM, 0.05 * MM
 
 
@@ -22,7 +22,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Box:
-    """Box with its sizes."""
+    """Box with edges along the axes of its frame."""
 
     x: float  # [m]
     y: float  # [m]
@@ -38,7 +38,7 @@ class Hull:
 
 @dataclass(frozen=True)
 class Spring:
-    """Sprung slide of a surface, for an engine whose own contact is too hard.
+    """Spring-loaded slide of a surface, for a physics engine whose contact model is too stiff.
 
     Attributes:
         axis: Direction of the slide (3,) in the body's frame.
@@ -73,11 +73,11 @@ class Surface:
 
 
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:
-    """Return the convex pieces of a polygonal ring about z, whose first corner is half a side from x.
+    """Return the convex pieces of a polygonal ring about z, whose first corner is half a side from the x axis.
 
     Args:
         profile: Corners (K, 2) of the convex section as [radius of the circle inside the polygon, height] [m].
-        num_sides: Number of sides, as for `triangle_mesh.lathe`.
+        num_sides: Number of sides, as for `sdf.lathe`.
 
     Returns:
         Vertices (4 K, 3) [m] of each piece, including shoulders.

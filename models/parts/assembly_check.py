@@ -13,9 +13,9 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import SurfaceLocator, require_module, sample_surface, to_arrays, to_manifold
 
-MAX_WALL_SLOPE = 0.5  # largest component along the axis of the normal of a wall
-MAX_RESTING_OVERLAP = 2e-6  # overlap of faces that rest on each other, by rounding [m]
-_SAMPLES = 12000  # points on the walls of a part
+MAX_WALL_SLOPE = 0.5  # largest component of a wall's normal along the axis
+MAX_RESTING_OVERLAP = 2e-6  # largest overlap that counts as rounding of faces in contact [m]
+_SAMPLES = 12000  # number of points sampled on the walls of a part
 _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a rounding error [m²]
 
 
@@ -101,7 +101,7 @@ def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> I
 
 
 def measure_side_clearance(plug: Part, socket: Part) -> float:
-    """Return the smallest distance between walls along the axis at the target [m]; infinite without such walls."""
+    """Return the smallest distance [m] between facing walls of the parts at the target; infinite if there are none."""
     walls = [_walls(part) for part in (plug, socket)]
     least = np.inf
     for (vertices, triangles), other in (walls, walls[::-1]):
@@ -109,7 +109,7 @@ def measure_side_clearance(plug: Part, socket: Part) -> float:
             continue
         points, faces = sample_surface(vertices, triangles, _SAMPLES)
         nearest, distance, face = SurfaceLocator(*other).find_nearest(points)
-        # Only walls that face each other: the distance to the back of a wall or past a corner does not count.
+        # Only walls that face each other count, not the distance to the back of a wall or past a corner.
         normals, other_normals = _normals(vertices, triangles)[faces], _normals(*other)[face]
         facing = np.einsum("ij,ij->i", normals, other_normals) < -0.7
         towards = np.einsum("ij,ij->i", normals, nearest - points) > -1e-9
@@ -119,7 +119,7 @@ def measure_side_clearance(plug: Part, socket: Part) -> float:
 
 
 def _walls(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) [m] and triangles (T, 3) of the walls of a part."""
+    """Return vertices (V, 3) [m] and triangles (T, 3) of the walls of a part, its faces along the axis."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in part.bodies)])
     triangles = np.concatenate([t + start for (_, t), start in zip(part.bodies, starts, strict=False)])
     corners = part.corners[triangles]
@@ -144,17 +144,17 @@ def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list
     return obstructions
 
 
-MAX_SHRINK = 0.5 * MM  # largest distance that is offered; parts that overlap more are not drawn assembled [m]
-_SPARE = 0.01 * MM  # clearance left by the offered distance [m]
-_VOLUME_SAMPLES = 1000  # points on the surface of a common volume
-_REGULARIZATION = 1e-3  # relative weight of a vertex that does not move along a face
+MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance; parts that overlap more are not drawn assembled [m]
+_SPARE = 0.01 * MM  # clearance left by the suggested distance [m]
+_VOLUME_SAMPLES = 1000  # number of points sampled on the surface of a common volume
+_REGULARIZATION = 1e-3  # relative weight of the motion of a vertex in the least-squares problem
 
 
 class OverlapError(InputError):
-    """The parts overlap at the target.
+    """Error raised if the parts overlap at the target.
 
     Attributes:
-        shrink: Distance by which the plug's surface would have to move inwards [m]; None if that is too much.
+        shrink: Distance by which the plug's surface would have to move inwards [m]; None if it exceeds `MAX_SHRINK`.
     """
 
     def __init__(self, message: str, shrink: float | None):
@@ -167,7 +167,7 @@ def check_target(plug: Part, socket: Part) -> None:
     """Check that the parts do not overlap with the plug at its target.
 
     Raises:
-        OverlapError: If they do, with the depth, the position, and the distance that `shrink` would need.
+        OverlapError: If they overlap, with the depth, the position, and the distance that `shrink` would need.
     """
     plug_solids, socket_solids = make_solids(plug), make_solids(socket)
     thickness, where = measure_overlap(plug_solids, socket_solids)
@@ -196,7 +196,7 @@ def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
         for other in second:
             common = one ^ other
             if not common.is_empty():
-                # Corners of the common volume lie on both surfaces: the deepest points are between them.
+                # Corners of the common volume lie on both surfaces: the deepest points are between the corners.
                 points, _ = sample_surface(*to_arrays(common), _VOLUME_SAMPLES)
                 deepest = max(deepest, float(SurfaceLocator(*to_arrays(other)).find_nearest(points)[1].max()))
     return deepest

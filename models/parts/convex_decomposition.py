@@ -17,8 +17,8 @@ _SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding err
 _CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its hull
 _FLAT = 1e-2  # angle below which an edge does not count as concave [rad]
 _MAX_PLANES = 6  # planes tried at each cut
-_SMALLEST_FACE = 2e-4  # [mm²] Drake computes the plane of each face, and fails at 5e-5
-_DIGITS = 9  # digits of meters in an OBJ file; a face may only be flat before it is rounded
+_SMALLEST_FACE = 2e-4  # smallest area of a face [mm²]; Drake cannot compute the plane of a face of 5e-5
+_DIGITS = 9  # decimal places [m] in an OBJ file; rounding may bend a flat face
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
 
@@ -49,7 +49,7 @@ def cut_into_convex_pieces(solid: Any, most: int = MAX_PIECES) -> list[Any] | No
 
 
 def _with_large_faces(convex: Any) -> Any:
-    """Return a convex solid without the vertices whose faces are too small for Drake: on an edge, or near another."""
+    """Return a convex solid without vertices whose faces are too small for Drake (near an edge or another vertex)."""
     from pydrake.geometry import Convex  # imported here because it takes half a second
 
     manifold3d = require_module("manifold3d")
@@ -73,7 +73,7 @@ def _with_large_faces(convex: Any) -> Any:
 
 
 def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
-    """Return the smallest triangle's area [mm²] with polygons cut into fans, as in Drake, and its flattest corner.
+    """Return the area [mm²] of the smallest triangle of faces cut into fans, as in Drake, and its flattest corner.
 
     `faces` holds the number of corners and the corners of each polygon.
     """
@@ -99,7 +99,7 @@ def _hollow(solid: Any) -> float:
 
 def _best_cut(solid: Any, total: float) -> list[Any] | None:
     best, smallest = None, np.inf
-    # A cut in the plane of faces meets rounding errors, which a cut slightly next to it may avoid.
+    # A cut exactly in the plane of faces suffers from rounding errors, which a slightly shifted cut may avoid.
     shift_size = 1e-5 * total ** (1 / 3)
     for normal, distance in _planes(solid):
         for shift in (0.0, shift_size, -shift_size):
@@ -123,7 +123,7 @@ def _planes(solid: Any) -> list[tuple[np.ndarray, float]]:
     normals = mesh.face_normals[faces]
     distances = np.einsum("ij,ij->i", normals, mesh.triangles_center[faces])
     rounded = np.round(np.column_stack([normals, distances / mesh.scale]), 4)
-    rounded *= np.where(rounded[:, :3].sum(axis=1) < 0, -1, 1)[:, None]  # both sides of a plane are one
+    rounded *= np.where(rounded[:, :3].sum(axis=1) < 0, -1, 1)[:, None]  # opposite normals describe the same plane
     _, first = np.unique(rounded, axis=0, return_index=True)
     ends = mesh.vertices[mesh.face_adjacency_edges[concave]]
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)

@@ -1,4 +1,4 @@
-"""Contact pieces of a compliant part that Drake accepts: degenerate ones raise an error, or abort its process."""
+"""Selection of compliant contact pieces that Drake accepts: degenerate pieces raise an error or abort the process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Piece:
     """Piece of a compliant part.
 
     Attributes:
-        body: Index of its body in `ContactSurface.bodies`.
+        body: Index of the piece's body in `ContactSurface.bodies`.
         suffix: ".obj" of a convex surface, or ".vtk" of tetrahedra.
         points: Points (P, 3) [m].
         cells: Triangles (T, 3) or tetrahedra (N, 4).
@@ -34,13 +34,13 @@ class Piece:
 
 
 def piece_text(piece: Piece) -> str:
-    """Return the file of a piece."""
+    """Return the text of a piece's OBJ or VTK file."""
     return (obj_text if piece.suffix == ".obj" else vtk_text)(piece.points, piece.cells)
 
 
 _GRIDS = (6, 5)  # decimal places [m] to which a refused convex piece is rounded, in the order of the attempts
 _NEGLIGIBLE = 1e-4  # fraction of the volume of all pieces below which a refused piece is left out
-_SECONDS = 20  # CPU time of a check [s]
+_SECONDS = 20  # largest CPU time of a check [s]
 
 
 def accepted_pieces(pieces: Sequence[Piece]) -> list[Piece] | None:
@@ -78,14 +78,14 @@ def _hull(points: np.ndarray) -> Any:
 
 
 def _rounded(piece: Piece) -> list[Piece]:
-    """Return the piece with vertices on coarser and coarser grids, as long as they span a volume."""
+    """Return copies of a piece with vertices rounded to coarser and coarser grids, if they span a volume."""
     hulls = [_hull(np.unique(np.round(piece.points, digits), axis=0)) for digits in _GRIDS]
     arrays = [to_arrays(hull) for hull in hulls if not hull.is_empty()]
     return [replace(piece, points=points, cells=cells) for points, cells in arrays]
 
 
 def _refused(pieces: Sequence[Piece]) -> set[int]:
-    """Return the indices of the pieces that Drake refuses; an abort ends a child process only."""
+    """Return the indices of the pieces that Drake refuses; an abort only ends the child process of the check."""
     try:
         return set(run_isolated(_try_each, pieces, cpu_seconds=_SECONDS))
     except IsolatedError:

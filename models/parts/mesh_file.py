@@ -19,7 +19,7 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 
 SMALLEST, LARGEST = 1e-3, 0.5  # bounds of the longest side of a part that an arm inserts [m]
 MAX_FILE_SIZE = 200_000_000  # [bytes]
-MAX_TRIANGLES = 2_000_000  # of a file
+MAX_TRIANGLES = 2_000_000  # largest number of triangles of a file
 NOTHING_REPAIRED = Repair()
 _KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
 
@@ -31,7 +31,7 @@ class Part:
     Attributes:
         path: Mesh file.
         bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, counter-clockwise as seen from outside.
-        repair: What was changed to make it a solid.
+        repair: Changes that made the mesh a solid.
     """
 
     path: Path
@@ -80,7 +80,7 @@ def load_part(path: Path, unit: str) -> Part:
         unit: Unit of the file's numbers, one of `UNITS`.
 
     Raises:
-        InputError: If the file can't be read, or the part can't be made a solid, or is of a size that no arm inserts.
+        InputError: If the file can't be read, the part can't be made a solid, or its size is out of bounds.
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
@@ -161,7 +161,7 @@ def part_sdf(
         name: Name of the model and its link.
         visual_file: OBJ file of the visual geometry.
         surfaces: Collision geometry; a compliant OBJ mesh is convex, a compliant VTK mesh
-            has tetrahedra, and a rigid mesh may be any.
+            has tetrahedra, and a rigid mesh may have any shape.
         mass: Mass [kg].
         center: Center of mass (3,) [m].
         gyration: Radius of gyration [m].

@@ -18,16 +18,16 @@ from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, req
 from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
-NO_CLEARANCE_TOLERANCE = 2e-5  # the same without walls that face each other [m]
+NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at without walls that face each other [m]
 MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [m]
 _THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
-MAX_YAW = 0.1  # rotation of the plug about its axis in a search, which widens the margin [rad]
+MAX_YAW = 0.1  # largest rotation of the plug about its axis in a search, which widens the margin [rad]
 CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 EARLY = 0.2  # fraction of the tolerance that `decimate` may use
-_LATE = 0.7  # fraction of the rest that is tried first, as the measured deviation exceeds that of `manifold3d`
+_LATE = 0.7  # fraction of the rest that is tried first, as the deviation may exceed the bound of `manifold3d`
 
 KINDS = ("convex", "tetrahedra")
-"""Kinds of pieces of a compliant part; the second is tried if nothing else seats the plug."""
+"""Kinds of pieces of a compliant part; tetrahedra are tried if no convex pieces let the plug reach its target."""
 
 Arrays = tuple[np.ndarray, np.ndarray]
 
@@ -40,7 +40,7 @@ class ContactSurface:
         bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, the snapping ones last.
         snapping: Number of the snapping bodies.
         visual: Vertices and triangles of the whole part, decimated but not cropped.
-        deviation: Largest measured distance from the drawing within what can touch [m].
+        deviation: Largest measured distance from the drawing in the regions that can touch [m].
         volume: Volume of the part [m³].
     """
 
@@ -77,7 +77,7 @@ def prepare_surfaces(
 
     Args:
         plug: Plug at its target, in the target frame, decimated by `decimate`.
-        socket: Socket, likewise.
+        socket: Socket in the target frame, decimated by `decimate`.
         motion: Motion of the plug.
         tolerance: Largest deviation of the result from the drawing [m].
         moved: Deviation of the given parts from the drawing [m].
@@ -95,9 +95,9 @@ def prepare_surfaces(
         (socket, fixed, rigid, []),
     ):
         lean = whole
-        if not snapping:  # a deflected body touches what a rigid one would not
+        if not snapping:  # a deflected body may touch where a rigid one would not
             cropped = crop_to_contact(whole, other, margin, motion.turn, is_plug=part is plug)
-            # Cropping adds edges, too: the leaner one is used.
+            # Cropping adds edges, too: the solid with fewer triangles is used.
             lean = min(whole, cropped, key=lambda solid: count_simplified(solid, _LATE * left))
         bodies = [_reduce(one, left) for one in lean.decompose()] + [simplify(one, left) for one in extra]
         surfaces.append(
@@ -118,7 +118,7 @@ def _unite(solids: Sequence[Any]) -> Any:
 
 
 def _reduce(solid: Any, tolerance: float) -> tuple[Any, float]:
-    """Return a solid with few triangles, its hull if that is near, and the deviation [mm]."""
+    """Return a solid with few triangles, or its hull if that deviates little, and the deviation [mm]."""
     simpler, moved = simplify(solid, tolerance, _LATE)
     hull, filled = as_hull_if_near(simpler, tolerance - moved)
     return hull, moved + filled
@@ -138,7 +138,7 @@ def join_bodies(surface: ContactSurface) -> Arrays:
 def make_compliant(
     kind: str, surfaces: dict[str, ContactSurface], tolerance: float, say: Callable[[str], None]
 ) -> Iterator[tuple[str, list[Piece]]]:
-    """Yield the compliant geometries to try: name of the part and its pieces, the leaner part first.
+    """Yield the compliant geometries to try: name of the part and its pieces, the part with fewer triangles first.
 
     Args:
         kind: One of `KINDS`.
@@ -165,7 +165,7 @@ def make_compliant(
 
 
 def cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
-    """Return convex pieces of all bodies; None if there are too many or they deviate."""
+    """Return convex pieces of all bodies; None if there are too many pieces or they deviate too much."""
     from guiderail.models.parts.solids import to_manifold
 
     manifold3d = require_module("manifold3d")
@@ -176,7 +176,7 @@ def cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
         if cut is None:
             return None
         joint = manifold3d.Manifold.batch_boolean(cut, manifold3d.OpType.Add)
-        added = to_arrays(joint - solid)[0]  # the other way round, seams between pieces would count
+        added = to_arrays(joint - solid)[0]  # the difference `solid - joint` would contain the seams between pieces
         if len(added) and float(SurfaceLocator(*arrays).find_nearest(added)[1].max()) > 2.0 * tolerance:
             return None
         pieces += [

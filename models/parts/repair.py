@@ -1,4 +1,4 @@
-"""Closed solids from meshes as CAD programs export them: slivers, open seams, doubled faces, cavities."""
+"""Repair of meshes exported from CAD programs to closed solids: slivers, open seams, doubled faces, cavities."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.solids import measure_distance, require_module, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
-MAX_MOVED = 1e-4  # largest distance by which a repair may move a surface, beyond which it closes a real hole [m]
+MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
 _CPU_SECONDS = 60
 _NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
@@ -87,7 +87,7 @@ def close_surface(
 
 
 def find_open_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of edges without exactly one opposite, and their center (3,) [m]."""
+    """Return the number of edges not balanced by opposite edges of other triangles, and their center (3,) [m]."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     edges = edges[edges[:, 0] != edges[:, 1]]
     low, high = edges.min(axis=1), edges.max(axis=1)

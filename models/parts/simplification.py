@@ -45,7 +45,7 @@ def count_simplified(solid: Any, tolerance: float) -> int:
 
 
 def as_hull_if_near(solid: Any, tolerance: float) -> tuple[Any, float]:
-    """Return the convex hull of a solid if it deviates by at most half the `tolerance` [mm], and the deviation [mm]."""
+    """Return a solid, or its convex hull if within half the `tolerance` [mm], and the deviation from the solid [mm]."""
     hull = solid.hull()
     if hull.volume() - solid.volume() > tolerance * solid.surface_area():
         return solid, 0.0

@@ -16,7 +16,7 @@ def require_module(module: str) -> Any:
     """Import an optional library for meshes.
 
     Raises:
-        InputError: If it is not installed.
+        InputError: If the library is not installed.
     """
     try:
         return import_module(module)
@@ -67,7 +67,7 @@ class SurfaceLocator:
 
 
 def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (P, 3) of a surface and their triangles (P,): `count` uniform samples, and up to as many corners.
+    """Return points (P, 3) of a surface and their triangles (P,): `count` uniform samples and corners.
 
     The samples are the same in every call.
     """

@@ -1,6 +1,6 @@
 """Symmetry of two parts under quarter turns about the axis and reflections.
 
-Experience can be augmented by a symmetry. On the rim, where only the outlines of tip and mouth are in contact, parts
+A learner can augment its data by a symmetry. On the rim, where only the outlines of tip and mouth are in contact, parts
 often have more symmetries than when they are assembled.
 """
 
@@ -35,7 +35,7 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
     Args:
         plug: The plug at its target, in the target frame.
         socket: The socket, in the target frame.
-        motion: Motion of the plug, which is turned back on the rim.
+        motion: Motion of the plug, which is turned by -`turn` on the rim.
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
     fixed, held = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]

@@ -28,7 +28,7 @@ def tetrahedralize(
     scale = 1e3  # tolerances of fTetWild are meant for numbers around one
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     mesher = require_module("pytetwild")
-    with TemporaryDirectory() as folder, chdir(folder):  # it writes a file into the current folder
+    with TemporaryDirectory() as folder, chdir(folder):  # the mesher writes a file into the current folder
         points, cells = mesher.tetrahedralize(
             np.ascontiguousarray(scale * vertices),
             np.ascontiguousarray(triangles, dtype=np.int32),
@@ -64,7 +64,7 @@ def boundary_of(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def add_interior_points(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split each tetrahedron all of whose corners are on the boundary, where the pressure is zero, at its center."""
+    """Split each tetrahedron at its center if all its corners are on the boundary, where the pressure is zero."""
     faces = np.concatenate([cells[:, corners] for corners in _FACES])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     is_outer = np.zeros(len(points), bool)

@@ -12,7 +12,7 @@ from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 TOLERANCE = 1e-9
 """Largest accepted violation of a command, a distance from the constraint's plane (1 nm if outputs are meters)."""
 _EPS = float(np.finfo(float).eps)
-_ROUNDING = 64 * _EPS  # contradiction that rounding of the rows explains, relative to c and to the output
+_ROUNDING = 64 * _EPS  # largest contradiction due to rounding of the rows, relative to c and to the output
 
 
 class LinearConstraints:
@@ -46,7 +46,7 @@ class LinearConstraints:
         self._normalize()
         self._interior = self._find_interior()
         for values in (self.G, self.c):
-            values.setflags(write=False)  # primitives of a process share it
+            values.setflags(write=False)  # primitives of a process share these arrays
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike) -> "LinearConstraints":
@@ -87,7 +87,7 @@ class LinearConstraints:
 
     @classmethod
     def none(cls, num_outputs: int) -> "LinearConstraints":
-        """Return constraints with F = 0."""
+        """Return a set of no constraints, F = 0."""
         return cls(np.zeros((0, num_outputs)), np.zeros(0))
 
     @property
@@ -106,7 +106,7 @@ class LinearConstraints:
         return self.G.shape[0] if self.G.ndim == 3 else None
 
     def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return G (n, F, O) and c (n, F) at steps (n,); a step past the end has the constraints of the last one."""
+        """Return G (n, F, O) and c (n, F) at steps (n,); a step past the end has the last constraints."""
         steps = np.asarray(steps)
         if self.G.ndim == 2:
             G, c = (np.broadcast_to(values, (len(steps), *values.shape)) for values in (self.G, self.c))
@@ -134,7 +134,7 @@ class LinearConstraints:
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
         """Compute the output (O,) within the constraints of a step that is nearest to `output` (O,).
 
-        Where the solver does not find it, the result is the first allowed point on the straight line to a point inside
+        If the solver does not find it, the result is the first allowed point on the straight line to a point inside
         the constraints, so that there is a result for every finite output.
 
         Raises:
@@ -181,7 +181,7 @@ class LinearConstraints:
         """Return a point inside the constraints, (O,) or (N, O).
 
         Raises:
-            InputError: If there is none at a step.
+            InputError: If a step has no such point.
         """
         steps = (self.G, self.c) if self.G.ndim == 3 else (self.G[None], self.c[None])
         if ((self.G != 0.0).sum(axis=-1) <= 1).all():
@@ -204,7 +204,7 @@ class LinearConstraints:
 
 
 def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the centers (n, O) of boxes, a bound where there is only one, 0 where there is none."""
+    """Return the centers (n, O) of boxes; an output with one bound or none gets its allowed value nearest to zero."""
     lower = np.where(G > 0.0, c[..., None], -np.inf).max(axis=1, initial=-np.inf)
     upper = np.where(G < 0.0, -c[..., None], np.inf).min(axis=1, initial=np.inf)
     both = np.isfinite(lower) & np.isfinite(upper)
@@ -213,8 +213,8 @@ def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _max_margin_point(G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the point (O,) with the largest smallest margin G y − c, at most the size of c."""
-    from scipy.optimize import linprog  # takes half a second, and reading a file does not need it
+    """Return the point (O,) that maximizes the smallest margin G y − c, up to a margin of max |c|."""
+    from scipy.optimize import linprog  # imported here because it takes half a second
 
     outputs = G.shape[1]
     size = float(np.abs(c).max(initial=0.0)) or 1.0

@@ -124,10 +124,10 @@ class Demonstrations:
         return Demonstrations(start + duration * phase, outputs, self.names)
 
     def save(self, path: str | Path) -> None:
-        """Write an `.npz` or a `.csv` file with one row a sample (demonstration, time, outputs); both are exact.
+        """Write an `.npz` or a `.csv` file with one row per sample (demonstration, time, outputs), without rounding.
 
         Raises:
-            InputError: If the file's ending is neither, or the file cannot be written.
+            InputError: If the file has another ending, or the file cannot be written.
         """
         path = Path(path)
         writer = {".npz": io.write_npz, ".csv": io.write_csv}.get(path.suffix)
@@ -137,7 +137,7 @@ class Demonstrations:
 
     @classmethod
     def load(cls, path: str | Path) -> "Demonstrations":
-        """Read a file that `save` wrote, or one of another program.
+        """Read a file that `save` or another program wrote.
 
         An `.npz` file may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` file with a first line of
         `t` (or `time`, `time [s]`) and the outputs' names is one demonstration; a folder of such files is several. Time
@@ -167,10 +167,10 @@ def _as_list(values: Any, what: str) -> list[Any]:
 
 
 def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> Demonstrations:
-    """Warp demonstrations in time onto the one of median duration, by dynamic time warping.
+    """Warp demonstrations in time onto the demonstration of median duration, by dynamic time warping.
 
     The cost of a match is the distance of the outputs, each divided by its standard deviation over all demonstrations.
-    The path of a demonstration is monotonic; a sample of the first that matches several of the second gets their mean.
+    The warping path is monotonic. The result at each step is the mean of the samples that match this step.
 
     Args:
         demonstrations: Demonstrations of one motion.

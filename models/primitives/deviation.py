@@ -11,8 +11,8 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
 MAX_MISS = 0.1
-"""Distance, relative to the range of an output, up to which a larger deviation is accepted: spreads may be tiny."""
-_EVALUATED = 16  # number of steps at which this distance is measured
+"""RMS distance, relative to an output's range, up to which any deviation is accepted, as spreads may be tiny."""
+_EVALUATED = 16  # number of steps at which the deviation is measured
 
 
 def measure_deviation(
@@ -20,8 +20,8 @@ def measure_deviation(
 ) -> tuple[float, float]:
     """Compute the RMS distance of a motion from its reference mean, in two units.
 
-    The motion is that of a primitive without actions, history and constraints. λ and β weigh outputs in their unit:
-    values for meters miss demonstrations in millimeters.
+    The motion is that of a primitive without actions, history and constraints. λ and β depend on the unit of the
+    outputs: values for meters are wrong for millimeters.
 
     Args:
         reference: As in `LcNsKmp`.
@@ -31,7 +31,7 @@ def measure_deviation(
         horizon: As in `LcNsKmp`.
 
     Returns:
-        The distance in standard deviations of the reference, and the largest one of an output relative to its range.
+        The distance in standard deviations of the reference, and the largest distance of an output over its range.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     errors = outputs_at(reference, kernel, lambda_ + beta, horizon, steps) - reference.means[steps]
@@ -98,10 +98,10 @@ def check_deviation(
         lambda_: As in `LcNsKmp`.
         beta: As in `LcNsKmp`.
         horizon: As in `LcNsKmp`.
-        max_deviation: Largest accepted one [standard deviations].
+        max_deviation: Largest accepted deviation [standard deviations].
 
     Raises:
-        InputError: If it exceeds `max_deviation`, and the second number `MAX_MISS`.
+        InputError: If the first number exceeds `max_deviation` and the second one exceeds `MAX_MISS`.
     """
     deviation, miss = measure_deviation(reference, kernel, lambda_, beta, horizon)
     if not deviation <= 1.0:

@@ -7,10 +7,10 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import Kernel
 
-# Conditioning on a history of standard deviation √ρ loses digits in double precision, as the kernel's is 1. Extended
-# precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
+# Conditioning on a history of standard deviation √ρ loses digits in double precision, as that of the kernel is 1.
+# Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
-# Smallest share of the kernel's variance at a point, given the other points, with which it can have its own action.
+# Smallest conditional variance of a point given the others, relative to the kernel's, for it to have its own action.
 _MIN_INDEPENDENCE = 1e-9
 
 
@@ -30,10 +30,10 @@ class WindowFeatures:
 def window_features(
     kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float
 ) -> WindowFeatures:
-    """Condition the kernel on the history and factor the rest.
+    """Condition the kernel on the history and factor the conditional kernel.
 
-    The history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs. It
-    is not in one matrix with the demonstrations' covariances, where a dense (K + ħΣ)⁻¹ loses its accuracy.
+    The history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs.
+    The history is kept out of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ with both would lose accuracy.
 
     Args:
         kernel: k.
@@ -53,7 +53,7 @@ def window_interpolation(
 ) -> np.ndarray:
     """Compute the map (H+1, J) that interpolates actions at some future points to all of them, given the history.
 
-    It is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history.
+    The map is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history.
 
     Args:
         kernel: k.
@@ -102,7 +102,7 @@ def _conditioned(
 
 
 class KernelBasis:
-    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on as few inputs as span the others.
+    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on few inputs that span the others.
 
     Args:
         kernel: k.
@@ -134,7 +134,7 @@ class KernelBasis:
         inputs = inputs.astype(_Extended)
         F = self._extended_features(inputs)
         residual = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs]) - (F**2).sum(axis=1)
-        # Larger than in a window: a feature of size 1e-7 would multiply weights that no data determines.
+        # Larger than the tolerance of a window: a feature of size 1e-7 would multiply weights that no data determines.
         tolerance = 1e-15
         before = self.size
         while len(inputs) and residual.max() > tolerance:

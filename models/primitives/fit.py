@@ -20,7 +20,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.reference import ReferenceTrajectory, fit_mixture, information_criteria, regress
 
 MIN_SHARE = 0.95
-"""Share of the steps within one standard deviation from which a motion follows the demonstrations."""
+"""Smallest share of the steps within one standard deviation at which a motion follows the demonstrations."""
 # Length scales to try, relative to the motion's duration: from one bend to a few steps.
 _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
 # Values of ħ to try, for outputs of unit size.
@@ -37,7 +37,7 @@ class Candidate:
         length_scale: ℓ of the kernel [input].
         lambda_: λ = β.
         error: RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in
-            standard deviations of the demonstrations; infinite if the motion of all demonstrations already leaves them.
+            standard deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread.
         worse: Difference from the best candidate's error, in standard errors over the demonstrations.
         share: Share of the steps at which the motion without actions is within one standard deviation of the mean.
     """
@@ -102,7 +102,7 @@ def fit(
 ) -> Selection:
     """Select components, kernel and regularization by leave-one-out cross-validation.
 
-    The number of components is the one of least Bayesian information criterion. Kernel and regularization are taken
+    The number of components has the least Bayesian information criterion. Kernel and regularization are taken
     from a grid relative to the motion's duration and size. Candidates qualify if their error is within a standard error
     of the best one and their motion without actions stays within the demonstrations' spread. Of these, the strongest
     regularization is selected, and for it the widest kernel: as smooth as the demonstrations allow.
@@ -199,7 +199,7 @@ def motion_without_actions(primitive: LcNsKmp) -> np.ndarray:
 def _reference(
     times: np.ndarray, outputs: np.ndarray, components: int, seed: int, floor: float | np.ndarray
 ) -> ReferenceTrajectory:
-    """Return the reference of a part of the demonstrations."""
+    """Return the reference of a subset of the demonstrations."""
     means, covariances = regress(fit_mixture(times, outputs, components, seed), times)
     return ReferenceTrajectory(times, means, covariances + np.diag(np.broadcast_to(floor, means.shape[1:]) ** 2))
 
@@ -226,7 +226,7 @@ def _validate(
     grid: Sequence[tuple[float, float]],
     make: Callable[[float], Kernel],
 ) -> tuple[Candidate, ...]:
-    """Return all candidates with their errors; one whose motion leaves the spread of all demonstrations has none."""
+    """Return all candidates with their errors; the error is infinite if the motion leaves the spread."""
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     kernels = [make(length_scale) for length_scale, _ in grid]
     motions = [outputs_at(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]

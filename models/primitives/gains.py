@@ -1,8 +1,8 @@
 """Gains from a policy's action in [−1, 1] to null-space units, per output.
 
-The null-space projector is about the size of the posterior's variance: a raw action of size one barely moves a
-demonstration in millimeters. Without active constraints the loop history → next point is linear, and two numbers that
-describe a gain follow from it exactly, for the action repeat that is used:
+The null-space projector is about the size of the posterior's variance: if demonstrations vary by millimeters, a raw
+action of size one barely moves the output. Without active constraints the loop history → next point is
+linear, and two numbers that describe a gain follow from it exactly, for the action repeat that is used:
 
 - authority: displacement by a constant action of ±1, in demonstration standard deviations;
 - exploration RMS: root mean square of the displacement by white actions, in the same unit.
@@ -16,7 +16,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 
 
 def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.ndarray:
-    """Compute the displacement of each output by a constant raw action of one in it, RMS over the motion, (O,).
+    """Compute the displacement (O,) of each output by a constant raw action of one in this output, RMS over the motion.
 
     Args:
         primitive: Primitive in its loop.
@@ -29,11 +29,11 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 
 
 def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.ndarray | None = None) -> np.ndarray:
-    """Compute gains (O,) with which a constant action of ±1 ends √3 κ demonstration standard deviations away.
+    """Compute gains (O,) with which a constant action of ±1 moves outputs by √3 κ demonstration standard deviations.
 
-    The factor √3 is KGRL's own relation: uniform actions in ±1 then have an RMS of κ standard deviations. Both sides
-    are RMS over the whole motion, so that wide regions, which leave room to explore, dominate. The result does not
-    depend on the action repeat, because a constant action is constant for any of them.
+    The factor √3 is KGRL's own relation: uniform actions in ±1 then cause an RMS of κ standard deviations. Displacement
+    and deviation are RMS over the whole motion, so that wide regions, which leave room to explore, dominate. The result
+    does not depend on the action repeat, because a constant action is constant for any of them.
 
     Args:
         primitive: Primitive to calibrate.
@@ -81,7 +81,7 @@ def rms_gains(
 
 
 def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 1) -> np.ndarray:
-    """Compute the RMS over the motion (O,), in demonstration standard deviations, by white actions times `gains` (O,).
+    """Compute the RMS displacement (O,) by white actions times `gains`, in demonstration standard deviations.
 
     Args:
         primitive: Primitive in its loop.
@@ -126,7 +126,7 @@ def _explored_mask(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray
 
 
 def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
-    """Compute displacements (N, O, B) from the motion without actions by raw actions (N, O, B), history commanded."""
+    """Compute displacements (N, O, B) from the motion without actions by raw actions (N, O, B), commands as history."""
     steps, outputs, batch = actions.shape
     history = primitive.history
     past = np.zeros((history + steps, outputs, batch))

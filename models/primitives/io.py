@@ -1,8 +1,8 @@
 """Readers and writers of demonstration files: `.npz`, which is small, and `.csv`, which any program can write.
 
-Reading takes bounded time and memory for any content, and never executes code. NumPy's reader allocates what a header
-claims; headers are therefore checked here against the size of the array before it is read. CSV files are read by the
-standard library's strict reader: `pandas.read_csv` fills short rows and accepts text after a closing quote.
+Reading takes bounded time and memory for any content, and never executes code. NumPy's reader allocates the size that a
+header claims; headers are therefore checked here against the size of the array before it is read. CSV files are read by
+the standard library's strict reader: `pandas.read_csv` fills short rows and accepts text after a closing quote.
 """
 
 import csv
@@ -26,12 +26,12 @@ from guiderail.models.common.files import read_bytes, write_atomically
 
 MAX_NUMBERS = 2_000_000  # times and outputs together: five minutes of six outputs at a kilohertz
 MAX_DEMONSTRATIONS = 1_000
-MAX_LINES = 400_000  # lines of text: six minutes at a kilohertz
+MAX_LINES = 400_000  # number of lines of text: six minutes at a kilohertz
 MAX_FILE_SIZE = 32_000_000  # [bytes]
-_MAX_LINE_LENGTH = 100_000  # characters
-_MAX_HEADER_SIZE = 1_000  # header of an array; NumPy writes 118 [bytes]
+_MAX_LINE_LENGTH = 100_000  # [characters]
+_MAX_HEADER_SIZE = 1_000  # largest header of an array [bytes]; NumPy writes 118
 _MAX_NAMES_SIZE = 1_000_000  # [bytes]
-_MAX_DIRECTORY_SIZE = 100_000  # directory of an archive [bytes]
+_MAX_DIRECTORY_SIZE = 100_000  # largest directory of an archive [bytes]
 
 # Name of the clock's column in a file of one demonstration, with or without a unit.
 _TIME = re.compile(r"(?:t|time|timestamp)\s*(?P<unit>[\[(/].*)?", re.IGNORECASE)
@@ -39,7 +39,7 @@ SECONDS = ("s", "sec", "secs", "second", "seconds")
 
 
 class Recording(NamedTuple):
-    """Content of a file, as `Demonstrations` takes it."""
+    """Content of a demonstration file: the arguments of `Demonstrations`."""
 
     times: Sequence[np.ndarray] | np.ndarray
     outputs: Sequence[np.ndarray] | np.ndarray
@@ -87,7 +87,7 @@ def write_npz(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndar
 
 
 def write_csv(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    """Write one row a sample: demonstration, time, outputs."""
+    """Write one row per sample: demonstration, time, outputs."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(["demonstration", "time", *names])
@@ -126,7 +126,7 @@ def _read_npz(data: bytes) -> Recording:
 
 
 def _check_directory(data: bytes) -> None:
-    """Refuse an archive of many arrays: every entry of the directory at its end costs time and memory."""
+    """Raise an InputError for an archive of many arrays: every entry of its directory costs time and memory."""
     if data[:6] == b"\x93NUMPY":
         raise InputError("it is a single array (.npy): save `times` and `outputs` with numpy.savez")
     end = data[-22:]
@@ -164,7 +164,7 @@ def _read_archive(archive: zipfile.ZipFile) -> Recording:
 
 
 def _split(archive: zipfile.ZipFile, headers: dict[str, _Header], names: list[str] | None) -> Recording:
-    """Read samples that follow one another and split them into demonstrations."""
+    """Read the concatenated samples of all demonstrations and split them."""
     lengths, times, outputs = (headers[key] for key in ("lengths", "times", "outputs"))
     if lengths.dtype.kind not in "iu" or len(lengths.shape) != 1:
         raise InputError(f"'lengths' must be whole numbers (M,), not {lengths.dtype} {lengths.shape}")
@@ -282,7 +282,7 @@ def find_repeated(names: Iterable[str]) -> str:
 
 
 def _check_clock(header: list[str], column: int) -> None:
-    """Refuse a header without a clock in seconds in `column` and an output after it."""
+    """Raise an InputError if `column` of a header is not a clock in seconds or no output follows it."""
     clock = _TIME.fullmatch(header[column]) if len(header) >= 2 + column else None
     if clock is None:
         raise InputError("the first line must be demonstration,time,<outputs> or time,<outputs>")

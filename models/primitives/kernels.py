@@ -26,15 +26,15 @@ class Kernel(Protocol):
             b: Inputs (M,) or (M, I).
 
         Returns:
-            (N, M), in the precision of the inputs.
+            Kernel matrix (N, M), in the precision of the inputs.
         """
         ...
 
 
 KERNELS: Registry[Callable[..., Kernel]] = Registry("kernel", entry_points="guiderail.kernels")
-"""Kernels by the name that `kernel=` of an environment takes.
+"""Registry of kernels; their names are the values of an environment's option `kernel`.
 
-An entry is called with `length_scale=` and with its own further parameters, all of them numbers, and returns a kernel.
+An entry is called with `length_scale=` and its own further parameters, all of them numbers, and returns a kernel.
 """
 register_kernel = KERNELS.register
 DEFAULT_KERNEL = "squared_exponential"
@@ -49,12 +49,12 @@ def make_kernel(
     """Build a registered kernel; equal arguments return the same object.
 
     Args:
-        name: Name that the kernel is registered by.
-        length_scale: ℓ, in the unit of the input, positive.
+        name: Registered name of the kernel.
+        length_scale: Length scale ℓ, in the unit of the input, positive.
         parameters: Further parameters of the kernel by name.
 
     Raises:
-        InputError: If there is no such kernel, it does not have one of the parameters, or a value is out of range.
+        InputError: If there is no such kernel, a parameter is not one of the kernel's, or a value is out of range.
     """
     factory = KERNELS.get(name)
     parameters = parameters or {}
@@ -83,7 +83,7 @@ class SquaredExponential:
     The thesis writes it as exp(−l ‖ζ − ζ'‖²): l = 1 / (2 ℓ²), and its l = 2 is ℓ = 0.5.
 
     Args:
-        length_scale: ℓ, in the unit of the input, positive.
+        length_scale: Length scale ℓ, in the unit of the input, positive.
 
     Raises:
         InputError: If the length scale is not positive and finite.
@@ -105,11 +105,11 @@ class SquaredExponential:
 class Matern52:
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
-    It is twice differentiable only: for motions that the squared exponential kernel is too smooth for, such as those
-    with a contact in the middle.
+    Use this kernel, whose functions are only twice differentiable, for motions for which the squared exponential kernel
+    is too smooth, such as motions with a contact in the middle.
 
     Args:
-        length_scale: ℓ, in the unit of the input, positive.
+        length_scale: Length scale ℓ, in the unit of the input, positive.
 
     Raises:
         InputError: If the length scale is not positive and finite.

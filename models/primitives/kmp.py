@@ -22,14 +22,15 @@ class Kmp:
 
     `LcNsKmp` solves for a window of a clock; this class uses the whole reference at once, for primitives driven by a
     state instead of time, and for via-points. The solution is stored as weights of the kernel's features, whose number
-    is the rank of the kernel and not the number of points. The factor is the triangle of a QR decomposition, to which a
-    via-point adds O rows. If a via-point is removed or moved, the update starts from the triangle of the reference.
+    is the rank of the kernel and not the number of points. The weights are solved for with the triangular factor of a
+    QR decomposition. Adding, moving or removing a via-point appends the O rows of each via-point to the factor of the
+    reference, which is stored.
 
     Args:
         inputs: Times or states, (N,) or (N, I).
         means: Means (N, O).
         covariances: Covariances (N, O, O), positive definite.
-        kernel: k; `SquaredExponential(length_scale=0.5)` by default.
+        kernel: Kernel k; `SquaredExponential(length_scale=0.5)` by default.
         lambda_: λ, positive.
         covariance_lambda: λ_c, positive; λ by default.
 
@@ -190,7 +191,7 @@ class Kmp:
 def _append(
     triangle: np.ndarray, right: np.ndarray, rows: np.ndarray, targets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangle and the right-hand side of a least-squares problem with rows appended."""
+    """Return the triangular factor and right-hand side of a least-squares problem after rows are appended."""
     if not len(rows):
         return triangle, right
     stacked = np.vstack([np.column_stack([triangle, right]), np.column_stack([rows, targets])])

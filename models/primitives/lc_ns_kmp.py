@@ -1,10 +1,10 @@
 """Linearly constrained null-space kernelized movement primitives, LC-NS-KMP (thesis, sections 4.3 and 5.3).
 
-A prediction solves problem 4.5 for a window of the P last outputs and the H+1 next reference points: as close to the
-demonstrations as their covariance demands, pulled by a null-space action at the executed point, through the history,
-and within the linear constraints at every future point. The other members of the family are special cases: without
-constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.2), with neither KMP (2.17), with a history the primitive of
-sKGRL (5.1 to 5.3).
+A prediction solves problem 4.5 for a window of the P last outputs and the H+1 next reference points. The solution
+follows the demonstrations as closely as their covariance requires, passes through the history, is displaced by a
+null-space action at the executed point, and satisfies the linear constraints at every future point. Special cases are
+NS-KMP without constraints (equation 4.4), LC-KMP with β = 0 (4.2), KMP without constraints and with β = 0 (2.17), and
+the primitive of sKGRL with a history (5.1 to 5.3).
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class LcNsKmp:
     """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
     The input is the reference's clock, so that every matrix depends on the step alone. Each step is factored at its
-    first use; a prediction is two small products, and a QP only if a constraint is not slack.
+    first use. A prediction is two small products; a QP is solved only if their result violates a constraint.
 
     Args:
         reference: Means and covariances of the demonstrations, N steps of O outputs.
-        kernel: k; the thesis's `SquaredExponential(length_scale=0.5)` by default.
+        kernel: Kernel k; the thesis's `SquaredExponential(length_scale=0.5)` by default.
         lambda_: Regularization λ of problem 4.5, not negative.
         beta: Weight β of a null-space action, not negative; λ + β is positive.
         horizon: Number of future points H after the executed one.
@@ -111,7 +111,7 @@ class LcNsKmp:
         self._whole: StepFactor | None = None
         self._history_shape = (self.history, reference.num_outputs)
         if self.history:
-            self._features(0)  # refuses a history that the kernel cannot be conditioned on
+            self._features(0)  # raises an InputError if the history's variance is too small
         strength = self.lambda_, self.beta
         self.deviation = check_deviation(reference, self.kernel, *strength, self.horizon, max_deviation)
 
@@ -122,7 +122,7 @@ class LcNsKmp:
 
     @property
     def num_steps(self) -> int:
-        """Number of steps N; a later step repeats step N−1, which holds the end of the motion."""
+        """Number of steps N; a later step repeats step N−1, so that the motion holds its end."""
         return self.reference.num_steps
 
     def predict(
@@ -149,11 +149,11 @@ class LcNsKmp:
     ) -> BatchPrediction:
         """Compute the outputs of B predictions at once, each equal to that of `predict`.
 
-        Predictions at the same step are two matrix products; a QP is solved for those with an active constraint only.
+        Predictions at the same step take two matrix products; a QP is solved only for those that violate a constraint.
 
         Args:
             steps: Steps n ≥ 0 (B,), or one step for all; past the end, the last step.
-            null_space_actions: ξ̂ (B, O), as in `predict`; zero by default, for which `histories` or `steps` give B.
+            null_space_actions: ξ̂ (B, O), as in `predict`; zero by default, with B from `histories` or `steps`.
             histories: (B, P, O), as in `predict`; None if P = 0.
 
         Raises:
@@ -183,13 +183,13 @@ class LcNsKmp:
         history_source: Literal["commanded", "measured"] = "commanded",
         motion: MotionConstraintFilter | None = None,
     ) -> PrimitiveStepper:
-        """Begin an episode of commands, one a control step, without a diagram.
+        """Start an episode that computes one command per control step without a diagram.
 
         Args:
             pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first
                 mean by default.
             gain: Raw null-space action per unit of the action of `PrimitiveStepper.step`, (O,); ones by default.
-            history_source: Outputs that the motion continues from.
+            history_source: Outputs that are appended to the history.
             motion: Filter of the commands by constraints of the motion, as in `PrimitiveStepper`.
 
         Raises:
@@ -244,7 +244,7 @@ class LcNsKmp:
         null_space_action: np.ndarray | None = None,
         history: np.ndarray | None = None,
     ) -> Prediction:
-        """Compute the output at a step with a window of another origin, such as a base policy; nothing is cached.
+        """Compute the output at a step from a given window, such as that of a base policy; nothing is cached.
 
         Arguments are those of `predict`, and the window's `means` (H+1, O) and positive definite `covariances`
         (H+1, O, O), the executed point first. Errors are those of `predict`.
@@ -254,7 +254,7 @@ class LcNsKmp:
         return self._finish(factor, self._stack(null_space_action, history))
 
     def _finish(self, factor: StepFactor, x: np.ndarray) -> Prediction:
-        """Return the prediction of a factored window, corrected if a constraint is not slack."""
+        """Return the prediction of a factored window, corrected if it violates a constraint."""
         output = factor.output_map @ x
         output += factor.output_offset
         free = factor.constraint_map @ x
@@ -364,7 +364,7 @@ class LcNsKmp:
         return self._factor(step).output_sizes()
 
     def factor_all(self) -> int:
-        """Factor every step in advance; return their memory [bytes]."""
+        """Factor every step in advance; return the memory of all factors [bytes]."""
         for step in range(self.num_steps):
             self._factor(step)
         return self.cached_bytes
@@ -377,7 +377,7 @@ class LcNsKmp:
         if self.history == 0:
             if history is not None and np.size(history):
                 raise InputError("this primitive has no history (P = 0): pass None")
-            x = action.copy()  # a `Prediction` uses it later
+            x = action.copy()  # copied, because a `Prediction` keeps x
         else:
             past = np.asarray(history, dtype=float) if history is not None else np.zeros(0)
             if past.shape != self._history_shape:
@@ -391,7 +391,7 @@ class LcNsKmp:
     def _stack_batch(
         self, steps: ArrayLike, null_space_actions: np.ndarray | None, histories: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Check the arguments of a batch; return x (B, (P + 1) O) and the steps (B,), at most the last one."""
+        """Check the arguments of a batch; return x (B, (P + 1) O) and the steps (B,), clipped to the last one."""
         at = as_numbers(steps, "steps")
         if at.ndim > 1 or not (at >= 0).all() or (at % 1 != 0).any():
             raise InputError(f"steps are whole numbers from 0 on, one for each prediction, not {brief(steps)}")
@@ -443,11 +443,11 @@ class LcNsKmp:
         return Window(self.reference.means[held], self.reference.covariances[held], G, c)
 
     def _held(self, step: int, horizon: int) -> np.ndarray:
-        """Return the steps of a window (horizon+1,), at most the last one."""
+        """Return the steps of a window (horizon+1,), clipped to the last one."""
         return np.minimum(np.arange(step, step + horizon + 1), self.num_steps - 1)
 
     def _inputs(self, step: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the clock at the history (P,), and at the executed point and the horizon (horizon+1,)."""
+        """Return the times of the history (P,), and of the executed point and the horizon (horizon+1,)."""
         past = self.reference.inputs(np.arange(step - self.history, step))
         return past, self.reference.inputs(np.arange(step, step + horizon + 1))
 
@@ -463,14 +463,14 @@ class LcNsKmp:
         return features
 
 
-# Weak references: the factored steps of a primitive take megabytes.
+# Weak references, so that an unused primitive releases its factored steps, which take megabytes.
 _SHARED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
 
 
 def get_shared_primitive(
     reference: ReferenceTrajectory, constraints: LinearConstraints, kernel: Kernel, **arguments: Any
 ) -> LcNsKmp:
-    """Return the primitive of these arguments that is in use, or a new one.
+    """Return the existing primitive with these arguments if there is one, otherwise a new one.
 
     Primitives can be shared because their state, the factored steps, does not change results. The caller must not
     modify the primitive.
@@ -478,7 +478,7 @@ def get_shared_primitive(
     Args:
         reference: As in `LcNsKmp`.
         constraints: As in `LcNsKmp`.
-        kernel: As in `LcNsKmp`; kernels that compare equal are the same.
+        kernel: As in `LcNsKmp`; kernels that compare equal share a primitive.
         arguments: Further arguments of `LcNsKmp`, numbers and names.
 
     Raises:

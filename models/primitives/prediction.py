@@ -15,8 +15,8 @@ class Prediction:
         output: Output to execute (O,).
         factor: Factor of the step.
         x: History and null-space action of the prediction ((P + 1) O,).
-        correction: Smallest correction v (r,) that satisfies the constraints, or None if every constraint is slack;
-            `output_sizes` is its largest effect per norm.
+        correction: Smallest correction v (r,) with which the window satisfies the constraints, or None if it satisfies
+            them uncorrected; `LcNsKmp.output_sizes` bounds the displacement of the output.
         signed_multipliers: Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower
             bound, or None.
     """

@@ -1,4 +1,4 @@
-"""Progress of a movement primitive along its demonstrations: by the clock, or by how the robot follows."""
+"""Progress of a movement primitive along its demonstrations: by the clock, or by how well the robot follows."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class StateProgress:
         s_{k+1} = s_k + 1  if ‖y − x‖ ≤ tolerance  or  k + 1 − s_k > max_lag,  else  s_k
 
     for the position and, for poses (6,), for the angles. Progress never decreases and is at most `max_lag` steps behind
-    the clock: a contact that keeps the robot from its command by design, such as pressing in a search, delays the
-    motion by no more, and after that the clock drives it. The tolerance is what contact and tracking take while nothing
-    blocks the robot.
+    the clock. A contact that keeps the robot from its command by design, such as pressing in a search, therefore delays
+    the motion by at most `max_lag` steps. The tolerance should cover the deviations that contact and tracking cause
+    while nothing blocks the robot.
 
     Attributes:
-        tolerance: Distances of the position [unit of the output] and of the angles [rad], positive.
-        max_lag: Largest number of steps behind the clock, not negative; 0 is the clock.
+        tolerance: Tolerances of the position [unit of the output] and of the angles [rad], positive.
+        max_lag: Largest number of steps behind the clock, not negative; with 0, progress follows the clock.
 
     Raises:
         InputError: If an argument is out of range.
@@ -42,7 +42,7 @@ class StateProgress:
             raise InputError(f"the largest lag of progress is a number of steps from 0, not {brief(self.max_lag)}")
 
     def next_step(self, step: int, clock: int, command: np.ndarray, pose: np.ndarray) -> int:
-        """Return the step after `step`.
+        """Return the step of the next command.
 
         Args:
             step: Step of the last command.

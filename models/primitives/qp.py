@@ -5,8 +5,8 @@ In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = �
 same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
 length, so that a solver's tolerance is a tolerance on the output itself.
 
-`qpsolvers` does not replace the adaptors: its rows are one-sided, which doubles them (DAQP takes 1.8 times as long),
-and it has no second tolerance, no margin and no check of an inaccurate result.
+The package `qpsolvers` is not used, because its constraints are one-sided, which doubles the rows (DAQP takes 1.8 times
+as long), and because it has no second tolerance, no margin and no check of an inaccurate result.
 """
 
 from collections.abc import Callable
@@ -17,13 +17,13 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 
 RELAXATIONS = (1e-10, 1e-9)
-"""Amounts by which bounds are relaxed in turn until a solver succeeds, relative to the largest correction."""
+"""Relaxations of the bounds, tried in turn until a solver succeeds, relative to the largest required correction."""
 
 Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class UnsolvableError(RuntimeError):
-    """Error of a problem without a solution within tolerance; the caller must repeat its last safe command."""
+    """Error if no solution within tolerance is found; the caller must repeat its last safe command."""
 
 
 def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +100,7 @@ def find_solver(name: str) -> Solver:
     """Return a solver by its name.
 
     Raises:
-        InputError: If there is none.
+        InputError: If there is no solver with this name.
     """
     if name not in SOLVERS:
         raise InputError(f"there is no solver '{name}': choose one of {', '.join(SOLVERS)}")
@@ -113,7 +113,7 @@ def solve_least_norm(
     """Solve min ½‖v‖² subject to lower ≤ rows v ≤ upper.
 
     Args:
-        rows: (m, r), rows of unit length (or zero).
+        rows: Constraint rows (m, r), of unit length (or zero).
         lower: Lower bounds (m,), −inf for none; at least one bound excludes v = 0.
         upper: Upper bounds (m,), inf for none.
         solver: One of `SOLVERS`.
@@ -140,8 +140,8 @@ def _solve_relaxed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve the problem with relaxed bounds.
 
-    Bounds with no room between them, such as those of an output that must not move, are equations to a solver, and many
-    rows of them contradict each other in their last digits. The caller checks the result against the bounds.
+    Equal lower and upper bounds, such as those of an output that must not move, are equations to a solver, and rounding
+    errors make many such equations contradict each other. The caller checks the result against the bounds.
     """
     *first, last = RELAXATIONS
     for relaxation in first:

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 # Smallest eigenvalue of a correlation matrix that is regular in double precision.
 _SINGULAR = 1e-13
-# Variance added to every component, relative to the data's own: EM needs it where demonstrations coincide.
+# Variance added to every component, relative to the data's variance: EM needs it where demonstrations coincide.
 _REGULARIZATION = 1e-6
 _MAX_COMPONENTS = 20
-VIA_POINT_VARIANCE = 1e-4  # relative to the kernel's own: contradicting via-points are averaged to this accuracy
+VIA_POINT_VARIANCE = 1e-4  # variance of a via-point, relative to the kernel's; contradicting via-points are averaged
 
 
 class ReferenceTrajectory:
@@ -64,7 +64,7 @@ class ReferenceTrajectory:
             raise InputError("the reference's times must increase strictly")
         self._check_covariances()
         for values in (self.times, self.means, self.covariances):
-            values.setflags(write=False)  # environments of a process share it
+            values.setflags(write=False)  # environments of a process share these arrays
         step = (self.times[-1] - self.times[0]) / (n - 1)
         grid = self.times[0] + step * np.arange(n)
         self.uniform = bool(np.abs(self.times - grid).max() <= 1e-12 * np.abs(self.times).max())
@@ -81,12 +81,12 @@ class ReferenceTrajectory:
         """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR).
 
         Args:
-            demonstrations: Demonstrations, resampled to one clock if theirs differ.
+            demonstrations: Demonstrations, resampled to one clock if their clocks differ.
             components: Number of components C; chosen by the Bayesian information criterion by default.
             seed: Seed of the mixture's initialization.
             num_steps: Number of steps N; that of the longest demonstration by default.
-            floor: Standard deviation, (O,) or scalar, added to every covariance [unit of the output]: the resolution of
-                a sensor or a controller, where demonstrations agree better than that.
+            floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
+                such as the resolution of a sensor or a controller if demonstrations differ by less.
 
         Raises:
             InputError: If an argument is out of range, or a covariance is singular.
@@ -124,9 +124,9 @@ class ReferenceTrajectory:
         return inside + before + after
 
     def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
-        """Return this trajectory with another time between steps, and `time_scale` times as long.
+        """Return this trajectory with a new time between steps and `time_scale` times its duration.
 
-        Means and covariances are interpolated linearly. The number of steps times the period stays the duration.
+        Means and covariances are interpolated linearly. The number of steps times the period is the new duration.
 
         Args:
             period: Time between steps [s], positive.
@@ -225,8 +225,8 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     Args:
         times: Common clock (N,) [s].
         outputs: Outputs (M, N, O).
-        components: Number of components C. By default the one of least Bayesian information criterion among 1 to 20,
-            where the search stops once two numbers in a row are not better than the best before.
+        components: Number of components C. By default the number from 1 to 20 with the least Bayesian information
+            criterion; the search stops once two numbers in a row are not better than the best before.
         seed: Seed of scikit-learn's generator.
 
     Raises:
@@ -259,12 +259,12 @@ def information_criteria(
 def _fit_candidates(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, tuple[GaussianMixture, float]]:
-    """Return mixtures and their criteria by number of components, until two in a row are not better."""
+    """Return mixtures and their criteria by number of components, up to two in a row that are not better."""
     for count in candidates:
         if not 1 <= count <= len(times) // 2:
             raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")
     data, _, _ = _standardize(times, outputs)
-    phase = np.tile(np.arange(len(times)), len(outputs)) / len(times)  # of each sample, from 0 to below 1
+    phase = np.tile(np.arange(len(times)), len(outputs)) / len(times)  # phase of each sample, from 0 to below 1
     fits: dict[int, tuple[GaussianMixture, float]] = {}
     for count in candidates:
         mixture = _fit(data, phase, count, seed)
@@ -291,7 +291,7 @@ def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
     offset = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
     variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]
     log = np.log(mixture.weights) - 0.5 * (np.log(variance) + offset**2 / variance)
-    weights = np.exp(log - log.max(axis=1, keepdims=True))  # without underflow far from every component
+    weights = np.exp(log - log.max(axis=1, keepdims=True))  # scaled to avoid underflow far from every component
     weights /= weights.sum(axis=1, keepdims=True)
     slopes = across / variance[:, None]
     lines = mixture.means[:, 1:] + offset[..., None] * slopes  # (N, C, O)
@@ -308,7 +308,7 @@ def _standardize(times: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np
     """Return samples (M·N, 1 + O) of time and outputs, standardized, with their center and scale (1 + O,)."""
     data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
     center, deviation = data.mean(axis=0), data.std(axis=0)
-    # The deviation of a constant output is a rounding error of its mean.
+    # The standard deviation of a constant output is only a rounding error.
     moves = deviation > 1e-12 * np.abs(data).max(axis=0)
     scale = np.where(moves, deviation, 1.0)
     return (data - center) / scale, center, scale

@@ -1,4 +1,4 @@
-"""Episode of a movement primitive without a diagram: history, gains and fallback, one command a control step."""
+"""Episode of a movement primitive without a diagram: history, gains and fallback, one command per control step."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Command:
 
     Attributes:
         output: Command (O,).
-        violation: max(c − G y) of the command, and of the motion's constraints if there are any: negative if all
-            constraints are slack, −inf without constraints.
-        is_fallback: True if no window within the constraints was found, and the command is the point nearest to the
-            last command within the constraints of its step; or if the motion's constraints leave nothing but braking.
+        violation: max(c − G y) of the command, or its violation of the motion's constraints if there is a motion
+            filter: negative if all constraints are slack, −inf without constraints.
+        is_fallback: True if no window within the constraints was found, so that the command is the point nearest to the
+            last command within the constraints of its step, or if braking is the only motion within the constraints.
     """
 
     output: np.ndarray
@@ -44,8 +44,8 @@ class PrimitiveStepper:
         gain: Raw null-space action per unit of the action (O,); ones by default.
         history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
             or is pushed by an operator.
-        motion: Filter of the commands by constraints of the motion; none by default. It begins at the pose, at rest or
-            with the velocity of the last two outputs.
+        motion: Filter of the commands by constraints of the motion; none by default. The filter starts at the pose:
+            at rest, or with the velocity of the last two outputs if `pose` holds several.
 
     Raises:
         InputError: If an argument has the wrong shape or is not finite.
@@ -116,7 +116,7 @@ class PrimitiveStepper:
         return self.num_steps, self.gain * action, self._history if self.primitive.history else None
 
     def finish(self, output: np.ndarray | None) -> Command:
-        """Return the command of a prediction's output (O,), or of None where none was found; the step is complete."""
+        """Complete the step: return the command for a predicted output (O,), or for None if no output was found."""
         constraints = self.primitive.constraints
         is_fallback = output is None
         self._last = constraints.nearest(self._last, self.num_steps) if output is None else output

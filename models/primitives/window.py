@@ -13,8 +13,8 @@ from guiderail.models.primitives.qp import Solver, UnsolvableError, solve_least_
 
 # Smallest singular value of the unit constraint rows, relative to the largest; smaller ones are rounding errors.
 _NEGLIGIBLE = 1e-13
-_CHUNK = 256  # predictions whose constraints are evaluated at a time, which stay in the processor's cache
-_OPPOSITE = 4 * float(np.finfo(float).eps)  # largest difference of two rows of unit norm that are opposite
+_CHUNK = 256  # number of predictions evaluated at a time, so that their constraints stay in the processor's cache
+_OPPOSITE = 4 * float(np.finfo(float).eps)  # largest entry of the sum of two unit rows that count as opposite
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Window:
         """Return the window of given means and covariances.
 
         Raises:
-            InputError: If they are not finite, or of another shape than the constraints.
+            InputError: If means or covariances are not finite, or their shape does not match the constraints.
         """
         means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
         steps, _, outputs = G.shape
@@ -54,7 +54,7 @@ class Window:
 class _Solution:
     """Solution of the unconstrained window as a function of x = [history, null-space action].
 
-    The window is y = L (latent_mean + latent_map x) + direct_map history; a correction v adds L v.
+    The window is y = L (latent_mean + latent_map x) + direct_map history; a change δ of the latent vector adds L δ.
     """
 
     whiten: np.ndarray  # Σ^(-1/2), (H+1, O, O)
@@ -81,15 +81,15 @@ class StepFactor:
 
     Args:
         window: Reference and constraints.
-        features: Kernel of the window's inputs, given the history.
-        lambda_: λ of problem 4.5.
-        beta: β of problem 4.5.
+        features: Features of the kernel at the window's inputs, conditioned on the history.
+        lambda_: Regularization λ of problem 4.5.
+        beta: Weight β of a null-space action.
 
     Attributes:
         output_map, output_offset: Map (O, PO+O) and offset (O,) from x to the executed point.
-        constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled by the inverse of its largest
-            displacement.
-        lower, upper: Bounds (m,) of the constrained directions, less their offset and scaled alike.
+        constraint_map: Map (m, PO+O) from x to the constrained directions, each divided by its largest
+            displacement by a correction of norm one.
+        lower, upper: Bounds (m,) of the constrained directions, minus their offset and scaled in the same way.
         constraint_rows: Unit rows (m, r), the map from a correction v to the constrained directions.
         correction_map: Map (O, r) from a correction v to the executed point.
     """
@@ -149,7 +149,7 @@ class StepFactor:
         self._uncorrected = A, solution.L[:outputs]
 
     def factor_corrections(self) -> None:
-        """Factor the corrections of the window; `correct` does it at its first call."""
+        """Factor the corrections of the window; the first call of `correct` does this too."""
         if self._uncorrected is None:
             return
         (A, L), self._uncorrected = self._uncorrected, None
@@ -180,7 +180,7 @@ class StepFactor:
         try:
             return solve_least_norm(self.constraint_rows, lower, upper, solver)
         except UnsolvableError:
-            # In units of a correction that hardly moves the output, rounding of the bounds is a contradiction.
+            # If a correction hardly moves the output, rounding errors of the scaled bounds can make them contradictory.
             loose = 0.5 * TOLERANCE * self._scale
             return solve_least_norm(self.constraint_rows, lower - loose, upper + loose, solver)
 
@@ -188,7 +188,7 @@ class StepFactor:
         """Return a mask (B,), true where every constraint is slack for x (B, PO+O)."""
         if len(x) < _CHUNK:
             return self._is_inside(x)
-        # Single precision takes half the time. It decides unless a bound is nearer than its rounding error.
+        # Single precision takes half the time. Its result is used unless a bound is nearer than the rounding error.
         rounding = 2.0**-23 * (x.shape[1] + 4)
         sizes = np.abs(self.constraint_map) @ np.maximum(x.max(axis=0), -x.min(axis=0))
         finite = (np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (self.lower, self.upper))
@@ -198,7 +198,7 @@ class StepFactor:
         transposed = self.constraint_map.astype(np.float32).T
         is_slack = np.empty(len(x), dtype=bool)
         buffer = np.empty((min(_CHUNK, len(x)), len(lower)), dtype=np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinity are not slack here
+        with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinity count as not slack
             for start in range(0, len(x), _CHUNK):
                 part = x[start : start + _CHUNK].astype(np.float32)
                 free = np.matmul(part, transposed, out=buffer[: len(part)])
@@ -285,7 +285,7 @@ class StepFactor:
 def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pair the rows of G (n, F, O) that are each other's negative at every step, as the two sides of a box are.
 
-    Rows that were scaled differently before they were normalized differ by rounding.
+    The comparison has a tolerance, because normalization rounds rows of different scales differently.
 
     Returns:
         For each direction: its row of G, the row of its lower bound, and the row of its upper bound (−1: no bound).

@@ -7,9 +7,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from guiderail.models.robots.robot import EndEffector, JointDrives, register_end_effector
 
-# A bayonet is locked by a quarter turn, from 90 degrees to 0. With the tool turned back by half of it, the quarter turn
-# is in the middle of the last joint's range for every robot.
-HALF_TURN_ANGLE = math.pi / 4  # [rad]
+# A bayonet is locked by a quarter turn, from 90 degrees to 0. With the tool mounted half of that angle back, the
+# quarter turn is in the middle of the last joint's range for every robot.
+HALF_TURN_ANGLE = math.pi / 4  # half of the quarter turn [rad]
 
 CONNECTOR_TOOL = register_end_effector(
     EndEffector(

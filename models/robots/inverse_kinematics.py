@@ -9,8 +9,8 @@ from pydrake.solvers import Solve
 
 from guiderail.models.common.errors import InputError
 
-STARTS = 10  # start postures of a search: the given one and random ones around it
-TOLERANCE = 1e-9  # tolerance of the pose, translation [m] and rotation [rad] together
+STARTS = 10  # number of start postures of a search: the given one, then random ones around it
+TOLERANCE = 1e-9  # largest norm of the pose error, translation [m] and rotation [rad] together
 AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 
 
@@ -20,18 +20,18 @@ def solve_inverse_kinematics(
     """Return the joint positions (n,) nearest to `posture` that put the tool center at X in the reference frame.
 
     Minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`, so that the result is
-    deterministic. If no solution is found from there, further searches start at random postures and the solution
-    nearest to `posture` is returned.
+    deterministic. If no solution is found, further searches start at random postures and the solution nearest
+    to `posture` is returned.
 
     Args:
-        plant: Finalized plant, all of whose joints are free.
+        plant: Finalized plant; the solution may move all of its joints.
         reference: Frame in which X is expressed.
         tool_center: Frame to place at X.
         X: Pose of the tool center in the reference frame.
         posture: Joint positions (n,) [rad].
 
     Raises:
-        InputError: If the pose is out of reach, or reached only beyond the joint limits.
+        InputError: If the pose is out of reach, or can only be reached beyond the joint limits.
     """
     problem = _Problem(plant, reference, tool_center, X, np.asarray(posture, dtype=float))
     solution = problem.search(within_limits=True)
@@ -54,12 +54,12 @@ class _Problem:
         self._context = plant.CreateDefaultContext()
 
     def search(self, within_limits: bool) -> np.ndarray | None:
-        """Return the solution of a search from the posture, otherwise the nearest one of random starts, or None."""
+        """Return the solution found from the posture, otherwise the nearest one found from random starts, or None."""
         lower, upper = self._limits(within_limits)
         solution = self._solve(self._posture, lower, upper, within_limits)
         if solution is not None:
             return solution
-        # Within half a turn of the posture, so that a joint with several turns is not wound up.
+        # Starts within half a turn of the posture, so that a joint with a range of several turns is not wound up.
         random = np.random.default_rng(0)
         low, high = np.maximum(lower, self._posture - np.pi), np.minimum(upper, self._posture + np.pi)
         starts = random.uniform(np.minimum(low, high), np.maximum(low, high), (STARTS - 1, len(lower)))
@@ -82,7 +82,7 @@ class _Problem:
         return self._refine(np.clip(result.GetSolution(q), lower, upper), lower, upper)
 
     def _constrain_pose(self, ik: InverseKinematics) -> None:
-        """Add six independent equations: for the origin, for y and z of a point on x, and for z of a point on y."""
+        """Add six independent equations: the origin, y and z of a point on the x axis, z of a point on the y axis."""
         free = np.inf
         for p_PQ, lower, upper in (
             ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),

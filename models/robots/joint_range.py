@@ -10,27 +10,28 @@ from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.damped_inverse import TOOL_SCALE
 
 _ITERATIONS = 60
-_TOLERANCE = 1e-9  # of a pose, in the units of a scaled twist [m]
-_MAX_CHANGE = 0.5  # of a joint in one iteration [rad]
-_DIFFERENCE = 1e-6  # of a joint, for the derivative of a singular value [rad]
+_TOLERANCE = 1e-9  # largest norm of the pose error, as a scaled twist [m]
+_MAX_CHANGE = 0.5  # largest change of a joint in one iteration [rad]
+_DIFFERENCE = 1e-6  # joint step of the finite difference of a singular value [rad]
 
 
 class JointRange:
-    """Joint positions that a commanded pose takes, and constraints on them.
+    """Joint positions at a commanded pose, and constraints on them.
 
-    The joint positions of a pose are those nearest to the posture: where the null-space control of an arm at rest is.
-    Near a command y they change by q(z) ≈ q(y) + J⁺ (z − y), so that limits of the joints are linear constraints on the
-    next command. Their second-order error is not bounded in advance: `violation` computes the joint positions of the
-    command itself, and a command with a violation is not executed (`MotionConstraintFilter`).
+    The joint positions of a pose are those nearest to the posture, to which null-space control brings an arm at rest.
+    Near a command y they are q(z) ≈ q(y) + J⁺ (z − y), so that limits of the joints are linear constraints on the next
+    command. The second-order error of these constraints is not bounded in advance: `violation` computes the joint
+    positions of the command itself, and a command with a violation is not executed (`MotionConstraintFilter`).
 
     Args:
         plant: Finalized plant with the arm only.
         reference: Frame of poses.
-        tool_center: Frame that is at the pose.
+        tool_center: Frame whose pose is commanded.
         posture: Joint positions (n,) [rad] within the limits.
-        margin: Distance from the limits, not negative: what an arm under impedance control deviates [rad].
-        min_singular_value: Smallest singular value of the Jacobian whose rotations are scaled by `LEVER` [m]; 0 for no
-            constraint.
+        margin: Distance to keep from the limits [rad], not negative, for the deviation of an arm under impedance
+            control.
+        min_singular_value: Lower bound of the singular values of the Jacobian whose rotations are scaled by `LEVER`
+            [m]; 0 for no constraint.
 
     Raises:
         InputError: If the posture is not within the limits and the margin, or an argument is negative.

@@ -43,7 +43,7 @@ class MountedEndEffector:
 
     Attributes:
         wrist: Joint to the flange, at which a wrist sensor measures.
-        tool_center: Frame P.
+        tool_center: Frame P of the tool center.
         bodies: All bodies; the first is the child of `wrist`.
         model: Model instance.
         actuators: Actuators in the order of its joints; empty for a rigid tool, or a gripper added as a rigid body.
@@ -112,13 +112,13 @@ def add_end_effector(
 
 
 def lighten_rotors(robot: Robot, mounted: MountedRobot) -> None:
-    """Set the rotor inertias to the smaller ones that a joint torque control makes apparent."""
+    """Reduce the rotor inertias to the apparent inertias under joint torque control."""
     for actuator in mounted.actuators:
         actuator.set_default_rotor_inertia(robot.apparent_rotor_inertia * actuator.default_rotor_inertia())
 
 
 def add_drives(actuators: Sequence[JointActuator], drives: JointDrives) -> None:
-    """Give each joint a spring to its desired position and a damper, which the plant integrates implicitly."""
+    """Give each joint a spring to its desired position and a damper; the plant integrates both implicitly."""
     for actuator, stiffness, damping in zip(actuators, drives.stiffness, drives.damping, strict=True):
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
 
@@ -166,7 +166,7 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
 
 
 def _check_names(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
-    """Refuse an end effector whose data name elements that its model file does not have."""
+    """Raise an InputError if the data of an end effector name an element that its model file does not have."""
     for kind, names, has_name in (
         ("frame", (end_effector.mount_frame, end_effector.tool_center), plant.HasFrameNamed),
         ("body", end_effector.bodies, plant.HasBodyNamed),

@@ -1,8 +1,8 @@
 """Robots and end effectors as data, and their registries.
 
-A robot is one file of this package and a model file. The Python file constructs a `Robot` and calls `register_robot`;
-`find_robot(name)` then returns it. An installed package adds robots by an entry point of the group `guiderail.robots`
-(end effectors: `guiderail.end_effectors`), a script by calling `register_robot`.
+A robot consists of a Python file of this package and a model file. The Python file constructs a `Robot` and calls
+`register_robot`; `find_robot(name)` then returns it. An installed package adds robots by an entry point of the group
+`guiderail.robots` (end effectors: `guiderail.end_effectors`), a script by calling `register_robot`.
 """
 
 import math
@@ -59,10 +59,10 @@ class Robot:
         joints: Names of the joints from the base to the flange.
         home: Joint positions (n,) [rad] with the flange pointing down in front of the robot, far from limits and
             singularities; inverse kinematics starts there.
-        tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with that of
-            the base at home, with the last joint in the middle of its range.
-        apparent_rotor_inertia: Part of the rotors' reflected inertia that remains under torque control; joint torque
-            feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
+        tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with the
+            base's x axis at home, with the last joint in the middle of its range.
+        apparent_rotor_inertia: Fraction of the rotors' reflected inertia that remains under torque control; joint
+            torque feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
         drives: Drives of the joints under position control; None if unknown.
         level_posture: Joint positions (n,) [rad] with a horizontal z axis of the flange, for a tool held like a cup;
             None if unknown.
@@ -110,8 +110,8 @@ class EndEffector:
         mount_frame: Frame that is mounted to the flange.
         tool_center: Name of the frame P that a station commands: the center of compliance, z towards the flange, fixed
             to the mount.
-        bodies: Names of all bodies, that of the mount first.
-        X_FlangeMount: Pose of the mount on the flange turned by the robot's `tool_turn`.
+        bodies: Names of all bodies, the mount first.
+        X_FlangeMount: Pose of the mount in the flange frame after its rotation by the robot's `tool_turn`.
         joints: Names of the actuated joints of a gripper, without mimic joints; empty for a rigid tool.
         opening: Positions of all joints by name, including mimic joints, at the start of an episode [rad] or [m].
         drives: Drives of the actuated joints.
@@ -141,7 +141,7 @@ class EndEffector:
 
     @property
     def is_gripper(self) -> bool:
-        """True if it has actuated joints."""
+        """True if the end effector has actuated joints."""
         return bool(self.joints)
 
 
@@ -167,7 +167,7 @@ def find_robot(name: str | Robot) -> Robot:
     """Return the robot with a name; a `Robot` is returned unchanged.
 
     Raises:
-        InputError: If there is none; the message suggests the nearest name.
+        InputError: If no entry has this name; the message suggests the nearest name.
     """
     return name if isinstance(name, Robot) else _ROBOTS.get(name)
 
@@ -193,7 +193,7 @@ def find_end_effector(name: str | EndEffector) -> EndEffector:
     """Return the end effector with a name; an `EndEffector` is returned unchanged.
 
     Raises:
-        InputError: If there is none; the message suggests the nearest name.
+        InputError: If no entry has this name; the message suggests the nearest name.
     """
     return name if isinstance(name, EndEffector) else _END_EFFECTORS.get(name)
 

@@ -23,7 +23,7 @@ UR5E = register_robot(
             stiffness=(8000.0, 8000.0, 8000.0, 3000.0, 3000.0, 3000.0),
             inertia=(4.0, 4.0, 2.5, 0.25, 0.25, 0.25),
         ),
-        # Elbow up.
+        # Posture with the elbow up.
         level_posture=(-0.24, -1.11, 1.54, -0.43, 1.33, 2.34),
         source=(
             "Universal Robots' Denavit-Hartenberg parameters, masses, centers of mass, inertias and limits; rotor "

@@ -1,8 +1,8 @@
 """Active constraints: projections of the end effector's pose into an allowed set (thesis, equation 2.21).
 
 Each projection is idempotent: an allowed pose is returned unchanged. The constraints of a state are applied in the
-order of the file. A constraint on the orientation that depends on the position therefore comes after those on the
-position.
+order of the file. A constraint on the orientation that depends on the position therefore comes after the constraints
+on the position.
 """
 
 import math
@@ -40,7 +40,7 @@ class ActiveConstraint(ABC):
         """Return the projection of X_WE; X_WE itself if it is allowed."""
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the distance of X_WE from its projection, the larger of [m] and [rad]; 0 if X_WE is allowed."""
+        """Return the distance of X_WE from its projection, the larger of position [m] and angle [rad]; 0 if allowed."""
         return pose_distance(self.project(X_WE, frames), X_WE)
 
     @property
@@ -60,7 +60,7 @@ class FrameConstraint(ActiveConstraint):
 
     @abstractmethod
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; an allowed one is the same object."""
+        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; the same objects if allowed."""
 
     @override
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
@@ -91,7 +91,7 @@ class ConstraintGroup:
         return X_WE
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the largest violation of one of the constraints, the larger of [m] and [rad]; 0 inside."""
+        """Return the largest violation of a single constraint, in position [m] or angle [rad]; 0 inside."""
         return largest(self._distances(*pose_in(self.constraints[0].frame, X_WE, frames)))
 
     def _distances(self, R_FE: np.ndarray, p_FE: np.ndarray) -> Iterator[float]:
@@ -135,7 +135,7 @@ class HalfSpace(PositionConstraint):
     """Half-space normal · p_FE ≥ offset_m."""
 
     normal: tuple[float, ...]  # vector in F
-    offset_m: float  # of the plane, along the normal
+    offset_m: float  # offset of the plane along the normal
     frame: str = WORLD  # F: frame of an object, or `world`
 
     def __post_init__(self) -> None:
@@ -180,7 +180,8 @@ class Box(PositionConstraint):
 class Cylinder(PositionConstraint):
     """Bounds on the distance from F's z axis; z is free.
 
-    A min_radius_m excludes the surroundings of the axis, a max_radius_m everything farther away.
+    `min_radius_m` is the radius of an excluded region around the axis; everything beyond `max_radius_m` is excluded
+    too.
     """
 
     frame: str  # F: frame of an object, or `world`
@@ -234,7 +235,7 @@ def _nudge_inside(bound: float, direction: np.ndarray, least: float, most: float
 @register(ACTIVE_CONSTRAINTS, "keep_above")
 @dataclass(frozen=True)
 class KeepAbove(FrameConstraint):
-    """Lower bound on the height of points that are fixed to the end effector, which is lifted along F's z axis."""
+    """Lower bound on the height of points fixed to the end effector; a projection lifts it along F's z axis."""
 
     height_m: float  # lower bound along F's z axis
     frame: str = WORLD  # F: frame of an object, or `world`
@@ -256,7 +257,7 @@ class KeepAbove(FrameConstraint):
 @register(ACTIVE_CONSTRAINTS, "funnel")
 @dataclass(frozen=True)
 class Funnel(PositionConstraint):
-    """Cone above p_FE: z ≤ height_m + slope · (radius − radius_m), so that an inward motion leads down."""
+    """Conical ceiling z ≤ height_m + slope · max(0, radius − radius_m) for p_FE, which falls towards F's z axis."""
 
     frame: str  # F: frame of an object, or `world`
     radius_m: float  # radius within which the ceiling is flat
@@ -276,7 +277,7 @@ class Funnel(PositionConstraint):
 @register(ACTIVE_CONSTRAINTS, "fixed_orientation")
 @dataclass(frozen=True)
 class FixedOrientation(FrameConstraint):
-    """One given orientation."""
+    """Constant orientation R_FE."""
 
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE
     frame: str = WORLD  # F: frame of an object, or `world`
@@ -294,7 +295,7 @@ class TiltConstraint(FrameConstraint):
 
     The interval may depend on the distance to F's origin. The projection is the nearest such rotation. With
     `turns_along`, the end effector turns about F's z axis as it moves around that axis, so that it always tilts about
-    the same axis of its own; `rpy_deg` then applies to a bearing along F's x axis. Without `turns_along`, the heading
+    the same axis of E; `rpy_deg` then applies to a bearing along F's x axis. Without `turns_along`, the heading
     is constant and the tilt axis changes.
     """
 
@@ -312,7 +313,7 @@ class TiltConstraint(FrameConstraint):
 
     @staticmethod
     def _heading(p_FE: np.ndarray) -> np.ndarray:
-        """Return R_FH; H has its z axis along F's and its x axis along the bearing, and its y axis is the tilt axis."""
+        """Return R_FH of the heading frame H with F's z axis, the bearing as x axis and the tilt axis as y axis."""
         x, y, _ = bearing(p_FE).tolist()
         return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
@@ -371,7 +372,7 @@ class TiltByDistance(TiltConstraint):
     """Tilt towards F's axis as a function of the distance to F's origin."""
 
     frame: str  # F: frame of an object, or `world`
-    distance_m: tuple[float, ...]  # increasing
+    distance_m: tuple[float, ...]  # distances to F's origin, increasing
     tilt_deg: tuple[float, ...]  # one tilt for each distance; linear in between, constant beyond
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
     turns_along: bool = False  # whether E turns about F's z axis as it moves around it
@@ -393,7 +394,7 @@ class TiltByDistance(TiltConstraint):
 @register(ACTIVE_CONSTRAINTS, "arc")
 @dataclass(frozen=True)
 class Arc(FrameConstraint):
-    """Circle about F's z axis, along which the orientation turns, as for a door handle.
+    """Circle about F's z axis; the orientation turns with the angle along the circle, as for a door handle.
 
     At angle 0 the end effector is on F's x axis with R_FE = rpy_deg.
     """

@@ -53,7 +53,7 @@ def draw(template: SharedControlTemplate, path: str | Path) -> None:
     """Write the state machine to a .dot or .gv file as text, or to a .png, .svg or .pdf file as a picture.
 
     Raises:
-        InputError: If the file has another ending.
+        InputError: If the file has another extension.
     """
     path = Path(path)
     if path.suffix in (".dot", ".gv"):
@@ -76,7 +76,7 @@ def draw_figure(template: SharedControlTemplate) -> "Figure":
     axes.set_axis_off()
     axes.set_xlim(-width / 2 - 0.2, (len(template.states) - 1) * (width + gap) + width / 2 + 0.2)
     axes.set_ylim(-1.4, 1.4)
-    plain: Any = {"parse_math": False}  # a dollar sign in a name is no math
+    plain: Any = {"parse_math": False}  # so that a dollar sign in a name does not start a formula
     x = {state.name: i * (width + gap) for i, state in enumerate(template.states)}
     for number, state in enumerate(template.states):
         box = {

@@ -91,7 +91,7 @@ def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
 
 
 def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
-    """Return the `angle_between` two rotation matrices (3, 3) [rad]."""
+    """Return the angle [rad] between two rotation matrices (3, 3), as `angle_between`."""
     # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; a trace loses half of the digits near zero.
     difference = R_WA - R_WB
     chord = math.sqrt(float(np.vdot(difference, difference)))
@@ -99,7 +99,7 @@ def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
 
 
 def pose_distance(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
-    """Return the distance of two poses, the larger of [m] and [rad]."""
+    """Return the distance of two poses, the larger of the distance [m] and the angle [rad] between them."""
     return max(math.dist(X_WA.translation(), X_WB.translation()), angle_between(X_WA.rotation(), X_WB.rotation()))
 
 
@@ -114,7 +114,7 @@ def largest(violations: Iterable[float]) -> float:
 
 
 def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:
-    """Return the pose a fraction of the way from A to B: on a line in position, about one axis in orientation."""
+    """Return the pose at a fraction of the motion from A to B, along a line and about a constant axis."""
     if fraction == 1.0:
         return X_WB
     p_WA, p_WB = X_WA.translation(), X_WB.translation()

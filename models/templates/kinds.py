@@ -1,7 +1,7 @@
 """Registries of the kinds of input mapping, active constraint and transition distance.
 
-A kind is a frozen dataclass whose fields are the entries that a template file may give, with the unit in the name. It
-is registered under the name that the file uses:
+A kind is a frozen dataclass whose fields are the entries that a template file may give, with the unit in the name of
+each. A kind is registered under the name that the file uses:
 
     @register(ACTIVE_CONSTRAINTS, "half_space")
     @dataclass(frozen=True)
@@ -25,7 +25,7 @@ def register(registry: dict[str, type], name: str) -> Callable[[Kind], Kind]:
 
     Args:
         registry: `INPUT_MAPPINGS`, `ACTIVE_CONSTRAINTS` or `TRANSITION_DISTANCES`.
-        name: value of `kind` in a file, not registered yet.
+        name: Value of `kind` in a file, not registered yet.
 
     Raises:
         ValueError: If the name is taken.

@@ -24,11 +24,11 @@ class InputMapping(ABC):
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        """Return ΔH during one period for all inputs of the template, each in [−1, 1]."""
+        """Return ΔH of one period; `inputs` are all inputs of the template, each in [−1, 1]."""
 
     @property
     def used_inputs(self) -> tuple[int, ...]:
-        """Numbers of the inputs that the mapping uses, its field `inputs` by default."""
+        """Numbers of the inputs that the mapping uses; by default the field `inputs`."""
         return self.inputs
 
     @property
@@ -109,8 +109,8 @@ class Rotation(InputMapping):
 class TiltTowards(InputMapping):
     """Tilt towards a frame.
 
-    Two inputs are a horizontal vector in the frame. Its component along the bearing of the end effector is the tilt's
-    speed, as a fraction of full speed.
+    Two inputs form a horizontal vector in the frame. The component of this vector along the bearing of the end effector
+    is the speed of the tilt, as a fraction of full speed.
     """
 
     inputs: tuple[int, ...]  # numbers of two inputs, from 0
@@ -152,9 +152,9 @@ class Scaled(ScaledMapping):
     """Another mapping with its inputs multiplied by a factor that depends on the distance to a frame."""
 
     frame: str  # frame of the object to which the distance is measured
-    distance_m: tuple[float, ...]  # increasing
+    distance_m: tuple[float, ...]  # distances to the frame's origin, increasing
     factor: tuple[float, ...]  # factors in [0, 1], one for each distance; linear in between
-    of: InputMapping  # the scaled mapping, an entry with its own kind
+    of: InputMapping  # mapping whose inputs are scaled, an entry with its own kind
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -176,13 +176,13 @@ class Scaled(ScaledMapping):
 class Uneven(ScaledMapping):
     """Another mapping with different factors for positive and negative inputs.
 
-    A zero input still commands no motion, but random inputs drift in the faster direction on average. Otherwise random
-    exploration would move away from a goal as often as towards it.
+    A zero input still commands no motion, but random inputs drift in the faster direction on average. With equal
+    factors, random exploration would move away from a goal as often as towards it.
     """
 
     above: float  # factor of positive inputs, in (0, 1]
     below: float  # factor of negative inputs, in (0, 1]
-    of: InputMapping  # the scaled mapping, an entry with its own kind
+    of: InputMapping  # mapping whose inputs are scaled, an entry with its own kind
 
     def __post_init__(self) -> None:
         require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")

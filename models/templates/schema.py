@@ -1,4 +1,4 @@
-"""Reader of shared control templates from YAML files, which refuses a faulty file in one sentence."""
+"""Reader of shared control templates from YAML files; a faulty file raises an InputError of one sentence."""
 
 import ast
 import dataclasses
@@ -38,9 +38,9 @@ from guiderail.models.templates.template import SharedControlTemplate, TemplateS
 from guiderail.models.templates.transitions import TransitionDistance
 
 MAX_STATES = 30
-MAX_PARTS = 30  # mappings, constraints or transitions of one state
-MAX_EXPRESSION = 200  # characters
-MAX_NUMBER = 1e6  # in any unit of a template: meters, degrees, radians, seconds
+MAX_PARTS = 30  # largest number of mappings, of constraints and of transitions of one state
+MAX_EXPRESSION = 200  # largest length of an expression [characters]
+MAX_NUMBER = 1e6  # largest magnitude of a number, in any unit of a template
 
 _OPERATORS: dict[type, Callable[..., float]] = {
     ast.Add: operator.add,
@@ -57,7 +57,7 @@ def load_template(source: str | Path, **parameters: float) -> SharedControlTempl
     Args:
         source: Path of a .yaml or .yml file, or the name of a shipped template: `pouring`, `pouring_aimed`,
             `grid_clamp` or `end_effector_velocity`.
-        **parameters: Sizes of the objects at hand. They replace values under `parameters` in the file.
+        **parameters: Values, such as sizes of objects, that replace those under `parameters` in the file.
 
     Raises:
         InputError: If the file cannot be read or is not a valid template.
@@ -94,7 +94,7 @@ def _load_shipped(path: Path) -> Any:
 
 
 def _calculate(node: ast.expr, parameters: Mapping[str, float] | None) -> float:
-    """Return the value of arithmetic on the names of parameters; None: names are not allowed."""
+    """Return the value of arithmetic on the names of parameters; if `parameters` is None, names are not allowed."""
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         return float(node.value)  # type: ignore[arg-type]
     if isinstance(node, ast.Name):
@@ -137,7 +137,7 @@ def _number(entry: Any, info: ValidationInfo) -> float:
 
 
 def _name(text: str) -> str:
-    """Accept a text that fits into a sentence and a figure."""
+    """Return `text` if it is short and printable enough for a message and a figure."""
     if not (0 < len(text) <= 100 and text.isprintable()):
         raise ValueError(f"{brief(text)} can't name anything; use a short text")
     return text
@@ -162,7 +162,7 @@ FIELD_TYPES = {
 
 
 class _Entry(BaseModel):
-    """Base of the mappings in a template file; an unknown field is refused with the nearest known one."""
+    """Base class of the entries of a template file; an error about an unknown field suggests the nearest known one."""
 
     @model_validator(mode="before")
     @classmethod
@@ -173,13 +173,13 @@ class _Entry(BaseModel):
         return data
 
     def build(self, kind: type, **fields: Any) -> Any:
-        """Return an instance of a dataclass with the fields that the file gives, and further ones."""
+        """Return an instance of a dataclass with the fields that the file gives, and `fields`."""
         return kind(**{key: getattr(self, key) for key in self.model_fields_set - {"kind"}}, **fields)
 
 
 @lru_cache
 def _union(kinds: tuple[tuple[str, type], ...]) -> TypeAdapter[Any]:
-    """Return the discriminated union of registered kinds; another registration makes another union."""
+    """Return the discriminated union of registered kinds; it is cached until another kind is registered."""
     models: Any = tuple(_kind_model(name, kind) for name, kind in kinds)
     return TypeAdapter(Annotated[Union[models], Field(discriminator="kind")])  # noqa: UP007  (of a tuple)
 
@@ -212,7 +212,7 @@ class _State(_Entry):
 
 @lru_cache
 def _state_model(unit: str) -> Any:
-    """Return the type of a state whose transition distance is in `unit`, "m" or "deg"; it holds SI units."""
+    """Return the type of a state with a transition distance in `unit`, "m" or "deg"; values are converted to SI."""
     si = math.pi / 180 if unit == "deg" else 1.0
     number: Any = Annotated[Number, AfterValidator(lambda value: si * value)]
     margin: Any = Annotated[Positive, AfterValidator(lambda value: si * value)]
@@ -236,7 +236,7 @@ def _state_model(unit: str) -> Any:
 
 
 class _MeasuredState(BaseModel):
-    """The part of a state that determines the unit of the others."""
+    """Field of a state that determines the unit of the other fields."""
 
     transition_distance: AnyDistance
 
@@ -256,7 +256,7 @@ def _state(entry: Any, info: ValidationInfo) -> Any:
 class TemplateFile(_Entry):
     """Content of a template file."""
 
-    # First, because the expressions in the other fields need their values.
+    # This field is first, because the expressions in the other fields need the values of the parameters.
     parameters: dict[ParameterName, Number] = Field({}, validate_default=True)
     name: Name
     inputs: StrictInt = Field(ge=1, le=6)
@@ -303,7 +303,7 @@ def _read(data: Any, where: str, given: Mapping[str, float]) -> SharedControlTem
 
 
 def _check_references(template: SharedControlTemplate, state: TemplateState) -> None:
-    """Refuse states, frames and inputs that a state names and the template does not have."""
+    """Raise an InputError if a state names a state, frame or input that the template does not have."""
     for transition in state.transitions:
         names = [other.name for other in template.states]
         _check_known(f"states.{state.name}: there is no state", transition.to, names)

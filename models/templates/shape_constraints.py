@@ -33,7 +33,7 @@ class Outside(PositionConstraint):
         return p_FE if distance >= 0.0 else p_FE + (shapes.CLEARANCE - distance) * normal
 
     def at(self, X_WLast: RigidTransform, frames: Frames) -> HalfSpace:
-        """Return the constraint of the command after X_WLast."""
+        """Return the half-space to which the command after X_WLast is constrained."""
         normal, offset = self.shape.half_space(position_in(self.frame, X_WLast, frames))
         return HalfSpace(tuple(normal), offset + shapes.CLEARANCE, self.frame)
 
@@ -43,7 +43,7 @@ class Outside(PositionConstraint):
 class OutsideSphere(Outside):
     """Outside of a sphere."""
 
-    radius_m: float  # radius of the sphere, with the distance to keep
+    radius_m: float  # radius of the sphere, including the distance to keep
     center_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # center in F
     frame: str = WORLD  # F: frame of an object, or `world`
 
@@ -64,9 +64,9 @@ class OutsideCylinder(Outside):
 
     frame: str  # F: frame of an object, or `world`
     radius_m: float  # radius of the cylinder
-    min_m: float  # z of its lower face
-    max_m: float  # z of its upper face
-    margin_m: float = 0.0  # distance to keep from it
+    min_m: float  # z of the lower face in F
+    max_m: float  # z of the upper face in F
+    margin_m: float = 0.0  # distance to keep from the cylinder
 
     def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
@@ -87,7 +87,7 @@ class OutsideBox(Outside):
     lower_m: tuple[float, ...]  # lower corner in F
     upper_m: tuple[float, ...]  # upper corner in F
     frame: str = WORLD  # F: frame of an object, or `world`
-    margin_m: float = 0.0  # distance to keep from it
+    margin_m: float = 0.0  # distance to keep from the box
 
     def __post_init__(self) -> None:
         require_three(self.lower_m, "lower_m")

@@ -1,4 +1,4 @@
-"""Shared control templates: data, and laws as functions of a state and a pose (thesis, section 2.3)."""
+"""Shared control templates: their data, and their laws as functions of a state and a pose (thesis, section 2.3)."""
 
 import math
 from collections.abc import Mapping
@@ -24,12 +24,13 @@ BACKTRACKS = 8  # attempts with a shortened displacement before the last command
 class Transition:
     """Transition to the state `to` when the distance of the present state falls below a threshold.
 
-    With a hysteresis, `to` returns to the present state when that state's distance exceeds below + hysteresis.
+    With a hysteresis, the template returns from `to` to the present state when the distance of the present state
+    exceeds below + hysteresis.
     """
 
     to: str
     below: float  # threshold [m] or [rad], in the unit of the state's distance
-    hysteresis: float | None = None  # [m] or [rad]; None: no return
+    hysteresis: float | None = None  # return threshold minus `below` [m] or [rad]; None: no return
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Command:
 class SharedControlTemplate:
     """Prior knowledge of a task as a state machine with input mappings and active constraints.
 
-    Users and policies act through the same template. An argument `frames` of a method holds the poses X_WF of the
+    Users and policies act through the same template. The argument `frames` of the methods holds the poses X_WF of the
     template's object frames by name.
 
     Attributes:
@@ -101,7 +102,7 @@ class SharedControlTemplate:
         """Return the number of the state with the name `state`.
 
         Raises:
-            InputError: If there is none.
+            InputError: If there is no such state.
         """
         for number, candidate in enumerate(self.states):
             if candidate.name == state:
@@ -134,7 +135,7 @@ class SharedControlTemplate:
         return X_WE
 
     def violation(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the largest violation of an active constraint, the larger of [m] and [rad]; 0 inside."""
+        """Return the largest violation of an active constraint, in position [m] or angle [rad]; 0 inside."""
         return largest(c.violation(X_WE, frames) for c in self.states[state].grouped_constraints)
 
     def command(
@@ -144,10 +145,10 @@ class SharedControlTemplate:
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. The same is done if one constraint undoes another. Constraints to stay outside of a shape are linearized
-        at the last command, so that the way to the command is outside too. From a last command inside the constraints,
-        every command is inside. A last command outside (at the start of an episode, or after an object moved) is led
-        inside at the largest speed.
+        object. It is also scaled down if one constraint undoes another. Constraints to stay outside of a shape are
+        linearized at the last command, so that the line to the new command is outside too. From a last command inside
+        the constraints, every command is inside. A last command outside (at the start of an episode, or after an object
+        moved) is led inside at the largest speed.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._load(X_WLast, X_WRequest, period_s))
@@ -171,7 +172,7 @@ class SharedControlTemplate:
     def _constraints_at(
         self, state: int, X_WLast: RigidTransform, frames: Frames
     ) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
-        """Return a state's constraints of the command after X_WLast, in their order."""
+        """Return the constraints of a state on the command after X_WLast, in their order."""
         phase = self.states[state]
         if not phase.has_linearized_constraints:
             return phase.grouped_constraints
@@ -181,7 +182,7 @@ class SharedControlTemplate:
         )
 
     def can_enter(self, state: int, X_WLast: RigidTransform, frames: Frames, period_s: float) -> bool:
-        """Return True if one period leads from the last command into a state's active constraints."""
+        """Return True if one period is enough to move from the last command into a state's active constraints."""
         X_WE = self.project(state, X_WLast, frames)
         return self._load(X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
 
@@ -189,7 +190,7 @@ class SharedControlTemplate:
         return self.violation(state, X_WE, frames) <= INSIDE
 
     def _load(self, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
-        """Return the speed between two commands divided by the largest speed, the larger of both kinds."""
+        """Return the speed between two poses relative to its limit, the larger of translation and rotation."""
         difference = X_WE.translation() - X_WLast.translation()
         return max(
             math.sqrt(difference @ difference) / (self.max_speed_m_per_s * period_s),
@@ -198,7 +199,7 @@ class SharedControlTemplate:
 
     @cached_property
     def _exits(self) -> tuple[tuple[tuple[int, float, int, float], ...], ...]:
-        """Exits of each state, forward ones first: state of the distance, sign, next state, threshold."""
+        """Exits of each state, forward ones first: state whose distance is tested, sign, next state, threshold."""
         forward: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         back: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         for number, state in enumerate(self.states):
@@ -212,8 +213,8 @@ class SharedControlTemplate:
     def next_state(self, state: int, X_WE: RigidTransform, frames: Frames, period_s: float | None = None) -> int:
         """Return the state after `state`, at most one transition away.
 
-        With `period_s`, X_WE is the last command, and a state whose constraints it cannot reach in one period is not
-        entered yet.
+        If `period_s` is given, X_WE is the last command, and a state is not entered while its constraints cannot be
+        reached from X_WE in one period.
         """
         for source, sign, target, threshold in self._exits[state]:
             distance = self.states[source].transition_distance.value(X_WE, frames)
@@ -225,7 +226,7 @@ class SharedControlTemplate:
     def state_at(self, X_WE: RigidTransform, frames: Frames) -> int:
         """Return the state in which an episode begins at X_WE.
 
-        It is `initial_state`, or the one reached from there by the transitions that fire at X_WE.
+        The state is `initial_state`, or the one reached from it by the transitions that fire at X_WE.
         """
         state = self.initial_state
         for _ in self.states:
@@ -252,7 +253,7 @@ class SharedControlTemplate:
         return tuple(progress)
 
     def progress(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the progress in the task: that of previous phases plus the weighted decrease of this one's distance.
+        """Return the progress in the task: that of previous phases plus the weighted decrease of this phase's distance.
 
         An increase of progress is d_{t−1} − d_t of equation 3.2, on one scale for all phases. Progress is continuous at
         a transition if the distance of the next phase is its starts_at there.

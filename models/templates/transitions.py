@@ -40,7 +40,7 @@ class Distance(TransitionDistance):
     """Distance ‖p_FE − point_m‖ of the end effector's origin from a point of F."""
 
     frame: str  # F: frame of an object, or `world`
-    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # the point, in F
+    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # point in F
 
     def __post_init__(self) -> None:
         require_three(self.point_m, "point_m")
@@ -78,7 +78,7 @@ class AxisDistance(TransitionDistance):
 @register(TRANSITION_DISTANCES, "tilt_to_go")
 @dataclass(frozen=True)
 class TiltToGo(TransitionDistance):
-    """Remaining tilt towards F's z axis, until_deg minus the present one."""
+    """Remaining tilt towards F's z axis, until_deg minus the present tilt."""
 
     frame: str  # F: frame of an object, or `world`
     until_deg: float  # tilt at which the distance is zero

@@ -1,7 +1,7 @@
-"""Checks of a template that go beyond those of reading its file.
+"""Checks of a template beyond those that are made when its file is read.
 
 The checks place the template's objects and the end effector at random near each other and evaluate the template's laws.
-They find a fault that shows in one pose of a few hundred; a rarer one may remain.
+A fault that occurs in less than one of a few hundred poses may not be found.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,20 +14,20 @@ from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates.geometry import Frames, pose_distance
 from guiderail.models.templates.template import SharedControlTemplate
 
-SAMPLES = 200  # poses of the end effector
+SAMPLES = 200  # number of sampled poses of the end effector
 REACH = 0.6  # largest distance of a sampled pose from an object [m]
-TOLERANCE = 1e-9  # [m or rad]
-GREEDY_STEPS = 400  # steps of a search for a transition
-GREEDY_PERIOD = 0.05  # [s]
-CONTROL_PERIOD = 0.01  # [s]
-ARRIVALS = 5  # approaches of each transition
+TOLERANCE = 1e-9  # largest error that counts as rounding [m or rad]
+GREEDY_STEPS = 400  # largest number of steps of a search for a transition
+GREEDY_PERIOD = 0.05  # time step of a search [s]
+CONTROL_PERIOD = 0.01  # time step of a search close to the threshold of a transition [s]
+ARRIVALS = 5  # largest number of searches that approach each transition
 
 Scenes = Sequence[tuple[RigidTransform, Frames]]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An error, or a remark."""
+    """Error in a template or remark about it."""
 
     is_error: bool
     message: str
@@ -56,7 +56,7 @@ def _sample_scene(
         yaw = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
         frames[name] = RigidTransform(yaw, rng.uniform(-0.3, 0.3, 3))
     X_WF = frames[template.frames[rng.integers(len(frames))]] if frames else RigidTransform()
-    # Uniform in the distance: constraints are closest to each other near an object.
+    # Sampled uniformly in the distance, because constraints are closest to each other near an object.
     p_FE = rng.normal(size=3)
     p_FE *= REACH * rng.uniform() / np.linalg.norm(p_FE)
     R_FE = RotationMatrix(Rotation.random(rng=rng).as_matrix())
@@ -85,7 +85,7 @@ def _find_unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
 
 
 def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
-    """Check that each constraint and their sequence are idempotent, and that the sequence satisfies all of them."""
+    """Check that each constraint and their sequence are idempotent, and that the sequence satisfies all constraints."""
     for number, state in enumerate(template.states):
         for i, constraint in enumerate(state.active_constraints):
             name = f"{state.name}: active constraint {i + 1} ({type(constraint).__name__})"
@@ -122,7 +122,7 @@ def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Itera
             ((template.project(number, X, frames), frames) for X, frames in scenes),
             key=lambda start: template.distance(number, *start),
         )
-        # From the nearest pose and from several others: one success proves that the threshold can be reached.
+        # Search from the nearest pose and from several others: one success proves that the threshold can be reached.
         best = np.inf
         for X, frames in [starts[0], *starts[len(starts) // 2 :: len(starts) // 8]]:
             best = min(best, _greedy(template, number, X, frames, lowest)[0])
@@ -149,7 +149,7 @@ def _greedy(
     enough: float,
     period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
-    """Return the least distance, and its pose, that a greedy choice of one full input at every step reaches."""
+    """Return the least distance, and the last pose, of a greedy search that applies one full input at every step."""
     candidates = [sign * row for row in np.eye(template.inputs) for sign in (1.0, -1.0)]
     best = template.distance(number, X_WE, frames)
     for _ in range(GREEDY_STEPS):
@@ -168,7 +168,7 @@ def _greedy(
 
 
 def _check_arrivals(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
-    """Check that a due transition does not wait: one control step must lead into the next state's constraints."""
+    """Check that a transition fires at its threshold: one control step must lead into the next state's constraints."""
     reach = GREEDY_PERIOD * max(template.max_speed_m_per_s, template.max_speed_rad_per_s)
     for number, state in enumerate(template.states):
         inside = [(template.project(number, X, frames), frames) for X, frames in scenes]
@@ -176,7 +176,7 @@ def _check_arrivals(template: SharedControlTemplate, scenes: Scenes) -> Iterator
             target, arrived, waiting, worst = template.index(transition.to), 0, 0, 0.0
             before = [start for start in inside if template.distance(number, *start) >= transition.below]
             for X, frames in before[:ARRIVALS]:
-                # The last part at the control period: a longer step would overshoot the threshold.
+                # The last part uses the control period, because a longer step would overshoot the threshold.
                 _, X_WE = _greedy(template, number, X, frames, transition.below + reach)
                 distance, X_WE = _greedy(template, number, X_WE, frames, transition.below, CONTROL_PERIOD)
                 if distance < transition.below:

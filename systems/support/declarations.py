@@ -64,7 +64,7 @@ class SignalPorts:
 
 
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
-    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` is its description."""
+    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` describes it."""
     try:
         takes = signature(function)
     except (ValueError, TypeError):
@@ -90,7 +90,7 @@ def declare_sample(system: LeafSystem, port: InputPort, period: float) -> Discre
 
     Args:
         system: System under construction.
-        port: Its vector input port.
+        port: Vector input port of the system.
         period: Sampling period [s].
 
     Returns:

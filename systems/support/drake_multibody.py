@@ -1,4 +1,4 @@
-"""Drake's multibody types: poses to and from its rigid transforms, and the joint dynamics of a plant."""
+"""Conversion between poses and Drake's rigid transforms, and joint dynamics of a plant."""
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -18,7 +18,7 @@ class JointDynamics:
         self._plant, self._damping = plant, np.concatenate([joint.default_damping_vector() for joint in joints])
 
     def evaluate(self, plant_context: Context) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mass matrix (n, n) and the torques (n,) [Nm] in the state of the plant's context."""
+        """Return the mass matrix (n, n) and the torques of Coriolis forces and damping (n,) [Nm]."""
         drag = self._plant.CalcBiasTerm(plant_context) + self._damping * self._plant.GetVelocities(plant_context)
         return self._plant.CalcMassMatrix(plant_context), drag
 
@@ -34,7 +34,7 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
 
 
 def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
-    """Return the quaternion (η, ε) of R_desired Rᵀ with η ≥ 0, the shorter rotation, which has no singularity."""
+    """Return the quaternion (η, ε) of R_desired Rᵀ with η ≥ 0, which is the shorter rotation and has no singularity."""
     q = (R_desired @ R.inverse()).ToQuaternion()
     sign = 1.0 if q.w() >= 0.0 else -1.0
     return sign * q.w(), sign * q.xyz()

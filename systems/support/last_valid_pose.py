@@ -9,7 +9,7 @@ from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period
 
-_TIME_TOLERANCE = 1e-6  # [s], far above the rounding error of a time of days, far below any period
+_TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s], far above rounding errors after days, far below any period
 
 
 class CommandValidity:
@@ -57,8 +57,8 @@ class LastValidPose:
 
     Args:
         system: System under construction, in which two states and two events are declared.
-        desired_pose: Its input port of the command, (O,).
-        command_time: Its input port of the time stamp, (1,) [s]; if it is not connected, commands never time out.
+        desired_pose: Input port of the command, (O,).
+        command_time: Input port of the time stamp, (1,) [s]; if it is not connected, commands never time out.
         measured_pose: Function of the system's context that returns the measured pose, (O,), for initialization.
         period: Period of the check [s], positive; ideally the period of the commands.
         timeout: Age above which a command is stale [s], positive.

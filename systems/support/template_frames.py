@@ -15,13 +15,13 @@ from guiderail.systems.support.declarations import declare_cache
 class TemplateFrames:
     """Object frames of a template, declared as numeric parameters of a LeafSystem.
 
-    They are parameters because they are constant during an episode: a guidance diagram has the same ports as all
-    guidance, and a reset moves an object with `set`.
+    The frames are constant during an episode, so they are parameters instead of input ports: a guidance diagram needs
+    no additional port, and a reset moves an object with `set`.
 
     Args:
-        system: System that gets the parameters; its outputs depend on `ticket`.
+        system: System under construction; its outputs that use the frames depend on `ticket`.
         template: Template with the frames.
-        frames: Default poses, one for each frame's name.
+        frames: Default poses by name of the frame.
 
     Raises:
         InputError: If a frame of the template is missing or not finite.
@@ -50,7 +50,7 @@ class TemplateFrames:
         return self._names
 
     def eval(self, context: Context) -> dict[str, RigidTransform]:
-        """Return the poses by name; `context` is that of the system."""
+        """Return the poses by name; `context` is the system's."""
         return self._cache.Eval(context)
 
     def set(self, context: Context, frames: Mapping[str, RigidTransform]) -> None:

@@ -13,7 +13,7 @@ import typer.core
 
 from guiderail.models.common.errors import InputError
 
-COLUMN = 19  # characters of a value in a table with several columns
+COLUMN = 19  # width of a value in a table with several columns [characters]
 
 
 def print_message(sentence: str) -> None:
@@ -68,7 +68,7 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
         typer.echo("  ".join([f"{labels[key]:<{width}}", *(f"{text:<{COLUMN}}" for text in cells)]).rstrip())
 
 
-# Commands import their tools when they are called, because PyTorch and Drake take seconds to import: `--help` is fast.
+# Commands import their tools when they are called, because PyTorch and Drake take seconds to import.
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 

@@ -1,4 +1,4 @@
-"""Entry point of the installed `guiderail` script, which also runs where the extras are missing."""
+"""Entry point of the installed `guiderail` script, which also starts if optional dependencies are missing."""
 
 import sys
 

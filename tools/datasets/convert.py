@@ -38,12 +38,12 @@ def import_recording(
         out: File to write, .npz or .csv; it must not exist.
         signal: ROS topic or LeRobot feature; by default the only one with suitable data. Not for CSV files.
         target: Pose of the task's target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees.
-        rate: Sampling rate of the result [1/s]; that of the recording by default.
+        rate: Sampling rate of the result [1/s]; the recording's by default.
         csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
 
     Raises:
-        InputError: If the source cannot be read, a unit or signal that it does not state is not given, or `out` cannot
-            be written.
+        InputError: If the source cannot be read, a required unit or signal is neither stated in it nor given, or
+            `out` cannot be written.
     """
     if out.suffix not in ENDINGS:
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
@@ -88,7 +88,7 @@ def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None
         source: File of demonstrations, or a folder of files.
         out: Folder to write; it must not exist.
         kind: Key of `WRITERS`.
-        rate: Sampling rate of the result [1/s]; that of the demonstrations by default.
+        rate: Sampling rate of the result [1/s]; the demonstrations' by default.
 
     Raises:
         InputError: For an unknown format, demonstrations that it cannot represent, or a folder that cannot be written.

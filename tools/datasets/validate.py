@@ -62,7 +62,7 @@ def fit_bounds(
     demonstrations = load_demonstrations(file)
     bounds = compute_bounds(demonstrations, phases, margin, min_margin, outputs)
     values = as_values(bounds)
-    # The task's bounds are written last, once they are valid: a picture can be drawn again.
+    # The new task file is validated before anything is written, and written last, after the other files succeeded.
     task_file = None if task is None else _with_bounds(task, values)
     if draw is not None:
         _draw(bounds, demonstrations, draw)
@@ -83,7 +83,7 @@ def fit_bounds(
 
 
 def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
-    """Return the value of `bounds` in a task folder; an unbounded output is None."""
+    """Return bounds as values for a task file; None for an unbounded output."""
 
     def plain(rows: np.ndarray) -> list[Any]:
         lists = [[float(f"{value:.9g}") if np.isfinite(value) else None for value in row] for row in rows]
@@ -115,7 +115,7 @@ def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> Non
     save_figure(figure, picture)
 
 
-_MAX_COMPONENTS = 8  # of the mixture with which demonstrations are compared with a default primitive
+_MAX_COMPONENTS = 8  # largest number of mixture components in the comparison with a default primitive
 
 
 def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | None:
@@ -128,7 +128,7 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
     Raises:
         InputError: For an unknown task or option.
     """
-    from guiderail.diagrams.envs.config import EnvConfig  # Drake takes a second
+    from guiderail.diagrams.envs.config import EnvConfig  # imports Drake, which takes a second
     from guiderail.diagrams.envs.options import kernel_from_options
 
     config = EnvConfig.resolve(task, environment)
@@ -147,11 +147,11 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
 
 
 def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
-    """Read demonstrations and return their number, durations, ranges, spread, and how a default primitive follows them.
+    """Read demonstrations and return their number, durations, ranges, spread, and the deviation of a default primitive.
 
     Args:
         file: File of demonstrations, or a folder of files.
-        draw: Picture of their mean, covariance and bounds to write.
+        draw: Picture to write, with the mean, two standard deviations and the range.
         fit: Whether a primitive is fitted to them, which takes seconds.
 
     Raises:
@@ -202,7 +202,7 @@ def _follow_by_default(common: Demonstrations) -> dict[str, Any]:
 
 
 def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
-    """Return the parameters of a primitive that reproduces the demonstrations, the reason, and the defaults' result.
+    """Return the parameters of a primitive that reproduces the demonstrations, and the result of the defaults.
 
     Raises:
         InputError: If there are too few demonstrations.
@@ -224,7 +224,7 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
 
 
 def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
-    """Draw resampled demonstrations, the mean and two standard deviations of the reference, and their bounds."""
+    """Draw resampled demonstrations, the mean and two standard deviations of the reference, and the range."""
     from guiderail.tools.visualization.style import new_figure, save_figure
 
     outputs = np.stack(common.outputs)
@@ -292,7 +292,7 @@ def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
 
 
 def _describe_transition(state: Any, transition: Any) -> str:
-    """Return a transition as text, with its unit and the threshold of the way back."""
+    """Return a transition as text, with its unit and the threshold of the transition back."""
     unit = SI_UNITS[state.transition_distance.unit]
     text = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
     if transition.hysteresis is None:

@@ -13,47 +13,47 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn
 
-HOLD = 10  # actions that `random_hold` repeats
-SWITCH_PROBABILITY = 0.1  # probability per action that `bang_bang` samples another corner
+HOLD = 10  # number of times that `random_hold` applies each action
+SWITCH_PROBABILITY = 0.1  # probability per action that `bang_bang` samples a corner again
 
-# Makes the policy of an episode from its random generator and the size of an action.
+# Function that makes the policy of an episode from a random generator and the size of an action.
 BaselineFactory = Callable[[np.random.Generator, int], PolicyFn]
-# Makes a policy for an environment.
+# Function that makes a policy for an environment.
 MakePolicy = Callable[[gymnasium.Env], PolicyFn]
 
 
 def zero(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return the zero action: guidance alone, which follows the demonstrations where there are some."""
+    """Return the policy of zero actions: guidance alone, which follows the demonstrations if there are any."""
     return lambda observation: np.zeros(size, np.float32)
 
 
 def uniform_random(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return independent uniform actions in [−1, 1], as of an untrained policy."""
+    """Return a policy of independent uniform actions in [−1, 1], as an untrained policy has."""
     return lambda observation: rng.uniform(-1.0, 1.0, size)
 
 
 def constant(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return one uniform action in [−1, 1] for the whole episode."""
+    """Return a policy of one uniform action in [−1, 1] for the whole episode."""
     return _repeat(lambda: rng.uniform(-1.0, 1.0, size), lambda count: False)
 
 
 def random_hold(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return uniform actions, each repeated `HOLD` times: they lead further than independent ones."""
+    """Return a policy of uniform actions, each applied `HOLD` times, which lead further than independent actions."""
     return _repeat(lambda: rng.uniform(-1.0, 1.0, size), lambda count: count % HOLD == 0)
 
 
 def bang_bang(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return actions at a corner of [−1, 1]^A, which is sampled again with `SWITCH_PROBABILITY`."""
+    """Return a policy of actions at a corner of [−1, 1]^A, which is sampled again with `SWITCH_PROBABILITY`."""
     return _repeat(lambda: rng.choice([-1.0, 1.0], size), lambda count: rng.uniform() < SWITCH_PROBABILITY)
 
 
 def random_corner(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return one corner of [−1, 1]^A for the whole episode."""
+    """Return a policy of one random corner of [−1, 1]^A for the whole episode."""
     return _repeat(lambda: rng.choice([-1.0, 1.0], size), lambda count: False)
 
 
 def _repeat(sample: Callable[[], np.ndarray], is_due: Callable[[int], bool]) -> PolicyFn:
-    """Return a policy that repeats a sampled action until `is_due` of the number of actions so far."""
+    """Return a policy that repeats a sampled action until `is_due(number of actions so far)`, then samples again."""
     count, action = 0, sample()
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -72,15 +72,15 @@ BASELINES: dict[str, BaselineFactory] = {
 
 
 class BaselinePolicy(Callback):
-    """Policy that ignores the observation, with a random generator of its own in every episode."""
+    """Policy that ignores the observation, with a new random generator in every episode."""
 
     def __init__(self, factory: BaselineFactory, env: gymnasium.Env, seed: int = 0):
         """Construct the policy.
 
         Args:
-            factory: Makes the policy of an episode.
+            factory: Function that makes the policy of an episode.
             env: Environment, for the size of its action only.
-            seed: Seed of the generators; episode i has [seed, i].
+            seed: Seed of the generators; episode i uses [seed, i].
         """
         self._factory, self._seed, self._episode = factory, seed, -1
         self._size = int(np.prod(env.action_space.shape or ()))
@@ -110,7 +110,7 @@ def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
 
 
 def scripted_policies(task: str, difficulty: str = STANDARD) -> Mapping[str, PolicyFn]:
-    """Return a task's scripted policies by name, the default for `difficulty` first; none if it is not guiderail's."""
+    """Return a task's scripted policies by name, the default for `difficulty` first; none for other tasks."""
     return TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
 
 

@@ -1,4 +1,4 @@
-"""Stored tables of evaluated episodes: CSV files, each named after everything that decides its rows."""
+"""Stored tables of evaluated episodes: CSV files, each named by a digest of everything that determines its rows."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_
 from guiderail.tools.tables import read_table, table_text
 
 POLICY = "policy"  # name of the run's own policy
-POLICY_FOLDER = "held_out"  # folder of its episodes, in the run
+POLICY_FOLDER = "held_out"  # folder of the policy's episodes, in the run
 BASELINES_FOLDER = "baselines"  # folder of the baseline policies' episodes, in the run
 
 
@@ -39,7 +39,7 @@ def episodes_file(
         config: Configuration of the run, for its task and seed.
         environment: Options of the environment.
         about: Anything else that the rows depend on, such as the digest of a learned policy.
-        how: Arguments of `evaluate_policy`; `label` and `processes` do not count.
+        how: Arguments of `evaluate_policy`; `label` and `processes` are ignored.
     """
     how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)
@@ -54,7 +54,7 @@ def policy_digest(folder: RunFolder) -> str:
 
 
 def stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield the name of each policy and its stored episodes in the run's own environment, with that first seed."""
+    """Yield the name of each policy and its stored episodes in the run's own environment that begin at `seed`."""
     digest = policy_digest(folder) if (folder.path / "policy.safetensors").is_file() else None
     for file in sorted(
         path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")

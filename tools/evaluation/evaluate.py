@@ -50,7 +50,7 @@ from guiderail.tools.visualization.style import is_demonstrated
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
-# Returns what is kept of an episode, from its environment and its row.
+# Function from an environment and an episode's row to the data that is kept of the episode.
 Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
 
 
@@ -67,23 +67,23 @@ def evaluate_policies(
 ) -> Iterator[tuple[str, pd.DataFrame, list[Any]]]:
     """Evaluate several policies on the same held-out episodes of one environment.
 
-    All episodes are distributed over processes, forks of this one. Conditions of an episode depend on its seed only,
-    so that the results do not depend on the number of processes. A policy that has a memory resets it in
-    `Callback.on_episode_start`; one that draws random numbers has a method `start_episode(index)`, which is called
-    before each episode, and seeds its generator there.
+    Episodes are distributed over forks of this process. The conditions of an episode depend only on its seed, so the
+    results do not depend on the number of processes. A policy with internal state resets it in
+    `Callback.on_episode_start`. A policy that draws random numbers has a method `start_episode(index)`, which is called
+    before each episode and seeds the policy's generator.
 
     Args:
-        env: Environment; what is constant in a run stays as it is, unless the reset option `new_run` is given.
+        env: Environment; values that are constant in a run stay the same unless the reset option `new_run` is given.
         policies: Policies by name.
-        episodes: Number of episodes of each.
-        seed: Seed of the first; episode i has seed + i.
+        episodes: Number of episodes of each policy.
+        seed: Seed of the first episode; episode i has seed + i.
         options: Further options of the resets.
-        labels: Names of progress bars on standard error by the policy's name; no bar by default.
-        collect: Returns what is kept of each episode.
+        labels: Labels of the progress bars on standard error, by policy name; no bar by default.
+        collect: Function that returns the data to keep of each episode.
         processes: Largest number of processes; None for the number of cores.
 
     Yields:
-        Name of a policy, its rows, and what was kept of each of its episodes.
+        Name of a policy, its rows, and the data that `collect` returned for each of its episodes.
 
     Raises:
         InputError: If a number is out of range.
@@ -122,7 +122,7 @@ def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how
         env: Environment.
         act: Policy.
         label: Name of the progress bar on standard error; no bar if empty.
-        how: Arguments of `evaluate_policies`.
+        how: Further arguments of `evaluate_policies`.
 
     Raises:
         InputError: If a number is out of range.
@@ -137,14 +137,14 @@ def evaluate_run(
     environment: Mapping[str, Any] | None = None,
     **how: Any,
 ) -> pd.DataFrame:
-    """Return the rows of held-out episodes in a run's environment, or with other options of it.
+    """Evaluate a policy in a run's environment, or with other environment options; return the episodes' rows.
 
-    Values that are hidden and constant in a run are those of its training.
+    Hidden values that are constant in a run are the same as in its training.
 
     Args:
         config: Configuration of the run.
-        make_policy: Makes the policy for the environment.
-        environment: Options of the environment; those of the run by default.
+        make_policy: Function from an environment to the policy.
+        environment: Options of the environment; by default the run's options.
         how: Arguments of `evaluate_policy`.
     """
     env = make_environment(config.task, config.environment if environment is None else environment)
@@ -165,19 +165,19 @@ def evaluate_once(
     about: Any = None,
     **how: Any,
 ) -> pd.DataFrame | None:
-    """Return the rows of held-out episodes from a folder, or evaluate and store them there.
+    """Return the stored rows of held-out episodes; if there are none, evaluate the policy and store its rows.
 
     Args:
-        folder: Folder of the files.
-        name: Name of the policy, in the file and as the default label of the progress.
-        config: Configuration of the run, for its task and its hidden values.
-        make_policy: Makes the policy for the environment.
+        folder: Folder of the stored tables.
+        name: Name of the policy, for the file name and the default label of the progress bar.
+        config: Configuration of the run, which decides the task and the hidden values.
+        make_policy: Function from an environment to the policy.
         environment: Options of the environment.
-        about: Anything else that the rows depend on.
+        about: Anything else that the rows depend on, such as the digest of a learned policy.
         how: Arguments of `evaluate_policy`.
 
     Returns:
-        None if the observation or action of the policy is not that of the environment.
+        Rows of the episodes, or None if the policy's observation or action shape does not match the environment.
     """
     file = episodes_file(folder, name, config, environment, about=about, **how)
     how.setdefault("label", name)
@@ -190,7 +190,7 @@ def evaluate_once(
 
 
 class _IncompatibleError(Exception):
-    """Policy with other observations or actions than an environment."""
+    """Error for a policy whose observation or action shape does not match the environment."""
 
 
 def _make_compatible(make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:
@@ -216,27 +216,28 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
 
-    The rows of the baseline policies are stored in the run's folder and used again; so are those of the run's policy in
-    its own environment, for a report.
+    The rows of the baseline policies are stored in the run's folder and used again. The rows of the run's policy in its
+    own environment are stored for a report.
 
     Args:
         policy: Folder of a run, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
             baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
             a model of Stable-Baselines3.
-        env: Name of the task, or an environment, that a policy without a run is evaluated in. An environment of another
-            origin is reset with the seed of the episode; `info["is_success"]` or `info["success"]` is its success.
+        env: Name of the task, or an environment, that a policy without a run is evaluated in. An environment that is
+            not of this package is reset with the seed of the episode and reports success as `info["is_success"]` or
+            `info["success"]`.
         episodes: Number of held-out episodes.
         baselines: Baseline policies: their names, or functions that make them for an environment, by name; None for the
-            default set of the task. The demonstration alone is always evaluated where the guidance has one.
-        environment: Options of the environment that differ from those of the run, or of the task's defaults.
-        seed: Seed of the first; episode i has seed + i.
+            default set of the task. The demonstration alone is always evaluated if the guidance has one.
+        environment: Options of the environment that differ from the run's options or the task's defaults.
+        seed: Seed of the first episode; episode i has seed + i.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it, see
             `evaluate_policies` for policies with a memory.
-        trust_policy: Read a policy's file that can execute code: a zip of Stable-Baselines3 or TorchScript.
+        trust_policy: True to read a policy file that can execute code: a zip of Stable-Baselines3 or TorchScript.
         resample_offsets: True if values that are hidden and constant in a run are sampled again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
-        signal: Poses that are saved: "commanded", which a primitive should learn under impedance control because the
-            contact force is in their difference from the measured ones, or "measured".
+        signal: Poses that are saved, "commanded" or "measured". Under impedance control a primitive should learn the
+            commanded poses, because their difference from the measured poses causes the contact force.
         describe_differences: Returns sentences on how a configuration differs from a reference, for `differences`.
 
     Returns:
@@ -350,7 +351,7 @@ def _baseline_file(subject: Subject, name: str, environment: Mapping[str, Any], 
 def _store(
     subject: Subject, name: str, rows: pd.DataFrame, environment: Mapping[str, Any], how: Mapping[str, Any]
 ) -> None:
-    """Store evaluated episodes in the run's folder: those of its policy only if they are in its own environment."""
+    """Store evaluated episodes in the run's folder; those of its policy only if evaluated in the run's environment."""
     file = _baseline_file(subject, name, environment, how)
     if file is None or subject.folder is None or subject.config is None:
         return
@@ -371,7 +372,7 @@ def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any
 
 
 def _training(folder: RunFolder | None) -> dict[str, Any]:
-    """Return the length of the training and its episodes to convergence, None without a table of its episodes."""
+    """Return the number of training episodes and the episodes to convergence; None without a table of episodes."""
     has_table = folder is not None and (folder.path / "episodes.csv").is_file()
     trained = folder.episodes() if folder is not None and has_table else None
     return {
@@ -389,14 +390,14 @@ class _DemonstrationRecorder:
         self._outputs: list[np.ndarray] = []
 
     def __call__(self, env: gymnasium.Env, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return times and poses of a successful episode; None of another one."""
+        """Return times and poses of a successful episode; None if the episode failed."""
         if not row["success"]:
             return None
         trace = cast(Any, env.unwrapped).trace
         return trace.period * np.arange(1, len(trace) + 1), getattr(trace, self._signal).copy()
 
     def keep(self, found: Sequence[tuple[np.ndarray, np.ndarray] | None]) -> None:
-        """Keep what was returned for the episodes."""
+        """Keep the times and poses of the successful episodes."""
         for times, outputs in filter(None, found):
             self._times.append(times)
             self._outputs.append(outputs)

@@ -18,7 +18,7 @@ COMPARED = (
     "max_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
 )  # fmt: skip
 """Statistics of the policy and of every baseline policy."""
-COLLISIONS = ("collisions", "collision_steps")  # those that need a task with a collision signal
+COLLISIONS = ("collisions", "collision_steps")  # statistics that need a task with a collision signal
 LABELS = {
     POLICY: "policy", "demonstration": "demonstration alone", "zero": "zero action",
     "uniform_random": "uniform random actions", "constant": "constant action", "scripted": "scripted policy",
@@ -31,8 +31,8 @@ class Comparison(NamedTuple):
 
     Attributes:
         baseline: Name of the baseline policy with the most successes.
-        successes: Number of its successes.
-        p: Probability of a difference at least as large if the policy were not better than every baseline policy.
+        successes: Number of successes of this baseline policy.
+        p: Largest p-value of the tests against each baseline policy; see `compare`.
     """
 
     baseline: str
@@ -40,7 +40,7 @@ class Comparison(NamedTuple):
     p: float
 
 
-@dataclass(frozen=True, eq=False)  # equal as mappings
+@dataclass(frozen=True, eq=False)  # compared as mappings
 class Evaluation(Mapping[str, Any]):
     """Result of `evaluate`, and a mapping of its statistics by name.
 
@@ -106,13 +106,13 @@ class Evaluation(Mapping[str, Any]):
 def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of a policy with that of baseline policies on the same episodes.
 
-    The test is McNemar's, exact and one-sided. Only episodes count in which exactly one of the two policies succeeds: a
-    policy that is not better wins half of them on average. Of all baseline policies the largest p counts, so that
-    "better than the best baseline" means better than each of them (intersection-union test), without a correction for
-    their number.
+    The test is McNemar's, exact and one-sided. Only episodes in which exactly one of the two policies succeeds count: a
+    policy that is not better wins half of them on average. The result is the largest p of all baseline policies,
+    so that "better than the best baseline" means better than each of them (intersection-union test). No correction for
+    their number is needed.
 
     Args:
-        rows: Episodes by the policy's name, with the same conditions in each; those of the policy are named `POLICY`.
+        rows: Episodes by policy name, under the same conditions for each; the evaluated policy is named `POLICY`.
 
     Returns:
         The comparison; None without a baseline policy.
@@ -131,7 +131,7 @@ def _mcnemar(won: Any, other: Any) -> float:
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
-    """Return the statistics `COMPARED` of episodes; None for one whose column the rows lack."""
+    """Return the statistics `COMPARED` of episodes; None for a statistic whose column the rows lack."""
     if not len(rows):
         return summary(rows, COMPARED, prefix)
     found: dict[str, Any] = {}

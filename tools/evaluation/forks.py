@@ -1,4 +1,4 @@
-"""Computation of independent results in forks of this process, which has imported and built everything already."""
+"""Computation of independent results in forks of this process, which inherit all that it has imported and built."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def num_cores() -> int:
 
 
 def check_processes(processes: int | None) -> int:
-    """Return a number of processes; that of the cores for None.
+    """Return `processes` unchanged, or the number of cores for None.
 
     Raises:
-        InputError: If it is less than 1.
+        InputError: If `processes` is less than 1.
     """
     if processes is None:
         return num_cores()
@@ -47,15 +47,15 @@ def can_fork() -> bool:
 class Forks:
     """Forks of this process, each of which computes one result at a time.
 
-    A fork starts with the state of this process, and changes of its state are lost in this one. It exits when this
-    process ends, even if this process is killed.
+    A fork starts with a copy of the state of this process, and its own changes do not reach this process. A fork exits
+    when this process ends, even if this process is killed.
     """
 
     def __init__(self, compute: Callable[[Any], Any], processes: int):
         """Start the processes.
 
         Args:
-            compute: Returns a result for an argument; both can be pickled.
+            compute: Function from an argument to a result; argument and result can be pickled.
             processes: Number of processes.
         """
         context = multiprocessing.get_context("fork")
@@ -122,7 +122,7 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
     the system cannot fork.
 
     Args:
-        compute: Returns a result that can be pickled.
+        compute: Function from an index to a result that can be pickled.
         count: Number of results.
         processes: Largest number of processes.
 
@@ -158,15 +158,15 @@ def _killed_error() -> KilledError:
 
 
 def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequence[Connection], parent: int) -> None:
-    """Answer each argument with its result until the other end is closed."""
+    """Compute and send the result of each received argument, until the other end of the connection is closed."""
     for one in others:
-        one.close()  # ends of the parent, which would keep this process alive after it
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its processes
-    # Locks of files that the parent holds are held by its forks, too.
+        one.close()  # the parent's ends, which would stay open after the parent has ended
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the parent ends its forks
+    # A fork inherits the parent's file locks, so it must not outlive the parent.
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
-    gc.freeze()  # a collection would visit, and so copy, everything that the parent has built
+    gc.freeze()  # a collection would write to, and so copy, the memory shared with the parent
     if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)  # threads of the parent do not exist here
+        sys.modules["torch"].set_num_threads(1)  # a fork does not have the parent's threads
     while True:
         try:
             argument = connection.recv()

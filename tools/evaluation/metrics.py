@@ -24,7 +24,7 @@ from guiderail.models.common.registry import did_you_mean
 
 CONFIDENCE = 0.95
 RESAMPLES = 1000
-TRIMMED_FRACTION = 0.25  # of the seeds at either end, for the interquartile mean
+TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
 TOLERANCE = 1e-9  # a violation up to this is rounding of the primitive's solver
 
@@ -42,9 +42,9 @@ def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def interquartile_mean(values: Sequence[float]) -> tuple[float, tuple[float, float] | None]:
-    """Return the mean without a quarter of the values at either end and its 95 % interval; None for a single value.
+    """Return the mean of the values without the lowest and the highest quarter, and its 95 % interval.
 
-    Of fewer than four values none is left out.
+    With fewer than four values, none is dropped. The interval is None for a single value.
     """
     array = np.asarray(values, float)
     mean = float(scipy.stats.trim_mean(array, TRIMMED_FRACTION))
@@ -74,7 +74,7 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 def wilson_of_each(successes: Sequence[int], episodes: Sequence[int]) -> list[tuple[float, float]]:
     """Return the 95 % Wilson interval of each seed's success rate.
 
-    There is no interval of all seeds together: episodes of one policy are independent, episodes of several policies are
+    No interval covers all seeds together: episodes of one policy are independent, episodes of several policies are
     not, because all episodes of one seed share what that seed learned.
     """
     return [wilson(won, of) for won, of in zip(successes, episodes, strict=True)]
@@ -90,7 +90,7 @@ def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[
         episodes: Number of episodes of each run.
 
     Returns:
-        Steps [episodes] and the fraction from each step on, (k,) each.
+        Numbers of episodes at which the fraction changes, and the fraction from each of them on, (k,) each.
     """
     known = [after for after in converged if after is not None]
     censored = [max(n - CONVERGED_SUCCESSES, 0) for after, n in zip(converged, episodes, strict=True) if after is None]
@@ -101,7 +101,7 @@ def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[
 
 
 def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
-    """Return the number of episodes after which half of the runs have converged; None if fewer do.
+    """Return the number of episodes after which half of the runs have converged; None if less than half do.
 
     Args:
         steps: Steps of `survival`, (k,).
@@ -113,7 +113,7 @@ def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
 
 @dataclass(frozen=True)
 class Episode:
-    """Episode that is over.
+    """Finished episode.
 
     Attributes:
         index: Number of the episode.
@@ -140,7 +140,7 @@ class Episode:
 
     @property
     def termination(self) -> str:
-        """Reason of the end."""
+        """Reason why the episode ended."""
         return "simulation_failure" if "simulation_failure" in self.info else self.info["termination"]
 
 
@@ -219,7 +219,7 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 
 
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
-    """Return an episode's row for an environment that is not of this package: the columns that its `info` has.
+    """Return an episode's row for an environment that is not of this package, with the columns that `info` provides.
 
     Args:
         index: Number of the episode.
@@ -270,7 +270,7 @@ def own_episodes(rows: pd.DataFrame) -> pd.DataFrame:
 def episodes_to_convergence(rows: pd.DataFrame) -> int | None:
     """Return the number of episodes before the first ten consecutive successes (the thesis's figure 3.8), or None.
 
-    A demonstration counts as an episode, and not as a success.
+    A demonstration counts as an episode, but not as a success.
     """
     own_successes = (rows["success"] == 1) & (rows.get("is_demonstration", 0) == 0)
     return find_streak(own_successes, CONVERGED_SUCCESSES)
@@ -373,7 +373,7 @@ _STATISTICS = (
 )
 STATISTICS = {metric.name: metric for metric in _STATISTICS}
 SYMBOLS = ("N", "N²", "s", VIOLATION, *JERKS.values())
-"""Units that are symbols, not words: a table has room for them."""
+"""Units that are symbols, not words, and therefore short enough for a table."""
 
 
 def statistics_of(task: str | None = None) -> dict[str, Metric]:
@@ -392,7 +392,7 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
         task: Task of the episodes; its own statistics may be named too.
 
     Raises:
-        InputError: If there is no statistic of a name, or the episodes lack a column that one is computed from.
+        InputError: If a statistic is unknown, or the episodes lack a column that one is computed from.
     """
     known = statistics_of(task) if task else STATISTICS
     found: dict[str, Any] = {}

@@ -1,7 +1,7 @@
 """Policies of any origin: a run, a policy's folder, a file of another library, a function, or an object with `predict`.
 
-Nothing that a file holds is executed, unless its user allows it: a policy's folder and an ONNX file hold numbers, a zip
-of Stable-Baselines3 is a pickle and a TorchScript file is a program. `module:function` names code on the command line.
+Code in a file is executed only if the user allows it: a policy's folder and an ONNX file hold only numbers, but a zip
+of Stable-Baselines3 is a pickle and a TorchScript file is a program. `module:function` names code to execute.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from guiderail.tools.pretrained import PRETRAINED
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
 """Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
 
-# Algorithm that reads a zip of Stable-Baselines3, by the module of the policy's class; the zip does not name its own.
+# Algorithm that reads a zip of Stable-Baselines3, by the module of the policy's class; the zip names no algorithm.
 _SB3_ALGORITHMS = {
     "stable_baselines3.common.policies": ("stable_baselines3", "PPO"),  # A2C and TRPO have the same policy
     "stable_baselines3.sac.policies": ("stable_baselines3", "SAC"),
@@ -42,7 +42,7 @@ _SB3_ALGORITHMS = {
     "sb3_contrib.common.recurrent.policies": ("sb3_contrib", "RecurrentPPO"),
     "sb3_contrib.ars.policies": ("sb3_contrib", "ARS"),
 }
-# Entries that only training needs; without them a zip of another version of Python or NumPy can be read.
+# Replacements of entries that only training needs, so that a zip from another Python or NumPy version can be read.
 _SB3_UNUSED: dict[str, Any] = {
     "learning_rate": 0.0,
     "lr_schedule": lambda remaining: 0.0,
@@ -73,7 +73,7 @@ class ForeignPolicy(Callback):
             act: Function from an observation to an action; a leading dimension of 1 of the action is removed.
             observation_shape: Shape of the observation, if it is known.
             action_shape: Shape of the action, if it is known.
-            errors: Exceptions of `act` for an observation of a wrong shape.
+            errors: Exceptions that `act` raises for an observation of a wrong shape.
         """
         self.observation_shape, self.action_shape = observation_shape, action_shape
         self._act, self._errors = act, errors
@@ -132,7 +132,7 @@ def as_policy(given: Any) -> PolicyFn:
         given: A function, or an object with a `predict` method.
 
     Raises:
-        InputError: If it is neither.
+        InputError: If `given` is neither.
     """
     if isinstance(given, Policy | Callback) and callable(given):
         return given
@@ -158,10 +158,10 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
         source: Folder with `policy.safetensors`; .zip of Stable-Baselines3; .onnx; TorchScript (.pt, .ts,
             .torchscript); or `module:function`, where a module is a module's name or a file (.py), and a function any
             policy that `as_policy` takes, or a class of such policies.
-        trust_policy: Read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
+        trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
 
     Raises:
-        InputError: If the file is missing, damaged or can execute code, or its package is not installed.
+        InputError: If the file is missing, damaged or executable without trust, or its package is not installed.
     """
     if (function := _function_of(str(source))) is not None:
         return _load_function(*function)
@@ -179,10 +179,10 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
 
 
 def add_base_policy(source: str) -> str:
-    """Register a base policy that is a file or `module:function`, and return the name of any base policy.
+    """Return the name of a base policy; register it first if it is given as a file or `module:function`.
 
     Raises:
-        InputError: If the source would execute code outside of `trust_imports`, or as `load_policy`.
+        InputError: If the source can execute code and `trust_imports` is not active, or `load_policy` raises one.
     """
     if source in BASE_POLICIES.names() or not is_policy_file(source):
         return source
@@ -226,7 +226,7 @@ def _load_sb3(path: Path) -> PolicyFn:
     try:
         kind: Any = getattr(import_module(package), algorithm)
         model = kind.load(path, device="cpu", custom_objects=_SB3_UNUSED)
-    except Exception as error:  # a pickle fails in any way
+    except Exception as error:  # reading a pickle can raise any exception
         text = " ".join(str(error).split())[:200]
         raise InputError(
             f"{path} cannot be read ({type(error).__name__}: {text}): save it with the installed versions"
@@ -278,26 +278,26 @@ def _load_onnx(path: Path) -> PolicyFn:
 
 
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
-    """Return a policy for an environment that may differ from the one it learned in.
+    """Return a policy unchanged if its observation and action shapes match an environment.
 
     Args:
         policy: Policy.
         env: Environment.
-        learned_in: Options of the environment that it learned in, for the message.
+        learned_in: Options of the environment in which the policy was trained, for the error message.
 
     Raises:
-        InputError: If the shape of its observations or its actions is another one than the environment's.
+        InputError: If the shape of the policy's observations or actions differs from the environment's.
     """
     if is_compatible(lambda env: policy, env):
         return policy
     raise InputError(_describe_mismatch(policy, env, learned_in))
 
 
-_MAX_DIFFERENCES = 5  # options that a message names
+_MAX_DIFFERENCES = 5  # largest number of options that a message names
 
 
 def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
-    """Return a sentence with the shapes of policy and environment, and the options that differ or fit."""
+    """Return a sentence with the shapes of policy and environment, and the options that differ or would fit."""
     sees, moves = shapes(policy, env)
     takes = "cannot take these observations" if sees is None else f"takes observations {sees}"
     returns = "" if moves is None else f" and returns actions {moves}"
@@ -317,7 +317,7 @@ def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping
 
 
 def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
-    """Return the shapes of a policy's observation and action; None for one that is unknown."""
+    """Return the shapes of a policy's observation and action; None if a shape is unknown."""
     if isinstance(policy, Policy):
         return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
     sees, moves = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
@@ -337,11 +337,11 @@ def _task_options(env: gymnasium.Env) -> tuple[str, dict[str, Any]]:
     return ("", {}) if config is None else (config.task, config.options)
 
 
-_MAX_FITTING = 2  # combinations that a message names
+_MAX_FITTING = 2  # largest number of combinations that a message names
 
 
 def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> list[str]:
-    """Return combinations of options of a task's environment with which a policy fits, the smallest change first.
+    """Return combinations of options of a task's environment with which a policy is compatible, smallest change first.
 
     Guidance, observation and difficulty are varied, because they decide the sizes of observation and action.
 
@@ -372,7 +372,7 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
 
 def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:
     try:
-        known = beyond_defaults(task, options)  # options of one guidance are unknown to another
+        known = beyond_defaults(task, options)  # without defaults, because guidance kinds have different options
         env = make_environment(task, changed_environment(task, known, changes))
     except InputError:
         return False
@@ -383,5 +383,5 @@ def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapp
 
 
 def learned_policy(folder: Path, learned_in: Mapping[str, Any]) -> Callable[[gymnasium.Env], PolicyFn]:
-    """Return a function that makes the policy of a run for an environment, which may be another one."""
+    """Return a function from an environment, not necessarily the run's own, to the run's policy."""
     return partial(check_compatible, Policy.load(folder), learned_in=learned_in)

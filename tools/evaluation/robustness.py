@@ -45,7 +45,7 @@ class Axis:
     Attributes:
         name: Name, as `--axes` takes it.
         label: Label of the plot's axis, with the unit.
-        values: Values, among them the default one if it is a number.
+        values: Values, including the default.
         default: Value of an environment with default options.
         change: Function from an environment's options and a value to the options that change.
         resamples: True if the hidden values of a run are sampled again in every episode, because the axis changes them.
@@ -114,7 +114,7 @@ AXES = (
 
 
 def select_axes(names: str | None) -> list[Axis]:
-    """Return the axes named, comma-separated; all of them for None.
+    """Return the axes of comma-separated names; all axes for None.
 
     Raises:
         InputError: For an unknown name.
@@ -135,9 +135,9 @@ class Point:
 
     Attributes:
         axis: Axis.
-        value: Value on it.
-        environment: Options of the environment there.
-        trained: Value that the policy was trained with; None if it is not on the axis, as for a range.
+        value: Value on the axis.
+        environment: Options of the environment with this value.
+        trained: Value in training if it is the axis's default, otherwise None.
         options: Options of every reset.
     """
 
@@ -149,7 +149,7 @@ class Point:
 
 
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
-    """Return the points of some axes that an environment has, and a sentence for each that it does not have.
+    """Return the points of some axes that an environment supports, and a sentence for each point left out.
 
     Args:
         task: Name of the task.
@@ -184,21 +184,21 @@ def _is_default(axis: Axis, resolved: Environment) -> bool:
     except InputError:
         return True
     if resolved.get("sensing", "exact") != "exact" and any(resolved.get(option, 0) is None for option in neutral):
-        return False  # the error is that of the setting
+        return False  # `sensing` sets the value, so it is not the default
     known = {option: resolved[option] for option in neutral if resolved.get(option) is not None}
     return all(np.allclose(value, neutral[option]) for option, value in known.items())
 
 
 COLUMNS = 4
-SPACING = 0.06  # distance between the markers of two policies, as a fraction of that between two values
+SPACING = 0.06  # distance between the markers of two policies, as a fraction of the distance between two values
 COLORS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3aa6a6")
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the rows of a table: success rate and force over each axis, with a line for each policy.
 
-    Bars are Wilson's 95 % intervals. Of the peak forces of the episodes, the mean is a line and the largest a dot. The
-    value that the policy was trained with is a dashed line.
+    Bars are Wilson's 95 % intervals. A solid line shows the mean of the episodes' peak forces, a dot the largest one. A
+    dashed line marks the value that the policy was trained with.
     """
     table = pd.DataFrame(rows)
     axes = list(dict.fromkeys(table["axis"]))
@@ -241,8 +241,8 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
 
 EPISODES = 30  # episodes of each policy at each point
-MAX_NAME_LENGTH = 120  # characters of a table's name
-DEMONSTRATION = "demonstration"  # name of the zero policy where it is the demonstration
+MAX_NAME_LENGTH = 120  # largest number of characters of a table's name
+DEMONSTRATION = "demonstration"  # name of the zero policy if it executes the demonstration alone
 
 
 @dataclass(frozen=True)
@@ -251,9 +251,9 @@ class _Actor:
 
     Attributes:
         name: Name in the table.
-        make_policy: Makes the policy for an environment.
+        make_policy: Function from an environment to the policy.
         config: Configuration of the run.
-        environment: Options of the environment at every point, those that the call changes included.
+        environment: Options of the environment at every point, including the changes given to `robustness`.
         about: Digest of a learned policy.
     """
 
@@ -278,29 +278,29 @@ def robustness(
     processes: int | None = None,
     trust_policy: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate policies along each axis, the rest of the environment being as in training.
+    """Evaluate policies under one disturbance at a time; the rest of the environment is as in training.
 
-    The episodes of every point are stored in the folder: an interrupted evaluation is resumed by the same call, and a
-    further run costs only its own episodes.
+    The episodes of every point are stored in the folder: the same call resumes an interrupted evaluation, and if a
+    run is added, only its episodes are simulated.
 
     Args:
         policies: Runs of one task; with `task`, any policies that `find_subject` takes. Baseline policies act through
-            the guidance of the first.
+            the guidance of the first one.
         task: Task of policies without a run.
         episodes: Number of held-out episodes of each policy at each point, with the same seeds.
-        seed: Seed of the first.
+        seed: Seed of the first episode.
         environment: Options of the environment that differ throughout, such as the station.
         axes: Names of axes, comma-separated; all by default.
         baselines: Baseline policies: their names, or functions that make them, by name; None for the default set of
             the task.
-        out: Folder to write; in the run, named after its station, by default. Several policies and one without a run
-            need it.
-        say: Called with a sentence on what the runs differ in and on each point left out.
+        out: Folder to write; by default `robustness/<station>` in the run. Required for several policies, and for a
+            policy without a run.
+        say: Function called with a sentence on the differences between the runs and one for each point left out.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
-        trust_policy: Read a policy's file that can execute code.
+        trust_policy: True to read a policy file that can execute code.
 
     Returns:
-        `table` and `picture`, the files; `rows`, those of the table; `policies`, the names of the policies.
+        `table` and `picture`, the paths of the files; `rows`, the table's rows; `policies`, the names of the policies.
 
     Raises:
         InputError: If there is no trained run, runs are of different tasks, or an argument is invalid.
@@ -349,7 +349,7 @@ def robustness(
 
 
 def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], say: Callable[[str], None]) -> list[_Actor]:
-    """Return the policies, those of runs named after their guidance, or after their folders if that is the same."""
+    """Return the policies; several are named by their guidance, or by their folders if two have the same guidance."""
     if not subjects:
         raise InputError("robustness needs the folder of a run")
     configs = [subject.config for subject in subjects if subject.config is not None]
@@ -393,7 +393,7 @@ def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], say: Callable[[str], N
 
 
 def _table_name(axes: str | None, given: Mapping[str, Any], policies: Sequence[str]) -> str:
-    """Return the name of a table from the arguments, so that other arguments do not replace it."""
+    """Return a table name that contains the arguments, so that other arguments do not overwrite the table."""
     parts = [] if axes is None else [axis.name for axis in select_axes(axes)]
     parts += [f"{key}={value}" for key, value in sorted(given.items())]
     name = re.sub(r"[^\w.=-]+", "_", "-".join(["robustness", *parts, *policies]))

@@ -1,4 +1,4 @@
-"""Loop of an episode, the same for training, evaluation, replays, studies, fuzzing and teleoperation; its progress."""
+"""Episode loop of training, evaluation, replays, studies, fuzzing and teleoperation, and its progress bar."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ class Callback:
     """Callback of an episode, such as a learner or a camera."""
 
     def on_episode_start(self) -> None:
-        """Call after the environment was reset."""
+        """Handle the start of an episode, after the reset."""
 
     def on_step(self, transition: Transition) -> None:
-        """Call after every action."""
+        """Handle the transition of an action."""
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Call with the episode's row; return further columns."""
+        """Handle the end of an episode; return further columns of its row."""
         return {}
 
 
@@ -85,10 +85,10 @@ class EnvCallback(Callback):
 
 
 def check_seed(seed: int) -> None:
-    """Refuse a seed that no environment takes.
+    """Check that environments accept a seed.
 
     Raises:
-        InputError: If it is negative, or does not fit into 31 bits.
+        InputError: If the seed is negative, or does not fit into 31 bits.
     """
     if not 0 <= seed < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
@@ -109,14 +109,14 @@ def rollout(
 
     Args:
         env: Environment.
-        act: Policy; it is called as a callback too if it is one.
+        act: Policy; if it is a `Callback`, its callback methods are called too.
         observers: Callbacks.
-        index: Number of the row.
+        index: Number of the episode, for its row.
         seed: Seed of the reset; default: the next conditions of the training distribution.
         held_out: Sample the conditions from the held-out distribution, by the seed.
         options: Options of the reset.
     """
-    from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row  # pandas takes a second
+    from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
     observation = (
         reset_held_out(env, seed or 0, **(options or {}))
@@ -129,7 +129,7 @@ def rollout(
     for callback in callbacks:
         callback.on_episode_start()
     total, terms = 0.0, dict.fromkeys(base.task.reward_terms if is_own else (), 0.0)
-    infos: list[Mapping[str, Any]] = []  # of an environment of another origin
+    infos: list[Mapping[str, Any]] = []  # `info` of each step, for an environment without a trace
     is_over = False
     while not is_over:
         action, privileged = act(observation), getattr(base, "privileged", None)
@@ -177,7 +177,7 @@ def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
     """Return True if a policy's actions for several observations have the shape of the environment's actions.
 
-    Several observations are tried because a scripted policy may index an entry only in the middle of an episode.
+    Several observations are tried because a scripted policy may index the observation only for some of its values.
     """
     act, shape = make_policy(env), env.observation_space.shape or ()
     try:
@@ -187,8 +187,8 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
     return shapes == {env.action_space.shape}
 
 
-WINDOW = 10  # training episodes that success and return are averaged over
-INTERVAL = 10.0  # time between lines where standard error is not a terminal [s]
+WINDOW = 10  # number of training episodes over which success and return are averaged
+INTERVAL = 10.0  # time between lines if standard error is not a terminal [s]
 
 
 class EpisodeProgress:
@@ -203,9 +203,9 @@ class EpisodeProgress:
         """Construct the progress.
 
         Args:
-            episodes: Number of episodes of the whole run; a resumed run starts further along.
+            episodes: Number of episodes of the whole run, including those before it was resumed.
             name: Name of the bar.
-            window: Number of last episodes that success and return are averaged over; None for all of them.
+            window: Number of last episodes over which success and return are averaged; None for all episodes.
             console: Console; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)

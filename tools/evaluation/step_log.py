@@ -20,7 +20,7 @@ from guiderail.tools.evaluation.rollout import EnvCallback
 from guiderail.tools.files import write_atomically
 
 SLACK = "distance outside of the constraint; negative is slack"
-# Unit and meaning of each column; "_i" stands for a column for every number of a pose or a wrench.
+# Unit and meaning of each column; "_i" stands for one column per component of a pose or a wrench.
 MEANINGS = {
     "episode": ("", "number of the episode, from 0"),
     "step": ("control steps", "number of the control step, from 0; all values are those at its end"),
@@ -41,10 +41,10 @@ _FLAGS = {"collision", "command_timed_out", "fallback"}
 
 
 class StepLog(EnvCallback):
-    """Callback that writes an episode's control steps when it ends, before a checkpoint counts the episode.
+    """Callback that writes an episode's control steps when the episode ends, before a checkpoint counts it.
 
     Attributes:
-        seconds: Time spent so far [s].
+        seconds: Time spent on writing so far [s].
     """
 
     def __init__(self, env: gymnasium.Env, folder: Path):
@@ -59,7 +59,7 @@ class StepLog(EnvCallback):
         self.seconds = 0.0
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Write the episode; add no column to its row."""
+        """Write the episode's control steps; add no column to its row."""
         started = time.perf_counter()
         write_step_log(step_log_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
         self.seconds += time.perf_counter() - started
@@ -116,10 +116,10 @@ def read_step_log(folder: Path, columns: list[str] | None = None) -> pd.DataFram
 
     Args:
         folder: A run's `steps/`.
-        columns: Names of the columns to read; default: all. A column that a file lacks is refused.
+        columns: Names of the columns to read; all by default.
 
     Raises:
-        InputError: If there is no step log, or a file is damaged.
+        InputError: If there is no step log, or a file is damaged or lacks a column.
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:

@@ -42,7 +42,7 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Refuse an environment with another guidance than a policy was trained with: actions mean something else there.
+    """Check that an environment has the guidance that a policy was trained with, which defines what actions mean.
 
     Args:
         own: Options of the environment that the policy was trained in.
@@ -68,7 +68,7 @@ def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets
         resample_offsets: Whether the hidden offset of the run is sampled again in every episode.
 
     Raises:
-        InputError: If `resample_offsets` is True and a run of the task hides nothing.
+        InputError: If `resample_offsets` is True and a run of the task has no hidden offset.
     """
     if resample_offsets and not _can_hide(task):
         raise InputError(f"a run of {task} has no hidden offset to resample: leave --resample-offsets out")
@@ -91,7 +91,7 @@ def _can_hide(task: str) -> bool:
 
 
 def counts_collisions(task: str) -> bool:
-    """Return True if a task declares a collision signal; a `TerminationTerm` named collision is not one."""
+    """Return True if a task declares a collision signal (a `TerminationTerm` does not count) or is not in `TASKS`."""
     return task not in TASKS.names() or TASKS.get(task).declares_collision()
 
 
@@ -106,10 +106,10 @@ class Subject:
 
     Attributes:
         name: Name of the policy.
-        config: Configuration of its run; of no run, one with the environment it acts in; None in an environment that is
-            given as an object.
-        make_policy: Makes the policy for an environment.
-        folder: Its run, or None.
+        config: Configuration of its run; without a run, a configuration of the environment that it acts in; None if the
+            environment is given as an object.
+        make_policy: Function from an environment to the policy.
+        folder: Folder of its run, or None.
         is_stored: Whether evaluated episodes are stored in the run's folder.
         digest: Digest of the policy, for the names of stored files; None for a baseline policy.
     """
@@ -132,7 +132,7 @@ def find_subject(
             or the name of a baseline policy.
         env: Name of the task, or an environment, that a policy without a run acts in; None for a run.
         environment: Options of the task's environment that differ from the defaults; unused for a run.
-        trust_policy: Read a policy's file that can execute code.
+        trust_policy: True to read a policy file that can execute code.
 
     Raises:
         InputError: If there is no such policy or task, or a policy without a run has no task.
@@ -150,7 +150,7 @@ def find_subject(
     config = None if isinstance(env, gymnasium.Env) else configure(env, environment or {})
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
-        unknown = str(time.time_ns())  # a function has no digest, so that its stored episodes are never used again
+        unknown = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
         if act is policy:
             return Subject("policy", config, lambda env: act, digest=unknown)
         return Subject("policy", config, partial(check_compatible, act), digest=unknown)
@@ -162,7 +162,7 @@ def find_subject(
 
 
 def _digest(source: Path) -> str:
-    """Return the digest of a policy's folder or file; a new one for a function, which may use other files."""
+    """Return the digest of a policy's folder or file; a unique value for a function, which may use other files."""
     file = source / "policy.safetensors" if source.is_dir() else source
     if not file.is_file():
         return str(time.time_ns())
@@ -175,9 +175,9 @@ def make_baselines(
     """Return the functions that make baseline policies, by name.
 
     Args:
-        config: Configuration of the run or of the task; None in an environment that is given as an object.
+        config: Configuration of the run or of the task; None if the environment is given as an object.
         environment: Options of the environment.
-        baselines: Names, or the functions themselves; None for the default set.
+        baselines: Names, or functions by name; None for the default set.
 
     Raises:
         InputError: If a name is unknown.

@@ -1,4 +1,4 @@
-"""Declaration of a study: the content of its YAML file, and one sentence for a wrong one."""
+"""Declaration of a study: the content of its YAML file, validated with one-sentence errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _with_placeholders(**examples: Any) -> AfterValidator:
             fields = [field[1:] for field in string.Formatter().parse(name) if field[1] is not None]
         except ValueError:
             raise ValueError(f"{name!r} has an open brace: it may have {known}") from None
-        # A format specification could ask for a width of gigabytes, and an attribute is no file name.
+        # Format specifications, which could set a width of gigabytes, conversions and attributes are not allowed.
         if any(word not in examples or specification or conversion for word, specification, conversion in fields):
             raise ValueError(f"{name!r} has an unknown placeholder: it may have {known}")
         path = PurePath(name.format(**examples))
@@ -65,18 +65,18 @@ class LearnerChoice(_Strict):
 
     algorithm: str | None = None  # registered name of the learner
     preset: str | None = None  # preset of the learner's settings
-    settings: dict[str, Any] = {}  # settings in place of the preset's
-    episodes: Integer | None = Field(default=None, ge=1)  # training episodes; default: the last of after_episodes
+    settings: dict[str, Any] = {}  # settings that override the preset's
+    episodes: Integer | None = Field(default=None, ge=1)  # training episodes; default: the largest of after_episodes
 
 
 class Method(_Strict):
     """Environment and policy that a study compares with others."""
 
     env: dict[str, Any] = {}  # options of the environment, in addition to the study's
-    learner: LearnerChoice = LearnerChoice()  # in place of the study's
-    policy: str = LEARNED  # or the name of a baseline policy, best_constant, or a scripted policy
-    grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each component of an action, for best_constant
-    seeds: tuple[Integer, ...] | None = None  # default: the study's; one is enough for a policy without learning
+    learner: LearnerChoice = LearnerChoice()  # choices that override the study's
+    policy: str = LEARNED  # "learned", "best_constant", or the name of a baseline or scripted policy
+    grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each action component that best_constant tries
+    seeds: tuple[Integer, ...] | None = None  # default: the study's; one seed is enough for a policy without learning
 
 
 class EvalSet(_Strict):
@@ -85,15 +85,15 @@ class EvalSet(_Strict):
     name: str = "held out"  # name in the table
     env: dict[str, Any] = {}  # options of the environment that differ from training
     sampled: dict[str, tuple[float, float]] = {}  # options that are resampled uniformly from a range
-    every: Integer = Field(default=4, ge=1)  # episodes between two samples
+    every: Integer = Field(default=4, ge=1)  # number of episodes between two samples
     options: dict[str, Any] = {}  # options of each reset
     episodes: Integer = Field(default=100, ge=1)  # number of episodes
-    first_seed: Integer = Field(default=HELD_OUT_SEED, ge=0)  # seed of the first episode; each has the next
+    first_seed: Integer = Field(default=HELD_OUT_SEED, ge=0)  # seed of the first episode; episode i has first_seed + i
     file: EvaluatedFile = "{name}-{after_episodes}-{digest}.csv"  # file of the episodes in the run's folder
 
 
 class Sweep(_Strict):
-    """Quantity of the environment whose difficulty increases: evaluated at each value and drawn."""
+    """Quantity of the environment that makes the task harder; policies are evaluated at each value and plotted."""
 
     quantity: str  # name and unit, the label of the axis
     at: dict[float, dict[str, Any]] = Field(min_length=1)  # options of the environment by value, the easiest first
@@ -122,7 +122,7 @@ class Study(_Strict):
     task: str  # task of every method
     env: dict[str, Any] = {}  # options of the environment of every method
     learner: LearnerChoice = LearnerChoice()  # learner of every method that learns
-    methods: dict[FolderName, Method] = Field(min_length=1)  # by the name of folder and legend
+    methods: dict[FolderName, Method] = Field(min_length=1)  # by name, used in folders and legends
     seeds: tuple[Integer, ...] = Field(min_length=1)  # seeds of training
     after_episodes: tuple[Annotated[Integer, Field(ge=1)], ...] = ()  # when policies are evaluated; default: at the end
     eval_set: tuple[EvalSet, ...] = (EvalSet(),)  # evaluation sets
@@ -169,7 +169,7 @@ class Study(_Strict):
         return self
 
     def subset_name(self, subset: Study) -> str | None:
-        """Return the table's name of a subset of this study; None for all of it, which has the study's name."""
+        """Return the name of a subset's table; None for the whole study, whose table has the study's name."""
         methods = [] if subset.methods.keys() == self.methods.keys() else list(subset.methods)
         seeds = [] if subset.seeds == self.seeds else [str(seed) for seed in subset.seeds]
         return "-".join([self.name, *methods, *seeds]) if methods or seeds else None
@@ -184,7 +184,7 @@ class Study(_Strict):
 
 
 def load_study(file: Path | str) -> Study:
-    """Read a study's YAML file; raise an InputError if there is none, or its content is not a valid study."""
+    """Read a study's YAML file; raise an InputError if it does not exist or is not a valid study."""
     path = Path(file)
     if not path.is_file():
         raise InputError(f"there is no file {path}: name a study's YAML file")

@@ -1,6 +1,6 @@
 """Job of a study: one method with one seed, trained and evaluated in a folder of its own by a worker that keeps a log.
 
-A job depends on nothing but its folder: interrupted, it resumes there, and finished, it only reads its tables.
+The state of a job is in its folder: an interrupted job resumes from it, and a finished job only reads its tables.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from guiderail.tools.learning.train import configure, with_defaults
 
 BEST_CONSTANT = "best_constant"
 BEGIN = " begins on "  # marks each attempt of a worker in the log of a job
-SELECTION_EPISODES = 10  # training episodes of each constant action, of which the best one is evaluated
+SELECTION_EPISODES = 10  # training episodes of each constant action, to select the best action
 
 TRAINING = (
     "episodes", "success_rate", "success_rate_last_10", "episodes_to_convergence", "mean_return_last_10", "mean_force",
@@ -69,7 +69,7 @@ class Job:
 
     @property
     def learns(self) -> bool:
-        """True if the job trains a policy; baseline policies do not."""
+        """True if the job trains a policy; False for a baseline policy."""
         return self.study.methods[self.method].policy == LEARNED
 
     @property
@@ -106,7 +106,7 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """Log of the workers that ran the job."""
+        """Log file of the workers that ran the job."""
         return self.out / "logs" / f"{self.study.name}-{self.method}-{self.seed}.txt"
 
     def policy_folder(self, episodes: int) -> Path:
@@ -115,7 +115,7 @@ class Job:
 
 
 def check_job(job: Job) -> None:
-    """Raise an InputError if the declaration of a job is not possible for its task, or its folder holds another run."""
+    """Raise an InputError if the declaration of a job is invalid for its task, or its folder holds another run."""
     config, policy = job.config(job.after_episodes[-1]), job.study.methods[job.method].policy
     if policy not in (LEARNED, BEST_CONSTANT):
         make_baseline(job.study.task, policy)
@@ -136,14 +136,14 @@ def check_job(job: Job) -> None:
 
 
 def is_done(job: Job) -> bool:
-    """Return True if the rows of a job only have to be read."""
+    """Return True if a job is trained and evaluated, so that its rows only have to be read."""
     pairs = itertools.product(job.after_episodes, job.study.eval_sets)
     is_evaluated = all(_evaluated_file(job, *pair).exists() for pair in pairs)
     return is_evaluated and not any(_needs_training(job, episodes) for episodes in job.after_episodes)
 
 
 def run_job(job: Job) -> list[dict[str, Any]]:
-    """Train and evaluate a job as far as that is not done, and return its rows."""
+    """Complete the training and evaluation of a job, and return its rows."""
     import_modules(job.study.imports)
     rows = []
     for episodes in job.after_episodes:
@@ -238,7 +238,7 @@ def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFram
 
 
 def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> Path:
-    name = re.sub(r"[ /\\\0]", "_", eval_set.name).lstrip(".")  # a part of a path, inside the run's folder
+    name = re.sub(r"[ /\\\0]", "_", eval_set.name).lstrip(".")  # one path component, inside the run's folder
     values = {"name": name, "after_episodes": episodes, "episodes": eval_set.episodes}
     return job.folder.path / eval_set.file.format(**values, digest=digest(job, eval_set, episodes))
 
@@ -309,8 +309,8 @@ def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: 
 
     Args:
         job: Job.
-        work: Returns the rows of a job.
-        versions: Package versions without which a worker is refused: other versions give other bits.
+        work: Function from a job to its rows.
+        versions: Required package versions by name; a worker with others is refused, because results depend on them.
     """
     host = socket.gethostname()
     if not job.log.parent.is_dir():
@@ -337,7 +337,7 @@ def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: 
 
 
 def count_attempts(log: Path, start: int = 0) -> int:
-    """Return how many workers started a job, counted from byte `start` of its log; 0 while it waits."""
+    """Return the number of workers that started a job, counted from byte `start` of its log; 0 while it waits."""
     try:
         return log.read_bytes()[start:].count(BEGIN.encode())
     except FileNotFoundError:

@@ -15,15 +15,15 @@ from rich.text import Text
 from guiderail.tools.experiments.engines.engine import Outcome
 from guiderail.tools.experiments.job import count_attempts
 
-MAX_SHOWN = 20  # jobs in the table; the others are counted
+MAX_SHOWN = 20  # largest number of jobs in the table; the number of others is shown
 TERMINAL_PERIOD, LOG_PERIOD = 1.0, 60.0  # time between two updates [s]
 
 
 class StudyProgress:
     """Table of running jobs on a terminal; one line per minute in a log file or a pipe.
 
-    Both get a line for each finished job. Everything is read from the folders of the runs, so workers and engines need
-    not report anything. It is a context manager.
+    In either case a line is printed for each finished job. Progress is read from the runs' folders, so workers and
+    engines need not report it. Use it as a context manager.
     """
 
     def __init__(self, jobs: Mapping[int, Any], total: int, console: Console | None = None):
@@ -61,7 +61,7 @@ class StudyProgress:
     def end(self, key: int, job: Any, outcome: Outcome) -> None:
         """Print the outcome of a job."""
         attempts = count_attempts(job.log, self._open[key][2]) if key in self._open else 0
-        self._open = {other: one for other, one in self._open.items() if other != key}  # _watch may be iterating
+        self._open = {other: one for other, one in self._open.items() if other != key}  # copy: _watch may be iterating
         self._num_ended += 1
         self._num_failed += bool(outcome.failure)
         text = f": failed: {outcome.failure}" if outcome.failure else ""

@@ -1,8 +1,8 @@
-"""Studies: train and evaluate methods over seeds, write a table with one row each, and draw the sweeps.
+"""Studies: train and evaluate methods over seeds, write a table of the results, and draw the sweeps.
 
-Each seed has rows of its own, so that failures of single seeds are not averaged away. A study that was interrupted
-resumes with the same call, and studies that share runs use them again. An engine runs the jobs; the rows are the same
-from each engine.
+Each seed has rows of its own, so that failures of single seeds are not averaged away. An interrupted study is
+resumed by the same call, and studies that share runs use them again. An engine runs the jobs; the rows do not depend on
+which one.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import legend, new_figure, save_figure
 
 ALL_METHODS = "all methods"
-LINE_STYLES = ("-", "--", "-.", ":")  # in turn, because curves of methods that always or never succeed coincide
+LINE_STYLES = ("-", "--", "-.", ":")  # used in turn, because curves of methods that always or never succeed coincide
 BREAKING_SUCCESS = 0.9  # success rate below which a method counts as broken
 NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
 
-# Sentences on how a configuration differs from a reference; with `learns=False`, none on the learner.
+# Function from a configuration to sentences on how it differs from a reference; `learns=False` omits the learner.
 DescribeDifferences: TypeAlias = Callable[..., list[str]]
 
 
@@ -51,7 +51,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
         A row for each method, seed, number of training episodes and evaluation set, in this order.
 
     Raises:
-        InputError: Before anything is written, if the declaration makes no sense or a folder holds another run.
+        InputError: Before anything is written, if the declaration is invalid or a folder holds another run.
         RunsFailedError: At the end, if some jobs failed.
     """
     if out.exists() and not out.is_dir():
@@ -81,10 +81,10 @@ def study_command(
     table: str | None = None,
     describe_differences: DescribeDifferences | None = None,
 ) -> dict[str, Any]:
-    """Run a study by `run_study`, write its table as `.csv` and `.md`, and return a summary with each seed by itself.
+    """Run a study by `run_study`, write its table as `.csv` and `.md`, and return a summary with results of each seed.
 
     The table has the study's name by default. In the summary, `differences` has the sentences of `describe_differences`
-    by method, and `failed` those of failed jobs, which the table does not have.
+    by method, and `failed` one sentence for each failed job, which has no rows in the table.
     """
     result: dict[str, Any] = {}
     try:
@@ -132,7 +132,7 @@ def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
 
 
 def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
-    """Return the ratio of a column between two methods, for each seed and for the sums; empty if a row is missing."""
+    """Return the ratio of a column between two methods, per seed and for the sums; empty if a row is missing."""
     of, against = (rows[rows["method"] == method] for method in (wanted.method, wanted.against))
     if not len(of) or of["seed"].tolist() != against["seed"].tolist():
         return {}
@@ -152,7 +152,7 @@ def _check_ratios(study: Study) -> None:
 
 
 def _run_jobs(jobs: list[Job], engine: Engine, console: Console | None) -> dict[int, Outcome]:
-    """Return the outcome of each job; those that are done are read in this process."""
+    """Return the outcome of each job; the rows of finished jobs are read in this process."""
     done = {index: job for index, job in enumerate(jobs) if is_done(job)}
     to_run = {index: job for index, job in enumerate(jobs) if index not in done}
     outcomes: dict[int, Outcome] = {}
@@ -193,10 +193,11 @@ def _refuse_shared_folders(jobs: list[Job]) -> None:
 def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
     """Draw a panel for each sweep: the success rate of all seeds against the quantity.
 
-    The band spans the seeds' own 95 % intervals. Harder values are to the right. A cross marks where a method that
+    The band spans all seeds' 95 % intervals. Harder values are to the right. A cross marks where a method that
     began above `BREAKING_SUCCESS` falls below it.
 
-    Of a method evaluated after several numbers of episodes, the largest counts. Return the path of the picture.
+    For a method evaluated after several numbers of training episodes, the largest number is drawn. Return the path of
+    the picture.
     """
     width = max(4.4 * len(study.sweeps), 1.3 * len(study.methods))  # the legend is one line
     figure, axes = new_figure(1, len(study.sweeps), (width, 3.6))
@@ -222,7 +223,7 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
 
 
 def breaking_points(study: Study, rows: pd.DataFrame) -> dict[str, str]:
-    """Return where each method breaks in each sweep, as text by a label."""
+    """Return the breaking point of each method in each sweep, as text by label."""
     texts = {}
     for sweep in study.sweeps:
         for name in study.methods:
@@ -249,7 +250,7 @@ def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], lis
 def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | str:
     """Return the value where the success rate first falls below `BREAKING_SUCCESS`, interpolated linearly.
 
-    It is `AT_ONCE` if already the first value, the easiest one, is below, and `NEVER` if none is.
+    Return `AT_ONCE` if the rate at the first, easiest value is below it already, and `NEVER` if no rate is below it.
     """
     if rates[0] < BREAKING_SUCCESS:
         return AT_ONCE

@@ -28,7 +28,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     The action is (A,) in [−1, 1], one entry for each of `action_dims` or each input of the template. It is applied for
     `action_repeat` steps of the environment, whose rewards are added up. An episode is truncated when the motion has
-    ended. `info` has, besides the environment's own entries: `constraint_violation` (the largest of the commands of the
+    ended. `info` has, in addition to the environment's: `constraint_violation` (the largest of the commands of the
     action's steps; negative inside, at most 1e-9 for guidance that enforces the constraints), `fallback` (number of
     these steps without a solution), `phase` (0 to 1), `command` (O,) and `segment` (its name).
 
@@ -37,18 +37,18 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         demonstrations: One motion in the world, its file, or segments with frames of their own.
         pose: (env, observation) → measured outputs (O,) in the world, such as a position, or a position and an
             orientation (see `orientation`).
-        to_action: (env, observation, command, extra) → action of `env` that moves it to the command (O,); `extra` is
-            the segment's discrete output, such as a gripper's.
-        guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (an action is added to it, without
-            constraints), "clipped_residual" (the same, moved to the nearest point within the constraints), "template",
-            or a `Guide`.
+        to_action: (env, observation, command, extra) → action of `env` that reaches the command (O,); `extra` is the
+            segment's discrete output, such as a gripper command.
+        guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (the action is added to the motion,
+            without constraints), "clipped_residual" (as "residual", moved to the nearest point within the constraints),
+            "template", or a `Guide`.
         constraints: Constraints of a single motion without segments; `Segment` has its own.
         frame: Frame of a single motion without segments, as in `Segment`.
         template: Template, or the name or file of one, for guidance="template".
         template_frames: (env, observation) → poses of the template's objects by name, called at reset.
         period: Duration of a step of `env` [s], positive.
         action_repeat: Steps of `env` for which an action is applied, at least 1.
-        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_scale: κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
         action_dims: Indices of the outputs that an action moves; all by default.
         history: P, past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
@@ -128,7 +128,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.end_action()
 
     def begin_action(self, action: Any) -> None:
-        """Begin a step; `request`, `advance` and `end_action` are its parts, for several environments at once.
+        """Begin an action; step several environments together with `request`, `advance` and `end_action`.
 
         Raises:
             InputError: If the action is not (A,) finite numbers.
@@ -147,7 +147,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._count >= self.action_repeat or self._terminated or self._truncated
 
     def request(self) -> Any:
-        """Return the prediction of the next step, or None."""
+        """Return the request for the next step's prediction, or None if the guide needs no prediction."""
         return self.guide.request(self.env, self._observation, self._action, self._measured())
 
     def advance(self, output: np.ndarray | None) -> None:
@@ -162,7 +162,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._truncated = bool(self._truncated) or (self.guide.is_finished and not self._terminated)
 
     def end_action(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Return the result of the step."""
+        """Return observation, summed reward, terminated, truncated and info, as `step` does."""
         assert self._command is not None
         info = {
             **self._info,
@@ -213,7 +213,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment]:
-    """Return the segments of what is given as demonstrations."""
+    """Return the segments of a motion; a motion without segments becomes a single one."""
     if demonstrations is None:
         raise InputError("guidance by demonstrations needs demonstrations=")
     if isinstance(demonstrations, Demonstrations | str | Path):
@@ -227,9 +227,9 @@ def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment
 
 
 class GuidedVectorEnv(SyncVectorEnv):
-    """Vector environment of `GuidedEnv`s that share their guidance; an environment behaves as it does alone.
+    """Vector environment of `GuidedEnv`s that share their guidance; each behaves as it does alone.
 
-    The guidance is fitted once, and the predictions of all environments at a control step are `LcNsKmp.predict_batch`.
+    The guidance is fitted once. `LcNsKmp.predict_batch` computes the predictions of all environments at a control step.
     An environment is reset in the step after the end of its episode (`AutoresetMode.NEXT_STEP`).
 
     Args:
@@ -283,7 +283,7 @@ def _copied(observations: Any) -> Any:
 
 
 def _predict_batch(requests: list[Any]) -> list[np.ndarray | None]:
-    """Return the outputs of predictions, those of one primitive in a batch; None without a request or a solution."""
+    """Return the outputs of requested predictions, batched by primitive; None without a request or a solution."""
     groups: dict[int, list[int]] = defaultdict(list)
     outputs: list[np.ndarray | None] = [None] * len(requests)
     for i, request in enumerate(requests):

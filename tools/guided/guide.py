@@ -1,4 +1,4 @@
-"""Guides: commands of an episode under a policy's actions, from demonstrations or a shared control template."""
+"""Guides: compute commands from a policy's actions and demonstrations or a shared control template."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class GuideCommand:
     Attributes:
         output: Command (O,) in the world.
         violation: Violation of the segment's constraints; negative inside, −inf without constraints.
-        is_fallback: True if no command within the constraints was found, and one near the last command is sent.
+        is_fallback: True if no command within the constraints was found; the command is then the last one or near it.
         extra: Discrete output of the segment, for `to_action`.
     """
 
@@ -47,7 +47,7 @@ class GuideCommand:
 
 
 class Guide(ABC):
-    """Commands of an episode, one a control step.
+    """Source of the commands of an episode, one per control step.
 
     Attributes:
         num_outputs: Number O of outputs of a command.
@@ -78,7 +78,7 @@ class Guide(ABC):
 
     @abstractmethod
     def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step with the output (O,) of the requested prediction, or None if it was not found."""
+        """Complete the control step with the output (O,) of the requested prediction, or None if it has no solution."""
 
     @property
     @abstractmethod
@@ -118,13 +118,13 @@ class _FittedSegment:
         self._primitive: LcNsKmp | None = None
         given = segment.constraints
         if not callable(given):
-            self.primitive_for(self.as_constraints(given))  # refuses wrong constraints before an episode
+            self.primitive_for(self.as_constraints(given))  # refuses invalid constraints before an episode
 
     def _variances(self) -> np.ndarray:
         return self.reference.standard_deviations**2
 
     def as_constraints(self, given: Any) -> LinearConstraints:
-        """Return linear constraints: those given, or a box for each step's phase of demonstrated bounds."""
+        """Return linear constraints: the given ones, or a box for each step's phase from demonstrated bounds."""
         if given is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(given, DemonstratedBounds):
@@ -162,7 +162,7 @@ class _FittedSegment:
         if self.guidance == "kmp":
             return np.zeros(self.num_outputs)
         if self.guidance in ("residual", "clipped_residual"):
-            # One gain for all directions and times: the RMS of the displacements by a null-space action.
+            # One gain for each group of outputs and all times: RMS displacement by a constant null-space action of ±1.
             gains = np.zeros(self.num_outputs)
             sigma = deviation(self.reference)
             groups = (range(3), range(3, 6)) if self.num_outputs == 6 else (range(self.num_outputs),)
@@ -179,7 +179,7 @@ class GuideSettings:
     """Settings of guidance by demonstrations.
 
     Attributes:
-        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_scale: κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
         action_dims: Outputs that an action moves, one entry each; all by default.
         history: P, past outputs that the motion of sKGRL passes through.
         history_variance: ρ, variance of the past outputs [output²].
@@ -196,7 +196,7 @@ class GuideSettings:
 
 
 class PrimitiveGuide(Guide):
-    """Commands of movement primitives, segment after segment.
+    """Guide by movement primitives, one segment after another.
 
     Args:
         segments: Segments in their order.
@@ -260,7 +260,7 @@ class PrimitiveGuide(Guide):
         self._last = past[-1]
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request:
-        """Begin a control step, and the next segment if the last one has ended."""
+        """Begin a control step, and the next segment if the current one has ended."""
         fitted = self.segments[self._index]
         segment = fitted.segment
         is_over = self._step >= fitted.num_steps + segment.dwell
@@ -304,20 +304,20 @@ class PrimitiveGuide(Guide):
 
     @property
     def is_finished(self) -> bool:
-        """True after the last step of the last segment, or if it ended early."""
+        """True after the last step of the last segment, or after that segment has ended early."""
         fitted = self.segments[self._index]
         is_last = self._index + 1 == len(self.segments)
         return self._is_ended or (is_last and self._step >= fitted.num_steps + fitted.segment.dwell)
 
     @property
     def phase(self) -> float:
-        """Share of the steps of all segments; it jumps where a segment ends early."""
+        """Completed fraction of the steps of all segments; it jumps if a segment ends early."""
         before = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments[: self._index])
         return (before + self._step) / self.num_steps
 
     @property
     def segment_name(self) -> str:
-        """Name of the current segment, or its number."""
+        """Name of the current segment, or its index if it has no name."""
         return self.segments[self._index].segment.name or str(self._index)
 
     def scaled_command(self) -> np.ndarray:
@@ -327,7 +327,7 @@ class PrimitiveGuide(Guide):
 
 
 class TemplateGuide(Guide):
-    """Commands of a shared control template; outputs are poses [x y z Rz Ry Rx] [m, rad].
+    """Guide by a shared control template; outputs are poses [x y z Rz Ry Rx] [m, rad].
 
     Args:
         template: Template.
@@ -354,7 +354,7 @@ class TemplateGuide(Guide):
         self.num_actions = template.inputs
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin in the state of the measured pose."""
+        """Begin in the template's state at the measured pose."""
         self._frames = self._frames_of(env, observation)
         missing = [name for name in self.template.frames if name not in self._frames]
         if missing:
@@ -365,7 +365,7 @@ class TemplateGuide(Guide):
         self._start, self._has_begun = self._progress(), False
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> None:
-        """Apply the input mapping, and the transition that is due."""
+        """Make the transition to the next state if it is due, and apply the input mapping."""
         if self._has_begun:
             self._state = self.template.next_state(self._state, self._X, self._frames, self._period)
         self._has_begun = True
@@ -392,7 +392,7 @@ class TemplateGuide(Guide):
 
     @property
     def phase(self) -> float:
-        """Number of the state, from 0 to 1."""
+        """Index of the current state, scaled to the range from 0 to 1."""
         return self._state / max(len(self.template.states) - 1, 1)
 
     @property

@@ -18,14 +18,14 @@ from guiderail.models.primitives import Demonstrations, LinearConstraints
 from guiderail.models.primitives.bounds import DemonstratedBounds
 from guiderail.models.primitives.poses import Orientation, pose_rotation
 
-MIN_STEPS = 12  # control steps of a segment, which the Gaussian mixture needs
+MIN_STEPS = 12  # minimum control steps of a segment, for the fit of the Gaussian mixture
 
 
 class Frame:
     """Frame F of a segment in the world W.
 
     Args:
-        p: Origin p_WF, (3,) or (O,) for outputs that are no positions in space [unit of the outputs].
+        p: Origin p_WF, (3,) or (O,) for outputs that are not positions in space [unit of the outputs].
         R: Rotation matrix R_WF (3, 3); the identity by default.
 
     Raises:
@@ -54,7 +54,7 @@ class Frame:
         Args:
             output: Output (O,) in W.
             orientation: Meaning of entries 3 to 6.
-            near: Output (O,) in F; the orientation is continued from it by full turns.
+            near: Output (O,) in F; full turns are added to the orientation so that it is nearest to this one.
         """
         return self._transformed(output, orientation, is_inverse=True, near=near)
 
@@ -104,13 +104,13 @@ class Segment:
         demonstrations: Demonstrations in the segment's frame, at least three, or their file.
         frame: (env, observation) → `Frame` or origin (O,), called when the segment begins; the world by default.
         constraints: Constraints in the frame, or (env, observation) → constraints, called when the segment begins.
-        extra: What `to_action` needs and no policy moves, such as a gripper: a value, or (phase of the segment from 0
-            to 1, true while its last point is held) → value. By default it is that of `discrete`.
+        extra: Value for `to_action` that no action changes, such as a gripper command, or (phase of the segment from 0
+            to 1, true while its last point is held) → value. By default, the value of `discrete`.
         discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
             the most frequent value of the demonstrations at its phase.
         until: (env, observation) → true to end the segment early; by default it ends with its steps.
         num_steps: Control steps; the mean duration of the demonstrations divided by the period by default.
-        dwell: Control steps for which the last point is then held.
+        dwell: Control steps for which the last point is held after that.
         floor: Standard deviation (O,) or scalar added to every covariance [unit of the output].
         name: Name of the segment, in `info`.
 
@@ -180,7 +180,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
 
     Args:
         demonstrations: M demonstrations.
-        cuts: Increasing samples of the events, M lists of equal length K, as `find_events` returns them.
+        cuts: Increasing sample indices of the events, M lists of equal length K, as `find_events` returns them.
 
     Returns:
         K + 1 demonstrations of M parts each; the clock of each part begins at 0.
@@ -202,7 +202,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
 
 
 def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np.ndarray], bool]]) -> list[list[int]]:
-    """Return for each recording the samples at which conditions first hold, one after the other.
+    """Return for each recording the sample indices at which the conditions hold first, each after the one before.
 
     Args:
         signals: M arrays (N_m, S), such as outputs and a gripper.

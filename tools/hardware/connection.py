@@ -23,10 +23,10 @@ from guiderail.tools.hardware.scenario import load_scenario
 
 LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall clock time]
 COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
-MAX_DURATION = 7 * 24 * 3600.0  # of a simulated driver, by the robot's clock [s]
-DEFAULT_RATE = 0.2  # in contact, a simulated robot with 1 kHz is slower than real time on usual machines
+MAX_DURATION = 7 * 24 * 3600.0  # longest run of a simulated driver, by the robot's clock [s]
+DEFAULT_RATE = 0.2  # rate of a simulated robot's clock; simulating contact at 1 kHz is slower than real time
 SIMULATED = (DEFAULT_ROBOT, "fci")  # drivers that have a simulated robot
-ROBOT_TIMEOUT = 60.0  # a simulated driver is started with the command [s]
+ROBOT_TIMEOUT = 60.0  # longest wait for the first status of a simulated driver, which has to start first [s]
 NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine the arm will be stopped because commands are late"
 
 Log = Callable[[str], None]
@@ -36,10 +36,10 @@ Log = Callable[[str], None]
 def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen[Any]]:
     """Run Python code in a child process that exits when its parent does, even if the parent is killed.
 
-    The child's standard input is a pipe; the operating system closes its other end with the parent.
+    The child's standard input is a pipe; the operating system closes the other end when the parent exits.
     """
     program = f"from {__name__} import exit_with_parent; exit_with_parent()\n{code}"
-    # A new session, because Ctrl-C is meant for this process, which needs the child to bring the arm to rest.
+    # A new session: Ctrl-C must not end the child, which this process needs to bring the arm to rest.
     process = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, start_new_session=True)
     try:
         yield process
@@ -73,7 +73,7 @@ class RobotConnection:
         scenario: Scenario file with robot, address and surroundings.
 
     Raises:
-        InputError: If the options contradict each other, or no such simulated driver exists.
+        InputError: If the options contradict each other, or the driver has no simulated robot.
     """
 
     robot_url: str = ""
@@ -86,10 +86,10 @@ class RobotConnection:
 
     @classmethod
     def from_scenario(cls, file: Path | None, **options: Any) -> RobotConnection:
-        """Return the connection of a scenario file and of further options; the file may be None.
+        """Return the connection that options and a scenario file describe; the file may be None.
 
         Raises:
-            InputError: If the file is invalid, or its robot or address is not that of the options.
+            InputError: If the file is invalid, or its robot or address contradicts the options.
         """
         if file is None:
             return cls(**options)
@@ -128,7 +128,7 @@ class RobotConnection:
         return options | ({"robot_timeout": ROBOT_TIMEOUT} if self.sim else {})
 
     def clocks(self, station: HardwareStation) -> tuple[Clock, WallClock]:
-        """Return the clock of a station, and a wall clock, which is the same unless in lockstep."""
+        """Return a station's clock and a wall clock; they are the same object unless in lockstep."""
         wall_clock = WallClock(station.driver, station.period, self.rate if self.sim else 1.0)
         if not self.synchronous:
             return wall_clock, wall_clock

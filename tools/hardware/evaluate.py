@@ -47,8 +47,8 @@ def evaluate_on_robot(
 ) -> Mapping[str, Any]:
     """Run episodes of a policy, and write a row for each.
 
-    With a simulated driver they are those of `guiderail evaluate` in simulation: held-out conditions, and the run's own
-    hidden offset.
+    With a simulated driver the episodes have the conditions of `guiderail evaluate` in simulation: held-out conditions,
+    and the run's own hidden offset.
 
     Args:
         run: Run folder.
@@ -106,5 +106,5 @@ def evaluate_on_robot(
                     try:
                         env.rest()
                     finally:
-                        write(rows)  # with the last episode, even if its motion back was not confirmed
+                        write(rows)  # includes the last episode, even if resuming after it was not confirmed
     return {"rows": str(path), **summary(pd.DataFrame(rows), STATISTICS)}

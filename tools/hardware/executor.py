@@ -53,7 +53,7 @@ SIGNALS = {
     "arm_state": 1,
 }
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
-MAX_WARM_UP_TIME = 0.1  # [s]
+MAX_WARM_UP_TIME = 0.1  # longest duration of the warm-up [s]
 BLEND_TIMEOUT = 5.0  # longest time until the controller has full authority [s]
 COMPLETED = "done"
 
@@ -65,7 +65,7 @@ class Outcome:
     Attributes:
         fault: Fault that stopped the arm, or NONE.
         description: The outcome in words.
-        steps: Control steps of the skill that were executed.
+        steps: Number of executed control steps of the skill.
     """
 
     fault: Fault
@@ -74,7 +74,7 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if the skill was executed to its end, otherwise 1."""
+        """Exit code of the program: 0 if the skill was executed to its end, otherwise 1."""
         return 0 if self.description == COMPLETED else 1
 
 
@@ -144,7 +144,7 @@ class SkillExecutor:
         self._clock.advance(self._simulator, station, round((station.limits.damping_time + 0.1) / station.period))
 
     def _return_control(self) -> None:
-        """Continue with the station of the approach, because a skill that raised cannot be advanced."""
+        """Give control back to the approach's station, because a simulator that raised cannot be advanced."""
         station, root_context = self._active_station()
         if station is self._skill_station:
             context = station.GetMyContextFromRoot(root_context)
@@ -157,7 +157,7 @@ class SkillExecutor:
         return (self._skill_station if is_skill else self._station), self._simulator.get_mutable_context()
 
     def _step(self) -> Outcome | None:
-        """Advance by a control step; return the outcome if it stopped the arm."""
+        """Advance by a control step; return the outcome if the arm is stopped or must be stopped."""
         station, root_context = self._active_station()
         self._clock.advance(self._simulator, station, self._steps)
         context = station.GetMyContextFromRoot(root_context)
@@ -221,7 +221,7 @@ class SkillExecutor:
             else station.GetOutputPort(name).Eval(station_context)
             for name in SIGNALS
         }
-        # Before the trace: an interruption in between leaves one joint sample too many, and never one too few.
+        # Joint signals first: an interruption before the trace then leaves one sample too many, never one too few.
         for name, values in self._joints.items():
             values.append(station.GetOutputPort(f"{station.driver.name}.{name}").Eval(station_context).copy())
         self.trace.append(
@@ -248,7 +248,7 @@ class SkillExecutor:
         log(f"{outcome.description}, after {outcome.steps} control steps: {self.write(folder, metadata)}")
 
     def write(self, folder: Path, metadata: Mapping[str, Any]) -> Path:
-        """Write the control steps with joint signals as Parquet and the metadata as JSON; return the first's path."""
+        """Write the control steps with joint signals as Parquet, the metadata as JSON; return the Parquet path."""
         folder.mkdir(parents=True, exist_ok=True)
         number = _next_number(folder)
         steps = table(self.trace, number)

@@ -34,7 +34,7 @@ class OperatorKeys:
         return self._is_stop_requested
 
     def describe(self, *, has_pauses: bool = False) -> str:
-        """Return a sentence on the keys, with the pause if there are episodes; without a terminal there is Ctrl-C."""
+        """Return a sentence on the keys, including the pause key if `has_pauses`; only Ctrl-C without a terminal."""
         if not sys.stdin.isatty():
             return "Ctrl-C stops the arm"
         return "Enter or Ctrl-C stops the arm" + has_pauses * ", p and Enter pauses it at the end of an episode"
@@ -50,7 +50,7 @@ class OperatorKeys:
 
 @contextmanager
 def operator_keys() -> Iterator[OperatorKeys]:
-    """Yield the operator's keys, with Ctrl-C as one of them; a second Ctrl-C in a row ends the process."""
+    """Yield the operator's keys; Ctrl-C requests a stop, or raises KeyboardInterrupt if one is already requested."""
     keys = OperatorKeys()
 
     def handle(number: int, frame: object) -> None:
@@ -66,7 +66,7 @@ def operator_keys() -> Iterator[OperatorKeys]:
 
 
 def confirm(question: str) -> None:
-    """Ask the operator at the terminal.
+    """Ask the operator at the terminal to confirm.
 
     Raises:
         InputError: If the answer is not yes, or there is no terminal.

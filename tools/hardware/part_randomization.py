@@ -1,4 +1,4 @@
-"""Offsets of fixture and workpiece in front of a simulated driver, where a reset in simulation would sample them."""
+"""Offsets of fixture and workpiece for a simulated driver, sampled as by a reset in simulation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
 class PartRandomizer:
-    """Sample the offsets of a task's parts, and send them to the simulated driver."""
+    """Sampler of the offsets of a task's parts, which sends them to the simulated driver."""
 
     def __init__(self, task: InsertionTask, driver: LcmDriver, seed: int):
         """Sample the offset of the run; it is the same as in simulation with this seed."""
@@ -27,7 +27,7 @@ class PartRandomizer:
         task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Move the parts to new offsets for the options of a reset in simulation; return the offsets by name."""
+        """Move the parts to offsets sampled with the options of a reset in simulation; return the offsets by name."""
         reset = validate_options(self._task.Reset, options, "a simulated driver")
         fixture, workpiece = self._task.offsets.draw(rng, reset)
         self._driver.lcm.Publish(CHANNEL, json.dumps([fixture.tolist(), workpiece.tolist()]).encode())

@@ -1,4 +1,4 @@
-"""Pre-flight checks, printed and confirmed before a robot moves, and slow motions between them and the skill."""
+"""Pre-flight checks, printed and confirmed before a robot moves, and slow motions to and from a skill's start."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, pose_difference
 from guiderail.tools.hardware.operator import confirm
 
-SPEED, ANGULAR_SPEED = 0.02, 0.1  # of a slow approach [m/s], [rad/s]
-MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum on the return path; slower segments are skipped [m/s], [rad/s]
-POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # of a reached pose
-SETTLING_TIME = 0.5  # at the end of an approach [s]
+SPEED, ANGULAR_SPEED = 0.02, 0.1  # speeds of a slow approach [m/s], [rad/s]
+MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum speeds of the way back; slower parts are skipped [m/s], [rad/s]
+POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # tolerances of a reached pose [m], [rad]
+SETTLING_TIME = 0.5  # time that the target is held at the end of an approach [s]
 
 
 def pose_distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -34,7 +34,7 @@ def is_near(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
-    """Return commands (n, 6) from `pose` to `target`, (6,), along a straight line at `SPEED`, then some to settle.
+    """Return commands (n, 6) from `pose` to `target`, (6,), along a straight line at `SPEED`, then at `target`.
 
     The time between commands is `period` [s].
     """
@@ -45,7 +45,7 @@ def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.nda
 
 
 def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
-    """Return commands backwards along poses (n, 6), at their own speed but without the segments nearly at rest.
+    """Return commands backwards along poses (n, 6) at the recorded speed, without segments that are nearly at rest.
 
     The time between poses is `period` [s].
     """
@@ -59,8 +59,8 @@ def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
     return poses
 
 
-MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # from the start pose, for an unattended approach [m], [rad]
-MAX_JOINT_SPEED = 0.05  # of an arm at rest [rad/s]
+MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # largest distance and angle from the start pose for an approach [m], [rad]
+MAX_JOINT_SPEED = 0.05  # largest joint speed of an arm at rest [rad/s]
 MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
 NUM_STATUSES = 20  # statuses that are received before the checks
 
@@ -116,7 +116,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     """Check the status of a robot in the root context of its station, and list the assumptions about it.
 
     `start` is the start pose of the skill, (6,), and `num_commands` the number of commands that the robot received from
-    other programs in the meantime.
+    other programs since the checks were constructed.
     """
     plant, arm = station.controller_plant.plant, station.controller_plant.arm
     driver, limits = station.driver, station.limits

@@ -24,7 +24,7 @@ from guiderail.tools.hardware.connection import Log
 from guiderail.tools.hardware.operator import OperatorKeys
 from guiderail.tools.hardware.preflight import PreflightChecks, is_near, pose_distance, retrace, slow_approach
 
-# A pull that checks a success: commanded distance, largest measured distance [m], smallest measured force [N].
+# Pull that confirms a success: commanded distance, largest measured distance [m], smallest measured force [N].
 PULL_DISTANCE, MAX_PULL_MOTION, MIN_PULL_FORCE = 3.0 * MM, 1.0 * MM, 1.5
 PULL_STEPS = 25  # control steps of the pull
 ANGLE_WEIGHT = 0.1  # weight of an angle in the distance to the return path [m/rad]
@@ -32,7 +32,7 @@ RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
 
 
 class RobotStoppedError(Exception):
-    """The arm is being stopped by a limit, a fault or the operator.
+    """Error while the arm is being stopped by a limit, a fault or the operator.
 
     Attributes:
         fault: Reason of the stop.
@@ -76,7 +76,7 @@ class RobotEnv(DiagramEnv):
 
         Args:
             task: Diagram of the task.
-            station: Its station.
+            station: Hardware station of the diagram.
             transfer_station: Clone of the station, for the motions between episodes.
             start: Pose at which an episode starts, (6,).
             clock: Clock of both stations.
@@ -85,7 +85,7 @@ class RobotEnv(DiagramEnv):
             confirm_resume: Function called with the reason of a stop; returns when the arm may move again, or raises.
             log: Function that shows a message.
             randomize_parts: Function called at the start pose with a random number generator and the reset's options;
-                moves the parts as a reset in simulation and returns what was sampled.
+                moves the parts as a reset in simulation does, and returns what was sampled.
 
         Raises:
             InputError: If no robot answers.
@@ -98,7 +98,7 @@ class RobotEnv(DiagramEnv):
         self._station, self._is_stepping = transfer_station, False
         self.preflight = PreflightChecks(transfer_station, clock, start, self._steps)
         self._last_transfer: Simulator | None = None
-        self._return_path: list[np.ndarray] = []  # the last pose is the nearest
+        self._return_path: list[np.ndarray] = []  # poses (6,) of the way back; the last one is next
         self.fault = Fault.NONE
 
     # The two stations.
@@ -156,7 +156,7 @@ class RobotEnv(DiagramEnv):
     # Episodes.
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Move the arm to the start.
+        """Move the arm to the start, and begin an episode.
 
         Raises:
             InputError: If the start is not reached, or options are given for a real robot.
@@ -337,8 +337,8 @@ class RobotEnv(DiagramEnv):
             return
         self._confirm_resume(self._active_fault.description)
         self._station.driver.recover()
-        # No status was received while the operator was asked. Those of an arm that was moved in the meantime are
-        # accepted after the settling time only.
+        # No status was received while the operator was asked. If the arm was moved in the meantime, its statuses are
+        # accepted only after the settling time.
         self._clock.begin()
         settling_steps = math.ceil(self._station.status_limits.settling_time / self._station.period)
         self._advance_statuses(self._steps + settling_steps)

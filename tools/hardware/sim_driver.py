@@ -26,8 +26,8 @@ from guiderail.tools.hardware.scenario import load_scenario
 
 DEFAULT_TASK = "BncConnector"
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # initial pose of the default task: the plug above the jack
-START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # of the initial pose from another task's start pose
-PLANT_STEPS_PER_STATUS = 5  # in real time; the arm's own control loop has 1 kHz
+START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # initial pose relative to another task's start pose
+PLANT_STEPS_PER_STATUS = 5  # if not in lockstep; a real arm's own control loop has 1 kHz
 
 
 def run_sim_driver(
@@ -57,7 +57,7 @@ def run_sim_driver(
         log: Function that shows a message.
 
     Returns:
-        True if acknowledgements arrived until the end.
+        True if acknowledgements arrived until the end; always True if not in lockstep.
 
     Raises:
         InputError: If the task is no insertion, or an argument is out of range.
@@ -85,7 +85,7 @@ def run_sim_driver(
         return True
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm = open_bus(url)
-    # In real time the monitor has a connection of its own, as next to a real driver, where it is another process.
+    # In real time the monitor has a bus connection of its own, as on a real robot, where it is another process.
     robot_lcm, monitor_lcm = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
     robot = SimulatedIiwa(
         insertion.workcell(),
@@ -96,7 +96,7 @@ def run_sim_driver(
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
     plant = robot.controller_plant.plant
-    # A simulated robot may be slower than its clock; its monitor has the same one.
+    # The monitor uses the simulated time, because a simulated robot may be slower than the wall clock.
     monitor = SafetyMonitor(
         IiwaDriver(monitor_lcm), plant, safety_limits(plant, IiwaDriver), clock=simulator.get_context().get_time
     )

@@ -26,7 +26,7 @@ from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, with_defaults
 
-EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are excluded from training
+EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are not used for training
 NICENESS = 5  # niceness of the training process, so that the control loop meets its deadlines
 
 
@@ -50,7 +50,7 @@ def train_on_robot(
         environment: Environment options by name, with a hardware station.
         given: Arguments of `configure`: algorithm, preset, episodes, seed.
         settings: Settings of the learner.
-        assume_yes: Skip the confirmation of the checks, and with a simulated driver also that of resuming after a stop.
+        assume_yes: Skip the confirmation of the checks and, with a simulated driver, of resuming after a stop.
         log: Function that shows a message.
 
     Raises:

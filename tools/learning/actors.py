@@ -37,13 +37,13 @@ class Snapshot(NamedTuple):
 
 
 class SimulatedEpisode(NamedTuple):
-    """Episode of an actor.
+    """Episode that an actor simulated.
 
     Attributes:
         number: Number of the episode.
         row: Its row in the table of the run.
         transitions: Its transitions.
-        is_greedy: True if it did not explore.
+        is_greedy: True if the learner acted without exploration.
     """
 
     number: int
@@ -55,9 +55,9 @@ class SimulatedEpisode(NamedTuple):
 class ParallelLearner(Learner):
     """Learner whose episodes are simulated by N actors, forks of this process, while it learns in this one.
 
-    Episode k is acted with the weights learned from the episodes before k − N, in their order; its random numbers
-    depend on the seed and k alone. The result of a run therefore depends on N but not on the timing of the processes,
-    and the conditions of episode k do not depend on N. N = 1 simulates an episode while it learns from the one before.
+    Episode k uses the weights learned from the first k − N episodes, in their order; its random numbers depend only on
+    the seed and k. The result of a run therefore depends on N but not on the timing of the processes; the conditions of
+    episode k do not depend on N. With N = 1, an episode is simulated while the learner learns from the previous one.
     """
 
     def __init__(
@@ -74,12 +74,12 @@ class ParallelLearner(Learner):
         """Construct the learner; the actors start with the first episode.
 
         Args:
-            learner: Learner, which learns in this process.
-            env: Environment, already reset once: what is constant in the run is sampled.
+            learner: Learner that is trained in this process.
+            env: Environment, already reset once, so that the values that are constant in the run are sampled.
             num_envs: Number N of actors.
             seed: Seed of the run.
             num_episodes: Number of episodes of the run.
-            demonstrator: Policy that acts in the first episodes instead, and their number.
+            demonstrator: Policy that acts instead of the learner in the first episodes, and the number of them.
             callbacks: Callbacks of the episodes, in the actor's process.
 
         Raises:
@@ -92,7 +92,7 @@ class ParallelLearner(Learner):
         self._learner, self._env, self._num_envs, self._seed = learner, env, num_envs, seed
         self._num_episodes, self._demonstrator, self._callbacks = num_episodes, demonstrator, callbacks
         self._forks: Forks | None = None
-        self._learned = self._assigned = 0  # numbers of episodes
+        self._learned = self._assigned = 0  # numbers of episodes learned from and assigned
         self._simulated: dict[int, SimulatedEpisode] = {}
         self._snapshots = {0: _snapshot(learner)}  # by the number of episodes learned from
 
@@ -118,7 +118,7 @@ class ParallelLearner(Learner):
         learner.start_recorded(episode.is_greedy, actor)
         for transition in episode.transitions:
             learner.on_step(transition)
-            self._exchange(0.0)  # an actor must not wait for the end of the training
+            self._exchange(0.0)  # an idle actor must not wait until the whole episode is learned
         row = {**episode.row, **learner.on_episode_end(episode.row)}
         self._learned += 1
         self._snapshots[self._learned] = _snapshot(learner)
@@ -128,11 +128,11 @@ class ParallelLearner(Learner):
         return row
 
     def _required(self, index: int) -> int:
-        """Return the number of episodes that the weights of an episode are learned from."""
+        """Return the number of episodes from which the weights that episode `index` uses are learned."""
         return max(0, index - self._num_envs)
 
     def _exchange(self, timeout: float | None) -> None:
-        """Assign episodes to idle actors, and collect simulated ones; at most `timeout` [s], or until there is one."""
+        """Assign episodes to idle actors and collect simulated ones; wait at most `timeout` [s], or for one if None."""
         assert self._forks is not None
         while self._forks.has_idle and self._assigned < self._num_episodes:
             if (required := self._required(self._assigned)) > self._learned:
@@ -148,7 +148,7 @@ class ParallelLearner(Learner):
         conditions, exploration, process = np.random.SeedSequence([self._seed, index]).spawn(3)
         self._env.unwrapped.np_random = np.random.default_rng(conditions)
         learner.random = np.random.default_rng(exploration)
-        set_random_seed(int(process.generate_state(1)[0]))  # of the process, which Stable-Baselines3 samples from
+        set_random_seed(int(process.generate_state(1)[0]))  # global generators, which Stable-Baselines3 uses
         load_weights(learner, snapshot.weights)
         learner.episodes, learner.transitions = index, snapshot.transitions
         learner.greedy_successes, learner.selection = snapshot.greedy_successes, None
@@ -165,7 +165,7 @@ class ParallelLearner(Learner):
             self._forks.close()
 
     def metrics(self) -> Mapping[str, float]:
-        """Return what the learner recorded since the last call."""
+        """Return the metrics that the learner recorded since the last call."""
         self._learner.records_metrics = self.records_metrics
         return self._learner.metrics()
 
@@ -178,7 +178,7 @@ class ParallelLearner(Learner):
         return self._learner.has_diverged()
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return the state of the learner, and the snapshots that the next episodes are acted with."""
+        """Return the state of the learner, and the snapshots that the next episodes use."""
         arrays, values = self._learner.state()
         stored = {f"learner/{name}": array for name, array in arrays.items()}
         for number, module, name, array in self._snapshot_arrays():
@@ -208,7 +208,7 @@ class ParallelLearner(Learner):
 
 
 class _EpisodeRecorder(Callback):
-    """Record of an episode's transitions, which starts the episode of the acting learner."""
+    """Callback that records an episode's transitions and starts the episode of the acting learner."""
 
     def __init__(self, learner: OffPolicyLearner):
         self._learner = learner
@@ -222,7 +222,7 @@ class _EpisodeRecorder(Callback):
 
 
 def record_transition(transitions: list[Transition], transition: Transition) -> bool:
-    """Append a transition that is learned from later; return False if there is nothing to learn from it.
+    """Append a transition for learning; return False if it is left out because the simulation failed.
 
     If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
     """
@@ -254,7 +254,7 @@ def load_weights(learner: OffPolicyLearner, weights: Weights) -> None:
 
 
 def _load_module(module: torch.nn.Module, weights: Mapping[str, np.ndarray]) -> None:
-    shapes = {key: value.shape for key, value in module.state_dict().items()}  # files have no array without axes
+    shapes = {key: value.shape for key, value in module.state_dict().items()}  # files store 0-d arrays as 1-d
     module.load_state_dict({key: torch.from_numpy(value).reshape(shapes[key]) for key, value in weights.items()})
 
 

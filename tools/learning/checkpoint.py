@@ -1,4 +1,4 @@
-"""Checkpoints: everything that a run needs to continue bit for bit, in one file without code; and actor selection."""
+"""Checkpoint files, from which a run continues bit for bit and which hold no code; and the selection of an actor."""
 
 import json
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ Actor = dict[str, torch.Tensor]
 
 @dataclass
 class Candidate:
-    """Actor with the number of consecutive greedy successes around it."""
+    """Actor with the numbers of consecutive successful greedy episodes before it and from its own episode on."""
 
     actor: Actor  # parameters by name
-    before: int  # successes before its episode
-    since: int = 0  # successes from its own episode on
+    before: int  # number of successes before its own episode
+    since: int = 0  # number of successes from its own episode on
 
     def score(self) -> int:
-        """Return the successes on the weaker side: an actor that succeeds by luck has few on one of them."""
+        """Return the smaller of both numbers: an actor that succeeds by luck has few successes before or after it."""
         return min(self.before, self.since)
 
 
@@ -37,7 +37,7 @@ class CheckpointSelection:
 
     Learning at the edge of contact oscillates: a policy that succeeds for twenty episodes can fail for two and recover,
     so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. Successes of the
-    next few episodes are no proof either, because the actors that achieved them were its successors.
+    next few episodes do not prove an actor good either, because later actors achieved them.
     """
 
     def __init__(self, window: int):
@@ -66,7 +66,7 @@ class CheckpointSelection:
         self._open.pop()
 
     def result(self) -> Actor | None:
-        """Return the best actor so far; None if no actor has successes on both sides."""
+        """Return the best actor so far; None if no actor has a score of at least 1."""
         best = self._best()
         return None if best is None else best.actor
 
@@ -98,7 +98,7 @@ class CheckpointSelection:
 
 
 def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-    """Write arrays and JSON values with a digest; if killed while writing, the last checkpoint stays."""
+    """Write arrays and JSON values with a digest; if killed while writing, the previous checkpoint stays."""
     arrays = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
     text = json.dumps(values)
     write_atomically(path, save(arrays, {"values": text, "digest": digest(arrays, text)}))

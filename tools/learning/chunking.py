@@ -15,16 +15,16 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.cloning import BcLearner
 from guiderail.tools.learning.config import ChunkConfig
 
-MIN_SCALE = 1e-6  # smallest scale of an output; one that never changes has no spread
+MIN_SCALE = 1e-6  # smallest scale of an output; the spread of a constant output is zero
 
 
 class ChunkLearner(BcLearner):
-    """Learner of a base policy: from an observation to the next K commanded poses, mean squared error, by Adam.
+    """Learner of a base policy that maps an observation to the next K commanded poses (mean squared error, Adam).
 
-    The policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations, whose spread is
-    the uncertainty of the chunk (Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", RSS
-    2023; Lakshminarayanan et al., 2017). They are exported as one network with block-diagonal layers. The learner does
-    not act: after the demonstrations its action is zero.
+    The policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations. The
+    spread of their outputs is the uncertainty of the chunk (Zhao et al., "Learning Fine-Grained Bimanual Manipulation
+    with Low-Cost Hardware", RSS 2023; Lakshminarayanan et al., 2017). The networks are exported as one network with
+    block-diagonal layers. The learner does not act: its action is always zero.
     """
 
     Config = ChunkConfig
@@ -34,7 +34,8 @@ class ChunkLearner(BcLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If observations are images, or the environment is not one of a task's diagram.
+            InputError: If observations are images, the environment is not of a task's diagram, or `pipelined` or
+                `num_envs` is set.
         """
         super().__init__(config, env, **arguments)
         if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
@@ -44,22 +45,22 @@ class ChunkLearner(BcLearner):
         dims = self._env.task.declaration.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)
         self._seen: list[np.ndarray] = []  # observations of the episode
-        self._starts: list[int] = []  # and their control steps
-        self._groups: list[int] = []  # demonstration of each observation
+        self._starts: list[int] = []  # control steps of these observations
+        self._groups: list[int] = []  # number of the demonstration of each observation
         self._center, self._scale = np.zeros(1), np.ones(1)
         self.network = torch.nn.Sequential()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return zero: a chunk is a reference and no action."""
+        """Return zero: a chunk is a reference and not an action."""
         return np.zeros(self._space.shape or (), np.float32)
 
     def on_episode_start(self) -> None:
-        """Count the episode."""
+        """Count the episode and clear its observations."""
         super().on_episode_start()
         self._seen, self._starts, self._step = [], [], 0
 
     def on_step(self, transition: Transition) -> None:
-        """Store the observation of a demonstration."""
+        """Store the observation if the episode is a demonstration."""
         if self.episodes <= self.config.demonstration_episodes:
             self._seen.append(np.asarray(transition.observation, np.float32))
             self._starts.append(self._step)
@@ -75,7 +76,7 @@ class ChunkLearner(BcLearner):
         return super().on_episode_end(row)
 
     def _add(self, observations: np.ndarray, chunks: np.ndarray) -> None:
-        """Store observations (n, …) and chunks (n, K, O); a symmetry moves explored outputs as it does actions."""
+        """Store observations (n, …) and chunks (n, K, O) with symmetric copies; `_dims` are mapped like actions."""
         symmetries = [(np.eye(observations.shape[1]), None)]
         if self._symmetry is not None:
             symmetries += [*zip(self._symmetry.observations, self._symmetry.actions, strict=True)]
@@ -103,7 +104,7 @@ class ChunkLearner(BcLearner):
             optimizer = torch.optim.Adam(network.parameters(), lr=self.config.learning_rate)
             for _ in range(self.config.gradient_steps):
                 batch = rows[random.integers(len(rows), size=self.config.batch_size)]
-                # Without noise an observed command is copied, and errors of the command add up (Ke et al., 2021).
+                # Without noise the network copies an observed command, and errors accumulate (Ke et al., 2021).
                 noise = torch.randn(seen[batch].shape, generator=generator)
                 noisy = seen[batch] + self.config.observation_noise * noise
                 loss = torch.nn.functional.mse_loss(network(noisy), targets[batch])
@@ -114,7 +115,7 @@ class ChunkLearner(BcLearner):
         self.network, self._loss = torch.nn.Sequential(*members), float(np.mean(losses))
 
     def _training_rows(self, random: np.random.Generator) -> np.ndarray:
-        """Return the rows that a network is trained on: those of a bootstrap sample of the demonstrations."""
+        """Return the indices of the samples in a bootstrap sample of the demonstrations, for training one network."""
         groups = np.array(self._groups)
         drawn = random.integers(1, self.episodes + 1, size=self.episodes)
         return np.concatenate([np.flatnonzero(groups == one) for one in drawn])

@@ -18,9 +18,9 @@ from guiderail.tools.learning.networks import export_layers
 
 
 class BcLearner(Learner):
-    """Learner of behavior cloning (Pomerleau, 1988): mean squared error of the demonstrator's actions, by Adam.
+    """Learner of behavior cloning (Pomerleau, 1988), with the mean squared error to the demonstrator's actions.
 
-    It trains once, after the last demonstration, and acts by the trained policy from then on.
+    The learner trains once, by Adam, after the last demonstration, and acts by the trained policy from then on.
 
     Attributes:
         config: The settings.
@@ -105,7 +105,7 @@ class BcLearner(Learner):
         return {"train/loss": self._loss} if np.isfinite(self._loss) else {}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the cloned policy; `description` holds further entries of its description."""
+        """Return the cloned policy; `description` holds further entries of the policy's description."""
         return export_layers([*self.network], self._space, {"squash": "clip", **description})
 
     def has_diverged(self) -> bool:

@@ -1,7 +1,7 @@
 """Configuration of learners: the settings, named presets, and their validation.
 
 A learner names its configuration class as `Learner.Config`, a pydantic dataclass derived from `LearnerConfig`. A
-setting of the command, `--set name=value`, is validated against that class.
+setting given by `--set name=value` is validated against that class.
 """
 
 import math
@@ -60,31 +60,31 @@ class OffPolicyConfig(LearnerConfig):
     """
 
     algorithm: str = "tqc"  # registered name of the learner
-    training_step: Literal["fast", "sb3"] = "fast"  # the equivalent fast step, if there is one, or Stable-Baselines3's
-    learning_rate: Rate = 3e-4  # of actor, critics and entropy coefficient
+    training_step: Literal["fast", "sb3"] = "fast"  # fast: equivalent to Stable-Baselines3's step, if available
+    learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
     gamma: Factor = 0.995  # discount factor per `gamma_per`
-    gamma_per: Literal["control_step", "action"] = "control_step"  # a control step is independent of action_repeat
+    gamma_per: Literal["control_step", "action"] = "control_step"  # time to which gamma applies
     tau: Factor = 0.02  # Polyak factor of the target critics per gradient step
     train_freq: Positive = 8  # transitions between two trainings
-    gradient_steps: Positive = 24  # per training
+    gradient_steps: Positive = 24  # gradient steps per training
     batch_size: BatchSize = 64  # transitions
     n_steps: Annotated[Positive, Field(le=1000)] = 1  # transitions of an n-step return
     buffer_size: Positive = 1_000_000  # transitions in the replay buffer
     learning_starts: Positive = 100  # transitions with uniformly random actions before the first training
     ent_coef: EntCoef = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     net_arch: NetArch = (256, 256)  # units of the hidden layers
-    constant_episodes: NonNegative = 0  # first episodes after the demonstrated ones; each repeats one uniform action
+    constant_episodes: NonNegative = 0  # episodes after the demonstrated ones that each repeat one random action
     ez_greedy: Fraction = 0.0  # probability that an exploring action starts a temporally extended action (εz-greedy)
     ez_greedy_longest: Positive = 8  # maximum number of actions that an extended action lasts
-    ez_greedy_until: NonNegative = 0  # consecutive greedy successes that end extended actions; 0 for never
+    ez_greedy_until: NonNegative = 0  # consecutive greedy successes that end this exploration; 0: never ended
     greedy_episode_fraction: Fraction = 0.0  # fraction of the episodes, evenly spread, that do not explore
     privileged_critic: bool = False  # critics also observe hidden values and the exact wrench; the policy never does
     layer_norm: bool = False  # normalize hidden layers before their activation
-    selection_window: NonNegative = 0  # greedy successes before and after an actor that select it; 0 for the last actor
+    selection_window: NonNegative = 0  # greedy successes counted before and after an actor to select it; 0: last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
-    base_motion_steps: NonNegative = 0  # transitions over which actions other than zero become certain; 0 for at once
-    demonstration_fraction: Fraction = 0.0  # of each batch from the demonstration_episodes (RLPD: 0.5); 0 for no mixing
-    dropout: Fraction = 0.0  # dropout probability of the critics, after which their layers are normalized (DroQ: 0.01)
+    base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
+    demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
+    dropout: Fraction = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
 
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
@@ -96,7 +96,7 @@ class Td3Config(OffPolicyConfig):
     """Settings of twin delayed DDPG (TD3), by the names of Stable-Baselines3 where it has them."""
 
     algorithm: str = "td3"
-    exploration_noise: Fraction = 0.1  # standard deviation of the noise of an exploring action
+    exploration_noise: Fraction = 0.1  # standard deviation of exploration noise, relative to half the action range
     policy_delay: Positive = 2  # critic updates per actor update
     target_policy_noise: Fraction = 0.2  # standard deviation of the noise of target actions
     target_noise_clip: Fraction = 0.5  # largest noise of target actions
@@ -118,7 +118,7 @@ class OnPolicyConfig(LearnerConfig):
     learning_rate: Rate = 3e-4
     gamma: Factor = 0.995  # discount factor per `gamma_per`
     gamma_per: Literal["control_step", "action"] = "control_step"
-    gae_lambda: Factor = 0.95  # weight of longer advantage estimates
+    gae_lambda: Factor = 0.95  # λ of generalized advantage estimation
     n_steps: Annotated[Positive, Field(ge=2, le=10**6)] = 256  # transitions between two trainings
     batch_size: BatchSize = 64  # transitions
     net_arch: NetArch = (64, 64)  # units of the hidden layers
@@ -142,7 +142,7 @@ class TrpoConfig(OnPolicyConfig):
     """Settings of trust region policy optimization (TRPO)."""
 
     algorithm: str = "trpo"
-    target_kl: Rate = 0.01  # largest Kullback-Leibler divergence of a training
+    target_kl: Rate = 0.01  # largest Kullback-Leibler divergence between the policies before and after a training
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -152,7 +152,7 @@ class BcConfig(LearnerConfig):
     algorithm: str = "bc"
     demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
     learning_rate: Rate = 1e-3
-    gradient_steps: Positive = 5000  # of the one training, after the last demonstration
+    gradient_steps: Positive = 5000  # gradient steps of the one training, after the last demonstration
     batch_size: BatchSize = 64  # transitions
     net_arch: NetArch = (256, 256)  # units of the hidden layers
 
@@ -167,7 +167,7 @@ class ChunkConfig(BcConfig):
 
     algorithm: str = "chunk"
     demonstration_episodes: NonNegative = 30  # first episodes in which the demonstrator acts, at least 1
-    gradient_steps: Positive = 3000  # of each network, after the last demonstration
+    gradient_steps: Positive = 3000  # gradient steps of each network, after the last demonstration
     net_arch: NetArch = (64, 64)  # units of the hidden layers of each network
     members: Annotated[Positive, Field(le=50)] = 5  # E, networks of the ensemble
     chunk_steps: Annotated[Positive, Field(le=1000)] = 16  # K, control steps of a chunk
@@ -184,13 +184,13 @@ class DistillationConfig(ChunkConfig):
     demonstration_episodes: NonNegative = 0  # always 0: the teacher acts in every episode
     teacher: str = ""  # folder of the teacher's run, or pretrained:NAME
     action_noise: Annotated[float, Field(ge=0, le=1)] = 0.2  # standard deviation added to the teacher's actions
-    noisy_copies: NonNegative = 4  # of each observation, labeled by the teacher
-    copy_noise: Annotated[float, Field(ge=0, le=10)] = 0.2  # of a copy, relative to the spread of each observed number
+    noisy_copies: NonNegative = 4  # noisy copies of each observation, labeled by the teacher
+    copy_noise: Annotated[float, Field(ge=0, le=10)] = 0.2  # noise of a copy, in standard deviations of each entry
     members: Annotated[Positive, Field(le=50)] = 1  # E, networks of the ensemble
     net_arch: NetArch = (128, 128)  # units of the hidden layers
     batch_size: BatchSize = 256  # observations
-    gradient_steps: Positive = 8000  # after the last episode
-    observation_noise: Annotated[float, Field(ge=0, le=10)] = 0.0  # added without a change of the label
+    gradient_steps: Positive = 8000  # gradient steps after the last episode
+    observation_noise: Annotated[float, Field(ge=0, le=10)] = 0.0  # noise added in training; labels do not change
 
     def __post_init__(self) -> None:
         if self.demonstration_episodes:
@@ -212,7 +212,7 @@ register_learner("bc", DeferredLearner("guiderail.tools.learning.cloning", "BcLe
 
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
-)  # table 4.1 has no batch and buffer size: those of table 3.2
+)  # table 4.1 states no batch and buffer size: they are from table 3.2
 _TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="action", learning_starts=1000)
 _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
 
@@ -233,7 +233,7 @@ PRESETS = {
         actor_ema=0.003,
     ),
     # The force cost is observed long before the first success. A large entropy and temporally extended actions lead
-    # back to contact; they end once greedy episodes succeed, because they push hardest.
+    # back to contact. Extended actions end once greedy episodes succeed, because they push hardest.
     "sac_gridclamp": OffPolicyConfig(
         algorithm="sac",
         learning_rate=7e-4,
@@ -252,7 +252,7 @@ PRESETS = {
     ),
     # Learns the narrow passage within a minute.
     "tqc_fast": _FAST,
-    # sKGRL is a low-pass filter: actions resampled at every transition seldom lead it around an obstacle.
+    # sKGRL low-pass filters actions: actions resampled at every transition seldom lead around an obstacle.
     "tqc_cheap_correlated": replace(_FAST, constant_episodes=10),
     "table_4_1_simulation": _TABLE_4_1,
     "table_4_1_robot": replace(_TABLE_4_1, tau=0.01, gamma=0.995, ent_coef="auto_0.1"),
@@ -291,12 +291,12 @@ def resolve_preset(
 
 
 def default_preset(algorithm: str) -> str | None:
-    """Return the preset used if none is chosen; None for a learner with settings of another kind."""
+    """Return the preset used if none is chosen; None for a learner that is not off-policy."""
     return DEFAULT_PRESET if issubclass(LEARNERS.get(algorithm).Config, OffPolicyConfig) else None
 
 
 def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
-    """Validate settings against the configuration class of a learner, whose defaults stand for missing ones.
+    """Validate settings against the configuration class of a learner; missing settings get its defaults.
 
     Raises:
         InputError: If there is no such learner or setting, or a value is out of range.
@@ -330,16 +330,17 @@ def check_choices(
     episodes: int | None,
     seed: int | None,
 ) -> None:
-    """Check what can be wrong in a run whatever the options of its task are, without importing Drake.
+    """Check the choices of a run that do not depend on its task's options, without importing Drake.
 
-    None stands for a default. A task of another package may have guidance and stations of its own.
+    None stands for a default. Guidance and station are checked only for a task of this package, because a task of
+    another package may have its own.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.
     """
     for registry, name in ((GUIDANCE, guidance), (STATIONS, station)):
         if name is not None and TASKS.is_packaged(task) and name not in registry.names():
-            registry.get(name)  # refuses the name
+            registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
     known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)}
@@ -351,7 +352,7 @@ def check_choices(
 
 
 def check_episodes(episodes: int) -> None:
-    """Raise an InputError unless a run has an episode."""
+    """Raise an InputError if a run has no episode."""
     if episodes < 1:
         raise InputError(f"a run needs at least one episode, not {episodes}")
 

@@ -15,11 +15,11 @@ from guiderail.tools.learning.chunking import ChunkLearner
 from guiderail.tools.learning.config import DistillationConfig
 from guiderail.tools.pretrained import find_run
 
-CLOCK_SPREAD = 1e-6  # an entry of the observation that differs less between episodes is a function of the step
+CLOCK_SPREAD = 1e-6  # largest spread between episodes of an observation entry that depends on the step only
 
 
 class DistillationLearner(ChunkLearner):
-    """Learner of a student: from the teacher's observation to the next K commands, without the null space.
+    """Learner of a student that maps the teacher's observation directly to the next K commands.
 
     In every episode the teacher acts, with noise on its actions, so that observations off its own path are visited. The
     labels are its commands without noise,
@@ -64,7 +64,7 @@ class DistillationLearner(ChunkLearner):
         return np.clip(noisy, -1.0, 1.0).astype(np.float32)
 
     def on_episode_start(self) -> None:
-        """Count the episode, and seed its noise."""
+        """Count the episode, and seed the noise of its actions."""
         super().on_episode_start()
         self._random = np.random.default_rng([self._seed, self.episodes])
 
@@ -86,13 +86,13 @@ class DistillationLearner(ChunkLearner):
         for at in range(step, step + self.config.chunk_steps):
             try:
                 commands.append(self._primitive.predict(at, action).output)
-            except UnsolvableError:  # as the guidance: the last command inside the constraints of this step
+            except UnsolvableError:  # as in the guidance: the last command, moved into the constraints
                 last = commands[-1] if commands else self._primitive.reference.means[0]
                 commands.append(self._primitive.constraints.nearest(last, at))
         return np.array(commands)
 
     def finish(self) -> None:
-        """Label the observations and copies of them with noise, and train."""
+        """Label the observations and noisy copies of them, and train."""
         observations, steps, groups = np.array(self._observations), np.array(self._steps), list(self._groups)
         scale = observations.std(axis=0) * ~self._clocks(observations, steps)
         random = np.random.default_rng([self._seed, 0])
@@ -111,12 +111,12 @@ class DistillationLearner(ChunkLearner):
 
     @staticmethod
     def _clocks(observations: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Return which entries of the observations (N, n) are functions of the control step (N,) alone, (n,)."""
+        """Return a mask (n,) of the entries of observations (N, n) that depend on the control step (N,) only."""
         spreads = [np.ptp(observations[steps == step], axis=0) for step in np.unique(steps)]
         return np.max(spreads, axis=0) < CLOCK_SPREAD
 
     def _training_rows(self, random: np.random.Generator) -> np.ndarray:
-        """Return all rows: a teacher can label any observation, so no spread is estimated."""
+        """Return the indices of all samples: the teacher labels any observation, so no spread is estimated."""
         return np.arange(len(self._groups))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,10 +1,10 @@
-"""SAC and TQC of Stable-Baselines3 with a faster training step: the same update in a fraction of the calls.
+"""SAC and TQC of Stable-Baselines3 with a faster training step: the same update in fewer PyTorch calls.
 
 `FastTrainingStep` is a mixin that replaces `train` of a Stable-Baselines3 algorithm. All critics are evaluated as one
 batched network, both batches of an update pass the actor at once, the parameters of a network are in one buffer, and
 the gradients are written out, so that no unused gradient is computed. `FastSac` and `FastTqc` are the two algorithms
-with it. `python -m research.benchmarks learner` compares the duration with Stable-Baselines3's; a test compares the
-parameters.
+with this mixin. `python -m research.benchmarks learner` compares their duration with Stable-Baselines3's; a test
+compares the parameters.
 """
 
 import math
@@ -35,8 +35,8 @@ class Linear:
         """Construct the layer.
 
         Args:
-            values: (n, outputs · inputs + outputs): weights and biases, a view of all parameters.
-            gradient: The same view of their gradient, which `backward` writes.
+            values: (n, outputs · inputs + outputs): weights and biases, a view of the buffer of all parameters.
+            gradient: View of the parameters' gradient, of the same shape, which `backward` writes.
             inputs: Number of inputs of one network.
             outputs: Number of outputs of one network.
         """
@@ -54,13 +54,13 @@ class Linear:
 
         Args:
             x: Inputs of `forward`, (n or 1, batch, inputs).
-            d: Gradient of its outputs, (n, batch, outputs).
+            d: Gradient of the loss with respect to the outputs, (n, batch, outputs).
         """
         torch.bmm(d.mT, x.expand(self._networks, -1, -1), out=self._weight_gradient)
         torch.sum(d, 1, out=self._bias_gradient)
 
     def input_gradient(self, d: torch.Tensor, shared: bool, columns: slice = slice(None)) -> torch.Tensor:
-        """Return the gradient of `columns` of the input, (n or 1, batch, columns); summed if the input is shared."""
+        """Return the gradient of the loss by `columns` of the input, (n or 1, batch, columns), summed if shared."""
         by_network = torch.bmm(d, self.weight[:, :, columns])
         return by_network.sum(0, keepdim=True) if shared and self._networks > 1 else by_network
 
@@ -76,7 +76,7 @@ class ForwardCache:
 
     Attributes:
         inputs: Input of each layer, (n or 1, batch, inputs).
-        normalized: Of each hidden layer with normalization: its output, mean and inverse standard deviation.
+        normalized: Affine output, its mean and its inverse standard deviation for each normalized hidden layer.
     """
 
     inputs: list[torch.Tensor]
@@ -90,7 +90,7 @@ class ForwardCache:
 
 
 class BatchedMLP:
-    """Rectified hidden layers and an affine output layer; the number of networks may grow from layer to layer."""
+    """Networks with rectified hidden layers and an affine output; later layers may have more networks than earlier."""
 
     def __init__(self, layers: Sequence[Linear], layer_norm: bool):
         """Construct the networks.
@@ -104,7 +104,7 @@ class BatchedMLP:
         self._layer_norm = layer_norm
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ForwardCache]:
-        """Map inputs (n or 1, batch, inputs) to outputs (n, batch, outputs), and return the cache too."""
+        """Return the outputs (n, batch, outputs) for inputs (n or 1, batch, inputs), and the cache."""
         cache = ForwardCache([x], [])
         for layer in self._layers[:-1]:
             x = layer.forward(x)
@@ -117,7 +117,7 @@ class BatchedMLP:
         return self._layers[-1].forward(x), cache
 
     def backward(self, cache: ForwardCache, d: torch.Tensor) -> None:
-        """Write the gradient of all parameters, given that of the output, (n, batch, outputs)."""
+        """Write the gradient of all parameters, given the gradient `d` of the output, (n, batch, outputs)."""
         for index in reversed(range(1, len(self._layers))):
             self._layers[index].backward(cache.inputs[index], d)
             d = self._through(index, cache, d)
@@ -158,11 +158,11 @@ def _parts(flat: torch.Tensor, shapes: Sequence[torch.Size]) -> list[torch.Tenso
 class FlatAdam:
     """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with the state dictionary of `torch.optim.Adam`.
 
-    It is not derived from `torch.optim.Optimizer`, because creating one imports PyTorch's compiler, which takes
-    seconds.
+    It is not derived from `torch.optim.Optimizer`, because creating such an optimizer imports PyTorch's compiler, which
+    takes seconds.
 
     Attributes:
-        values: All parameters, (P,); each parameter is a view of it.
+        values: All parameters, (P,); each parameter is a view of this buffer.
         gradient: Gradient of the next step, (P,).
     """
 
@@ -199,7 +199,7 @@ class FlatAdam:
         return {"state": {i: {"step": self._steps, **one} for i, one in enumerate(named)}, "param_groups": []}
 
     def load_state_dict(self, stored: Mapping[str, Any]) -> None:
-        """Set the state to that of a `state_dict`, also one of `torch.optim.Adam`.
+        """Set the state from a `state_dict` of this class or of `torch.optim.Adam`.
 
         Raises:
             KeyError: If the moments of a parameter are missing.
@@ -221,8 +221,8 @@ class FlatAdam:
         self._steps.copy_(state[0]["step"].reshape(()))  # safetensors stores 0-d arrays as 1-d
 
 
-_SQUASH_EPSILON = 1e-6  # Stable-Baselines3 adds it to the derivative of tanh before taking the logarithm
-_MAX_GATHERED = 2**22  # most numbers in the batches of one gathering; observations without images need no second one
+_SQUASH_EPSILON = 1e-6  # added to the derivative of tanh before taking the logarithm, as in Stable-Baselines3
+_MAX_GATHERED = 2**22  # largest number of values in the batches sampled at once; only images exceed it
 
 # SAC and TQC have no common interface that a type checker could use.
 if TYPE_CHECKING:
@@ -237,7 +237,7 @@ class FastTrainingStep(_Algorithm):
     A subclass implements `_target_value`, `_critic_gradient`, `_value_gradient` and `_critic_loss`.
 
     Attributes:
-        records_metrics: Record losses, values and the entropy coefficient in the algorithm's logger.
+        records_metrics: Whether losses, values and the entropy coefficient go into the algorithm's logger.
     """
 
     ent_coef: Any
@@ -331,12 +331,12 @@ class FastTrainingStep(_Algorithm):
         """Take one gradient step on a batch of B transitions.
 
         Args:
-            states: (2B, features + actions): features, next features, and room for actions.
+            states: (2B, features + actions): rows of features, then of next features; the actions are overwritten.
             taken: (B, features + actions): features and actions of the transitions.
-            rewards: (B, 1).
-            discounts: (B, 1), the discount factor, and 0 after a terminal transition.
-            noise: (2B, actions), standard normal.
-            log_density: (2B, 1), logarithm of the density of the noise.
+            rewards: Rewards (B, 1).
+            discounts: Discount factors (B, 1), 0 for a terminal transition.
+            noise: Standard normal noise (2B, actions).
+            log_density: Logarithm of the density of the noise, (2B, 1).
         """
         batch = len(taken)
         (mean, log_std), actor_cache = self._actor.forward(states[None, :, : self._actor_features])
@@ -375,7 +375,7 @@ class FastTrainingStep(_Algorithm):
         self.logger.record_mean(f"train/{name}", float(value))
 
     def _ent_coef_step(self, log_prob: torch.Tensor) -> torch.Tensor:
-        """Return the entropy coefficient, (1,), and then move a learned one towards its target."""
+        """Return the entropy coefficient, (1,), and then take a gradient step on it if it is learned."""
         if self.ent_coef_tensor is not None:
             return self.ent_coef_tensor
         ent_coef = self.ent_coef_optimizer.values.exp()
@@ -405,7 +405,7 @@ class FastTrainingStep(_Algorithm):
 
 
 class FastSac(FastTrainingStep, SAC):
-    """Soft actor-critic (Haarnoja et al., 2018): critics of one value each, of which the minimum counts."""
+    """Soft actor-critic (Haarnoja et al., 2018); a value is the minimum over the critics."""
 
     def _target_value(self, values: torch.Tensor) -> torch.Tensor:
         return values.amin(dim=0)
@@ -424,13 +424,13 @@ class FastSac(FastTrainingStep, SAC):
 
 
 class FastTqc(FastTrainingStep, TQC):
-    """Truncated quantile critics (Kuznetsov et al., 2020): quantiles of all critics without the largest ones."""
+    """Truncated quantile critics (Kuznetsov et al., 2020): the largest quantiles of all critics are dropped."""
 
     def _build_networks(self) -> None:
         super()._build_networks()
         critic = self.policy.critic
         self._num_kept = critic.quantiles_total - self.top_quantiles_to_drop_per_net * critic.n_critics
-        # ½ − τ of each quantile.
+        # ½ − τ for the fraction τ of each quantile.
         self._quantile_weights = 0.5 - (torch.arange(critic.n_quantiles) + 0.5) / critic.n_quantiles
 
     def _target_value(self, values: torch.Tensor) -> torch.Tensor:
@@ -447,7 +447,7 @@ class FastTqc(FastTrainingStep, TQC):
     def _critic_gradient(self, values: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the gradient of the quantile Huber loss, for which errors beyond ±1 count as ±1.
 
-        With such a clipped error e, the weight |τ − (e < 0)| gives e/2 − (½ − τ)|e|.
+        With a clipped error e, the weighted error |τ − (e < 0)| e equals e/2 − (½ − τ)|e|.
         """
         errors = (target.T[:, None, :, None] - values).clamp_(-1, 1)  # (kept, n, B, quantiles)
         half = errors.sum(dim=0).mul_(0.5)
@@ -465,7 +465,7 @@ def _num_parameters(inputs: int, outputs: int) -> int:
 
 
 def _layers(values: torch.Tensor, gradient: torch.Tensor, sizes: list[int]) -> list[Linear]:
-    """Return the layers of n networks whose parameters are the rows of `values`, in the order of a module."""
+    """Return the layers of n networks whose parameters are the rows of `values`, layer by layer."""
     pairs = list(pairwise(sizes))
     counts = [_num_parameters(*pair) for pair in pairs]
     parts = zip(values.split(counts, dim=1), gradient.split(counts, dim=1), pairs, strict=True)

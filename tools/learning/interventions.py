@@ -1,8 +1,8 @@
 """Human-in-the-loop training: a supervisor corrects the policy, stops episodes and labels them.
 
-Interventions are recorded with the run. A correction replaces the policy's action, up to the action's limits, and is
-stored as a transition like any other. It also becomes via-points through which the demonstrations pass from the next
-episode on. Both go through guidance: a command that a supervisor causes satisfies the constraints as every other does.
+Interventions are recorded with the run. A correction, clipped to the action's limits, replaces the policy's action
+and is stored as a transition. It also becomes via-points through which the demonstrations pass from the next episode
+on. Corrections and via-points go through guidance: the resulting commands satisfy the constraints like all others.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Supervisor:
     def correction(self, observation: np.ndarray) -> np.ndarray | None:
         """Return the wanted offset from the demonstrations, (A,), in units of a full action; None for no correction.
 
-        An action cannot reach beyond ±1 in this episode. The demonstrations of the next one pass through the offset.
+        In this episode the offset is clipped to ±1. The next episode's demonstrations pass through the full offset.
         """
         return None
 
@@ -71,7 +71,7 @@ class InterventionPolicy(Callback):
     """
 
     def __init__(self, env: gymnasium.Env, supervisor: Supervisor, act: PolicyFn, corrections: ViaPointCorrections):
-        """Construct the policy: `act`, overridden by `supervisor`; `corrections` are the via-points of `env` so far."""
+        """Construct the policy `act`, overridden by `supervisor`; `corrections` are the via-points of `env` so far."""
         self._env, self._supervisor, self._act, self._corrections = env, supervisor, act, corrections
         self._offsets: dict[int, np.ndarray] = {}
         self._offset: np.ndarray | None = None
@@ -79,7 +79,7 @@ class InterventionPolicy(Callback):
 
     @property
     def via_points(self) -> tuple[float, ...]:
-        """Via-points including those of this episode, as the option `via_points`: (step, output) one after another."""
+        """Via-points including those of this episode, as the option `via_points` (step, output, step, output, …)."""
         return self._corrections.with_offsets(self._offsets, is_held=self._offset is not None)
 
     def on_episode_start(self) -> None:

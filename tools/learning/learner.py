@@ -26,7 +26,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Callback
 
 LOG_FORMATS = ("tensorboard", "wandb", "csv", "json", "log", "stdout")
-# Name in the log of each column of an episode's row that is logged.
+# Columns of an episode's row that are logged, and their names in the log.
 LOGGED_COLUMNS = {
     "return": "rollout/return",
     "success": "rollout/success",
@@ -55,12 +55,12 @@ class LearnerConfig:
 
     Attributes:
         algorithm: Registered name of the learner.
-        demonstration_episodes: Number of first episodes in which a demonstrator acts; their transitions are learned
-            from.
+        demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
+            their transitions.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
-        pipelined: Learn in a second process while the next episode is simulated, with weights that are one episode
-            older. Deterministic as well.
-        num_envs: Number N of processes that simulate episodes while this one learns. Episode k is acted with the
+        pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
+            older. The result is deterministic too.
+        num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
     """
@@ -100,7 +100,7 @@ class Learner(Callback, ABC):
         """
 
     def submit_episode(self) -> None:
-        """Continue after an episode whose checkpoint, if it has one, has been written."""
+        """Continue after an episode; its checkpoint, if one is due, has been written."""
 
     def finish(self) -> None:
         """Block until everything is learned; called after the last episode."""
@@ -165,7 +165,7 @@ class DeferredLearner(NamedTuple):
         return getattr(import_module(self.module), self.name)(*args, **kwargs)
 
 
-# An entry is a class derived from `Learner`, or a callable with its arguments and a `Config`.
+# An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`.
 LEARNERS: Registry[Any] = Registry(
     "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners"
 )
@@ -186,7 +186,7 @@ def divergence_error() -> InputError:
 def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
     """Return the keyword arguments of a learner for the `RunConfig` and the task of a run.
 
-    There is no symmetry if the demonstrations have been corrected by via-points: they are not symmetric then.
+    The symmetry is None if a supervisor or via-points correct the demonstrations: they are not symmetric then.
     """
     symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
     is_corrected = config.human_in_the_loop or bool(config.environment.get("via_points"))
@@ -212,9 +212,10 @@ def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
 
 
 class LearningLog:
-    """Learning log of a run in formats of Stable-Baselines3's logger, with an entry per episode; none without formats.
+    """Learning log of a run in formats of Stable-Baselines3's logger, with one entry per episode.
 
-    An entry has columns of the episode's row and the metrics of the learner, at the run's number of control steps.
+    An entry has columns of the episode's row and the learner's metrics; its step is the number of control steps so far.
+    Nothing is written if no format is given.
     """
 
     def __init__(self, folder: Path, formats: str | Sequence[str] = ()):
@@ -223,12 +224,12 @@ class LearningLog:
         self._logger: Any = None
 
     def record(self, rows: Sequence[Mapping[str, Any]], metrics: Callable[[], Mapping[str, float]]) -> None:
-        """Write the entry of the last of all episodes' `rows`; `metrics` returns the metrics of the learner."""
+        """Write the entry of the last of `rows`, one row per episode; `metrics` returns the learner's metrics."""
         if not self._formats:
             return
         row = rows[-1]
         if self._logger is None:
-            from stable_baselines3.common.logger import Logger, make_output_format  # PyTorch takes seconds
+            from stable_baselines3.common.logger import Logger, make_output_format  # imports PyTorch: slow
 
             # A resumed run must not overwrite the files of its first part.
             suffix = f"-from-{row['episode']}" if row["episode"] else ""
@@ -253,7 +254,7 @@ class LearningLog:
 
 
 def _make_wandb_output(folder: str) -> Any:
-    """Return an output format of Stable-Baselines3's logger that writes to Weights & Biases; a run resumes its own."""
+    """Return an output format of Stable-Baselines3's logger that writes to Weights & Biases and resumes its run."""
     import wandb
     from stable_baselines3.common.logger import KVWriter
 
@@ -265,7 +266,7 @@ def _make_wandb_output(folder: str) -> Any:
 
         def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
             """Log the values."""
-            run.log(dict(key_values), step=step)  # the logger clears its own dictionary
+            run.log(dict(key_values), step=step)  # a copy, because the logger clears the dictionary
 
         def close(self) -> None:
             """Finish the run."""

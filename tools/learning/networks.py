@@ -16,7 +16,7 @@ from guiderail.models.policy import FORMAT, Policy
 
 
 class FirstEntries(BaseFeaturesExtractor):
-    """Features of an actor whose critics observe more: the first entries of their observation."""
+    """Feature extractor of an actor: the first entries of the critics' larger observation."""
 
     def __init__(self, observation_space: spaces.Box, number: int):
         """Construct the extractor of the first `number` entries of an observation (n,)."""
@@ -43,14 +43,15 @@ def asymmetric_policy(policy: Any, num_observed: int) -> type:
 def observe_privileged(
     env: gymnasium.Env, algorithm: Any, symmetry: Symmetry | None
 ) -> tuple[gymnasium.Env, type, int]:
-    """Let an environment observe what is privileged, for the critics of an algorithm.
+    """Make an environment provide privileged observations for the critics of an algorithm.
 
     Returns:
-        The spaces that critics observe, the policy class whose actor observes those of `env` only, and the number of
-        privileged entries.
+        An environment with the spaces of the critics, a policy class whose actor observes the entries of `env` only,
+        and the number of privileged entries.
 
     Raises:
-        InputError: If the task declares no privileged observation, or no symmetry of it.
+        InputError: If the task declares no privileged observation or no symmetry of it, or the algorithm has no critic
+            apart from its actor.
     """
     base: Any = env.unwrapped
     observed, hidden = env.observation_space, getattr(base, "privileged_space", None)
@@ -78,8 +79,8 @@ def observe_privileged(
 def with_privileged(
     observations: list[np.ndarray], privileged: np.ndarray | None, symmetry: Symmetry | None
 ) -> list[np.ndarray]:
-    """Return an observation and its symmetric copies, (n,) each, with the privileged numbers of each appended."""
-    assert privileged is not None  # the environment observes it for a privileged critic
+    """Return an observation and its symmetric copies, (n,) each, with the privileged entries of each appended."""
+    assert privileged is not None  # because `observe_privileged` was called
     hidden = [privileged]
     if symmetry is not None and symmetry.privileged is not None:
         hidden.extend(symmetry.privileged @ privileged)
@@ -92,8 +93,8 @@ IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22�
 class AveragePooledImage(BaseFeaturesExtractor):
     """Features of an image: the averages of squares of pixels, as one vector (thesis, 4.4.1).
 
-    Without pooling, an image of 110×144×3 makes a first layer of twelve million weights per network and a gradient step
-    of most of a second on one core. What the task needs to see is larger than a pixel.
+    Without pooling, an image of 110×144×3 needs a first layer of twelve million weights per network, and a gradient
+    step takes most of a second on one core. The details that a task needs are larger than a pixel.
     """
 
     def __init__(self, observation_space: spaces.Box, pool: int):
@@ -121,7 +122,7 @@ class DroppedNormalizedReLU(NormalizedReLU):
     """Dropout, followed by layer normalization and a rectifier (DroQ; Hiraoka et al., 2022)."""
 
     def __init__(self, probability: float):
-        """Construct the module, which drops features with a probability while it is trained."""
+        """Construct the module, which drops each feature with a probability in training mode."""
         super().__init__()
         self.dropout = torch.nn.Dropout(probability)
 
@@ -131,7 +132,7 @@ class DroppedNormalizedReLU(NormalizedReLU):
 
 
 def add_dropout(critic: Any, probability: float) -> None:
-    """Replace the activations of the critics by ones with dropout."""
+    """Replace the activations of the critics by activations with dropout."""
     for network in critic.q_networks:
         for index, layer in enumerate(network):
             if not isinstance(layer, torch.nn.Linear):
@@ -152,7 +153,7 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
 
 
 def export_layers(layers: Sequence[torch.nn.Module], space: Any, description: Mapping[str, Any]) -> Policy:
-    """Return the policy of a network's layers; one that normalizes by running statistics joins the next linear layer.
+    """Return the policy of a network's layers; batch renormalization is merged into the next linear layer.
 
     Args:
         layers: Linear layers with one kind of activation between them.

@@ -3,8 +3,8 @@
 Stable-Baselines3 supplies the networks, the replay buffer and the training step. Acting, exploring and the schedule of
 trainings are here, so that all state that a run depends on can be written to a checkpoint. Another algorithm is one
 file: a subclass of `OffPolicyLearner` that names the algorithm's class and is registered by `register_learner`. It is
-trained by Stable-Baselines3's own step; SAC and TQC have an equivalent fast one (`guiderail.tools.learning.fast_sb3`),
-which the setting `training_step` switches off.
+trained by the algorithm's own training step. SAC and TQC use an equivalent faster step
+(`guiderail.tools.learning.fast_sb3`) unless the setting `training_step` is "sb3".
 """
 
 import copy
@@ -53,14 +53,14 @@ class OffPolicyLearner(Learner):
     """Learner of an off-policy algorithm with the interface of Stable-Baselines3.
 
     Attributes:
-        algorithm: Class of Stable-Baselines3; a subclass names it.
+        algorithm: Class of the algorithm; a subclass sets it.
         fast_algorithm: The same algorithm with a faster training step, or None; used unless `training_step` is "sb3".
         config: The settings.
         model: Instance of the algorithm.
         averaged: Exponential moving average of the actor; None if `actor_ema` is 0.
         transitions: Number of transitions so far.
         episodes: Number of episodes so far.
-        random: Generator of exploration.
+        random: Random generator of exploration.
         is_greedy: True in an episode that does not explore.
         greedy_successes: Number of consecutive successes in greedy episodes.
     """
@@ -81,7 +81,7 @@ class OffPolicyLearner(Learner):
     ):
         """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.symmetry = symmetry if config.symmetry else None
-        self._copies = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)  # of a transition in the buffer
+        self._copies = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)  # buffer entries per transition
         networks: dict[str, Any] = {"net_arch": list(config.net_arch), "optimizer_kwargs": {"fused": True}}
         if config.layer_norm:
             networks["activation_fn"] = NormalizedReLU
@@ -106,7 +106,7 @@ class OffPolicyLearner(Learner):
         algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
         accepted = inspect.signature(algorithm).parameters  # not every algorithm has an entropy coefficient
         policy: Any = "MlpPolicy"
-        self._num_privileged = 0  # entries of an observation in the replay buffer after those of the policy
+        self._num_privileged = 0  # number of privileged entries at the end of a stored observation
         if config.privileged_critic:
             env, policy, self._num_privileged = observe_privileged(env, algorithm, self.symmetry)
         self.model = algorithm(policy, env, **{k: v for k, v in arguments.items() if k in accepted})
@@ -135,7 +135,7 @@ class OffPolicyLearner(Learner):
         self.greedy_successes = 0
         self._constant_action: np.ndarray | None = None  # the action of a constant episode
         self._extended_action: np.ndarray | None = None
-        self._extended_steps = 0  # actions for which the extended action still lasts
+        self._extended_steps = 0  # remaining repetitions of the extended action
 
     def algorithm_arguments(self, config: Any) -> dict[str, Any]:
         """Return further arguments of the algorithm, from settings that a subclass adds to its `Config`."""
@@ -159,7 +159,7 @@ class OffPolicyLearner(Learner):
             self.selection.begin(self.actor(), self.greedy_successes)
 
     def start_recorded(self, is_greedy: bool, actor: torch.nn.Module) -> None:
-        """Start an episode that was acted elsewhere, by `actor`, and is learned from now."""
+        """Start learning from an episode that `actor` has already run in another process."""
         self.episodes += 1
         self._has_transition, self.is_greedy = False, is_greedy
         if self.selection is not None and is_greedy:
@@ -168,8 +168,8 @@ class OffPolicyLearner(Learner):
     def on_step(self, transition: Transition) -> None:
         """Store a transition and train if it is due.
 
-        A transition in which the simulation failed has no next observation and is not stored. The one before becomes
-        the episode's last, as at a time limit.
+        A transition in which the simulation failed has no next observation and is not stored. The transition
+        before it becomes the episode's last, as at a time limit.
         """
         if "simulation_failure" in transition.info:
             if self._has_transition:
@@ -212,7 +212,7 @@ class OffPolicyLearner(Learner):
             return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
 
     def _follows_base_motion(self) -> bool:
-        """Return True if this action is zero, the motion that a residual is added to (Policy Decorator).
+        """Return True if this action is zero, so that the base motion has no residual (Policy Decorator).
 
         The progressive exploration of Yuan et al. (2025): the policy acts with a probability that grows linearly.
         """
@@ -224,7 +224,7 @@ class OffPolicyLearner(Learner):
         return self.model.predict(observation, deterministic=False)[0]
 
     def _temporally_extended(self) -> np.ndarray | None:
-        """Return a uniform action that lasts for several transitions; None while there is none.
+        """Return a uniform action that lasts for several transitions; None if none is in progress.
 
         The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves states in
         which a policy has settled, such as free space, and shows the value of continuing in one direction.
@@ -303,7 +303,7 @@ class OffPolicyLearner(Learner):
         return self.model.actor if self.averaged is None else self.averaged
 
     def result(self) -> Any:
-        """Return the actor that the run leaves: the selected one, or the last one if none is selected."""
+        """Return the actor to export: the selected one, or the last one if none is selected."""
         weights = None if self.selection is None else self.selection.result()
         if weights is None:
             return self.actor()
@@ -374,7 +374,7 @@ class OffPolicyLearner(Learner):
         self._check_restored(arrays, values)
 
     def _check_restored(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Raise a ValueError if `state` differs from what was restored, such as for entries of another learner."""
+        """Raise a ValueError if `state` differs from what was restored, for example from another learner."""
         own_arrays, own_values = self.state()
         different = {
             key for key in {*own_arrays, *arrays} if _array_key(own_arrays.get(key)) != _array_key(arrays.get(key))
@@ -410,7 +410,7 @@ class TqcLearner(OffPolicyLearner):
 
 
 class Td3Learner(OffPolicyLearner):
-    """Learner of twin delayed DDPG (TD3; Fujimoto, van Hoof and Meger, 2018), which explores with normal noise."""
+    """Learner of twin delayed DDPG (TD3; Fujimoto, van Hoof and Meger, 2018), which explores with Gaussian noise."""
 
     Config = Td3Config
     algorithm = TD3

@@ -1,6 +1,7 @@
-"""On-policy learners: PPO of Stable-Baselines3 and TRPO of sb3-contrib, trained by their own steps.
+"""On-policy learners: PPO of Stable-Baselines3 and TRPO of sb3-contrib, trained by the libraries' own steps.
 
-An update uses only the transitions since the last update. A checkpoint stores those collected for the next update.
+An update uses only the transitions since the last update. A checkpoint stores the transitions
+collected for the next update.
 """
 
 from collections.abc import Mapping
@@ -29,7 +30,7 @@ class OnPolicyLearner(Learner):
     """Learner of an on-policy algorithm with the interface of Stable-Baselines3.
 
     Attributes:
-        algorithm: Class of the algorithm; a subclass names it.
+        algorithm: Class of the algorithm; a subclass sets it.
         own_settings: Names of settings that the algorithm takes as arguments of the same name.
         model: Instance of the algorithm.
         transitions: Number of transitions so far.
@@ -88,7 +89,7 @@ class OnPolicyLearner(Learner):
         return np.clip(self._sampled[0][0].numpy(), space.low, space.high)
 
     def on_step(self, transition: Transition) -> None:
-        """Store a transition and train if the buffer is full; one with a failed simulation is dropped."""
+        """Store a transition and train if the buffer is full; drop a transition whose simulation failed."""
         if "simulation_failure" in transition.info or self._sampled is None:
             self._is_start = True
             return
@@ -122,7 +123,7 @@ class OnPolicyLearner(Learner):
         return recorded
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of the most probable action; `description` has further entries of its description."""
+        """Return the policy that takes the most probable action, with `description` added to its description."""
         network = self.model.policy
         layers = [*network.mlp_extractor.policy_net, network.action_net]
         return export_layers(layers, network.action_space, {"squash": "clip", **description})

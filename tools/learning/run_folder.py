@@ -26,7 +26,7 @@ from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
-_version = cache(metadata.version)  # reads files
+_version = cache(metadata.version)  # cached, because it reads files
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -43,7 +43,7 @@ class RunConfig:
     imports: tuple[str, ...] = ()  # modules or files that register the task, the learner, …
     step_log: bool = True  # whether every control step is written to the step log
     task_content: str = ""  # digest of the files that define the task; empty if there are none
-    human_in_the_loop: bool = False  # whether a supervisor corrects the policy; corrections are via_points
+    human_in_the_loop: bool = False  # whether a supervisor corrects the policy; see the option via_points
 
     @property
     def action_repeat(self) -> int:
@@ -68,8 +68,8 @@ def installed_versions() -> dict[str, str]:
 class RunFolder:
     """Files of one run.
 
-    `config.yaml` is written at the start, a file of `steps/` at the end of each episode, `episodes.csv` and
-    `checkpoint/` after it, and everything else at the end of the run. Every file is replaced as a whole.
+    `config.yaml` is written at the start, a file in `steps/` at the end of each episode, `checkpoint/` and then
+    `episodes.csv` at each checkpoint, and the policy at the end of the run. Each of them is replaced as a whole.
 
     Attributes:
         path: The folder.
@@ -128,13 +128,13 @@ class RunFolder:
         (self.path / "config.yaml").unlink()
         if remove_folder:
             (self.path / LOCK).unlink(missing_ok=True)
-            with suppress(OSError):  # it holds hidden files of the user
+            with suppress(OSError):  # the folder holds hidden files of the user
                 self.path.rmdir()
 
     def refuse_existing(self) -> None:
         """Raise an InputError if the folder holds anything but hidden files.
 
-        Hidden files may be left of a run that was killed before its configuration was written.
+        Hidden files may be left over from a run that was killed before its configuration was written.
         """
         try:
             is_taken = self.path.exists() and (
@@ -166,11 +166,11 @@ class RunFolder:
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
     def config(self) -> RunConfig:
-        """Read the configuration of the run, and import what registers its task and learner.
+        """Read the configuration of the run, and import the modules that register its task and learner.
 
         Raises:
-            InputError: If the folder is not a run, its configuration is invalid, or it imports code without
-                `trust_imports`.
+            InputError: If the folder is not a run, its configuration is invalid, or it names code to import
+                that is not trusted (`trust_imports`).
         """
         file = self.path / "config.yaml"
         try:

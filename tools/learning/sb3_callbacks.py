@@ -13,8 +13,8 @@ from guiderail.tools.learning.learner import Learner
 class Sb3Callbacks(Callback):
     """Callback of an episode that calls callbacks of Stable-Baselines3.
 
-    They receive the learner's `model`, which is an algorithm of Stable-Baselines3: `num_timesteps` counts transitions,
-    and `locals` has the names `infos`, `rewards`, `dones`, `actions` and `new_obs`, each of one environment.
+    The callbacks receive the learner's `model`, an algorithm of Stable-Baselines3. `num_timesteps` counts transitions,
+    and `locals` has the names `infos`, `rewards`, `dones`, `actions` and `new_obs`, with values of one environment.
 
     Attributes:
         is_stopped: True once a callback returned False from `on_step`; training ends after the episode.
@@ -43,7 +43,7 @@ class Sb3Callbacks(Callback):
         self.is_stopped = False
 
     def on_episode_start(self) -> None:
-        """Start the training before the first episode, and a rollout in each."""
+        """Report the start of training before the first episode, and the start of a rollout in each episode."""
         if not self._is_started:
             self._callback.init_callback(self._model)
             self._callback.on_training_start({"self": self._model}, {})
@@ -65,11 +65,11 @@ class Sb3Callbacks(Callback):
         self.is_stopped = not self._callback.on_step() or self.is_stopped
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """End the rollout."""
+        """Report the end of the rollout."""
         self._callback.on_rollout_end()
         return {}
 
     def close(self) -> None:
-        """End the training."""
+        """Report the end of training."""
         if self._is_started:
             self._callback.on_training_end()

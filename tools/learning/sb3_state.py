@@ -1,4 +1,4 @@
-"""Stable-Baselines3 objects as arrays of a checkpoint, and its replay buffer with demonstrations in every batch."""
+"""Stable-Baselines3 objects as arrays of a checkpoint, and a replay buffer with demonstrations in every batch."""
 
 import random
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 class DemonstrationReplayBuffer(NStepReplayBuffer):
     """Replay buffer with a fixed fraction of demonstrated transitions in every batch (RLPD; Ball et al., 2023).
 
-    The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites the others only.
+    The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
 
     Attributes:
         fraction: Fraction of a batch that is demonstrated, once there are other transitions.
@@ -25,20 +25,20 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     num_demonstrated = 0
 
     def add(self, *args: np.ndarray, **kwargs: np.ndarray) -> None:  # type: ignore[override]
-        """Add a row; after the last one, continue behind the demonstrations."""
+        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations."""
         super().add(*args, **kwargs)  # type: ignore[arg-type]
         if self.full and self.pos < self.num_demonstrated:
             self.pos = self.num_demonstrated
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Return a batch; demonstrated rows are spread evenly over it, so that equal parts of it have as many."""
+        """Return a batch; demonstrated rows are spread evenly, so that equal parts of it have equally many."""
         size, first = self.size(), self.num_demonstrated
         if not 0 < first < size:
             return super().sample(batch_size, env)
         count = np.arange(batch_size + 1) * self.fraction
         is_demonstrated = np.diff(np.floor(count + 1e-9)) > 0
         low, high = np.where(is_demonstrated, 0, first), np.where(is_demonstrated, first, size)
-        # From the generator of the process, as Stable-Baselines3's own buffers do.
+        # NumPy's global generator is used, as in Stable-Baselines3's own buffers.
         indices = np.random.randint(low, high)  # noqa: NPY002
         return self._get_samples(indices, env=env)
 
@@ -46,7 +46,7 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
 def module_arrays(
     modules: Mapping[str, torch.nn.Module], optimizers: Mapping[str, torch.optim.Optimizer]
 ) -> dict[str, np.ndarray]:
-    """Return the parameters and buffers of modules and the moments of optimizers, by names that start with theirs."""
+    """Return the parameters and buffers of modules and the moments of optimizers as arrays by name."""
     arrays: dict[str, np.ndarray] = {}
     for name, module in modules.items():
         arrays |= {f"{name}/{key}": value.numpy() for key, value in module.state_dict().items()}
@@ -61,10 +61,10 @@ def restore_modules(
     modules: Mapping[str, torch.nn.Module],
     optimizers: Mapping[str, torch.optim.Optimizer],
 ) -> None:
-    """Set modules and optimizers to what `module_arrays` returned, as tensors."""
+    """Set modules and optimizers from the arrays that `module_arrays` returned, given as tensors."""
     for name, module in modules.items():
         own = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(name + "/")}
-        # Files hold arrays of at least one dimension; a counter of steps has none.
+        # Files store 0-d arrays, such as counters of steps, as 1-d arrays.
         shapes = {key: value.shape for key, value in module.state_dict().items()}
         module.load_state_dict({k: v.reshape(shapes.get(k, v.shape)) for k, v in own.items()})
     for name, optimizer in optimizers.items():
@@ -77,14 +77,14 @@ def restore_modules(
 
 
 def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the states of the random generators that Stable-Baselines3 draws from, those of the process."""
+    """Return the states of the global random generators, which Stable-Baselines3 samples from."""
     kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     arrays = {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
     return arrays, {"numpy": [kind, *rest], "python": random.getstate()}
 
 
 def restore_random(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-    """Set the random generators of the process to what `random_state` returned."""
+    """Set the global random generators to what `random_state` returned."""
     torch.set_rng_state(torch.from_numpy(np.array(arrays["random/torch"])))
     kind, *rest = values["numpy"]
     np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002

@@ -43,7 +43,7 @@ class Run:
 
     Attributes:
         path: Folder of the run.
-        pictures: Paths of the pictures that training left, by name.
+        pictures: Paths of the pictures drawn after training, by name.
     """
 
     path: Path
@@ -61,12 +61,12 @@ class Run:
 
     @property
     def policy(self) -> Policy:
-        """Learned policy: the deterministic one, evaluated by NumPy."""
+        """Learned deterministic policy, evaluated by NumPy."""
         return Policy.load(self.path)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Statistics of training, and the pictures."""
+        """Statistics of training, and the paths of the pictures."""
         rows = self.episodes
         statistics = summary(rows, SUMMARY)
         recent = min(len(rows), 10)
@@ -92,7 +92,7 @@ def train(
     pictures: bool = True,
     **options: Any,
 ) -> Run:
-    """Train a policy and leave a run folder.
+    """Train a policy and write its run folder.
 
     Args:
         task: Name of the task, or the path of a task folder.
@@ -105,9 +105,9 @@ def train(
         settings: Settings of the learner by name, in place of the preset's.
         log: Formats of a learning log in the folder's `logs/`: tensorboard, wandb, csv, json, log or stdout; none by
             default.
-        callbacks: Callback of Stable-Baselines3, or a list of them; one that returns False ends the training after the
+        callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after the
             episode.
-        resume: Continue a run that was stopped, with the result of an undisturbed one.
+        resume: Continue a run that was stopped; the result is that of an uninterrupted run.
         pictures: Draw the learning curve and the replay page after training.
         **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
 
@@ -173,7 +173,7 @@ def start_or_resume(
         folder.refuse_existing()
         given["settings"] = settings
         config = configure(task, environment, imports=imports, **with_defaults(task, given))
-    from guiderail.tools.learning.trainer import run_training  # PyTorch takes seconds; wrong input is refused by now
+    from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
     demonstrator = (
         find_demonstrator(config.task) if find_demonstrator and config.learner.demonstration_episodes else None
@@ -205,8 +205,8 @@ def configure(
 ) -> RunConfig:
     """Return a checked configuration with everything resolved.
 
-    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. The algorithm is the
-    preset's by default, and the preset the algorithm's; `with_defaults` supplies the task's instead.
+    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. By default, the
+    algorithm is that of the preset, and the preset that of the algorithm; `with_defaults` supplies those of the task.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.
@@ -222,9 +222,9 @@ def configure(
 
 
 def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Complete the arguments of `configure` by the task's own learner.
+    """Complete the arguments of `configure` with the learner that the task declares.
 
-    It is used if neither `algorithm` nor `preset` is given; the given `settings` replace single settings of it.
+    The task's learner is used if neither `algorithm` nor `preset` is given; given `settings` replace single ones of it.
     """
     has_learner = given.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     learner: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
@@ -235,7 +235,7 @@ def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
 def draw_pictures(out: Path) -> dict[str, str]:
     """Draw the learning curve and the replay page of a run, and return their paths.
 
-    A replay that cannot be drawn on this machine is reported in place of its path.
+    If the replay page cannot be drawn on this machine, the reason is returned in place of its path.
     """
     from guiderail.tools.visualization.curves import plot_run
     from guiderail.tools.visualization.episode_spec import EpisodeSpec
@@ -256,7 +256,7 @@ def _resumed_config(
     given: Mapping[str, Any],
     settings: Mapping[str, Any] | None,
 ) -> RunConfig:
-    """Return the configuration of the run to continue; refuse arguments that would make it another run."""
+    """Return the configuration of the run to continue; raise an InputError if an argument contradicts it."""
     config = folder.config()
     config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
@@ -283,7 +283,7 @@ def _resumed_config(
 
 
 def _merged_versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:
-    """Return the versions so far and from now on; warn if they differ, because the result may differ then."""
+    """Return the package versions so far and the current ones; warn if they differ, because results may differ."""
     merged = {}
     for name, current in installed_versions().items():
         stored = config.versions.get(name, current)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from guiderail.tools.learning.actors import ParallelLearner
     from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
 
-# Largest fraction of the time for the step log and checkpoints: a small checkpoint is written after every episode, a
-# large one now and then. The first and the last are always written.
+# Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
+# episode, large ones less often. The first and the last checkpoint are always written.
 MAX_SAVING_FRACTION = 0.03
 
 Demonstrator = Callable[[gymnasium.Env], PolicyFn]
@@ -43,20 +43,20 @@ def run_training(
 ) -> list[dict[str, Any]]:
     """Train a run to its last episode and write its folder.
 
-    A run that was killed and resumed gives bit for bit the result of an undisturbed one: a checkpoint is taken at the
-    end of an episode and holds every number and every random generator that the rest depends on. The step log is
-    written before it; rows after the checkpoint are written again.
+    A run that was killed and resumed gives bit for bit the result of an uninterrupted run: a checkpoint is taken at
+    the end of an episode and holds every number and every random generator that the rest of the run depends on. The
+    step log is written before the checkpoint; episodes after the last checkpoint are run and logged again.
 
     Args:
         folder: Folder of the run; with `resume`, that of the run to continue.
         config: Configuration; with `resume` it must agree with the folder's.
         resume: Continue the run from its checkpoint.
         report: Called with the row of each episode.
-        demonstrator: Policy, for an environment, that acts in the learner's `demonstration_episodes`; it has no memory
-            of earlier episodes. Off-policy learners learn from demonstrations (Vecerik et al., 2017).
+        demonstrator: Function from an environment to the policy of the learner's `demonstration_episodes`,
+            independent of earlier episodes. Off-policy learners learn from demonstrations (Vecerik et al., 2017).
         supervisor: Supervisor of a run that is configured `human_in_the_loop`.
         log: Formats of the learning log: tensorboard, wandb, csv, json, log or stdout.
-        sb3_callbacks: Callback of Stable-Baselines3, or a list of them; one that returns False ends the training after
+        sb3_callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after
             the episode.
 
     Returns:
@@ -64,7 +64,7 @@ def run_training(
 
     Raises:
         InputError: If the folder holds another run, another process writes into it, or a demonstrator, a supervisor or
-            the package of a log format is missing; or for an error in an episode: if it is the first one, a folder that
+            the package of a log format is missing; or if an episode fails. If the first episode fails, a folder that
             did not exist before is removed.
     """
     if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
@@ -123,7 +123,7 @@ def run_training(
                     folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log, callbacks
                 )
             except InputError:
-                # The user corrects the error and tries again; a folder with a configuration only would be in the way.
+                # A folder that holds only a configuration would make the user's next attempt fail.
                 # The folder of a learner that diverged is kept.
                 if not resume and not learner.has_diverged():
                     folder.remove_unstarted(remove_folder=is_new_folder)
@@ -165,9 +165,9 @@ def _train(
     if resume:
         rows, num_written = _resume(folder, learner, env)
         if num_written < len(rows):
-            folder.write_episodes(rows)  # a complete run writes no table any more
+            folder.write_episodes(rows)  # a complete run does not write the table again
         if len(rows) < config.episodes:
-            folder.remove_policy()  # if killed from here on, the folder would hold an outdated policy
+            folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
     supervised = None
     if config.human_in_the_loop and supervisor is not None:
         from guiderail.tools.learning.interventions import SupervisedTraining
@@ -240,7 +240,8 @@ def _resume(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[st
     """Restore learner and environment from the checkpoint.
 
     Returns:
-        The rows up to the checkpoint, and how many of them the table has: fewer if the run was killed between the two.
+        The rows up to the checkpoint, and the number of rows in `episodes.csv`: fewer if the run was killed between
+        writing the two files.
     """
     table = folder.path / "episodes.csv"
     if not folder.checkpoint.exists() and not table.exists():

@@ -1,4 +1,4 @@
-"""Choice of a task's contact geometry and of its settings, from the measured depth of scripted insertions."""
+"""Choice of a task's contact geometry and of its settings, from the penetration measured in scripted insertions."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ MAX_MODULUS = 5e10
 SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded depth below the target; the first that seats the plug is used
 MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug
-MIN_SPEED = 2.0  # real-time factor below which less penetration does not count
+MIN_SPEED = 2.0  # smallest real-time factor at which penetration is reduced further
 MAX_TRIALS = 5  # settings tried for each compliant part
-MIN_TIME_STEP = 0.0025  # [s]
-TRIAL_SECONDS = 20.0  # CPU time of the trials of a part from which no more are made [s]
-CHECK_SECONDS = 20  # CPU time in which Drake must have made the contact geometry [s]
+MIN_TIME_STEP = 0.0025  # time step that is not halved further [s]
+TRIAL_SECONDS = 20.0  # CPU time of a part's trials after which no further trial starts [s]
+CHECK_SECONDS = 20  # largest CPU time for Drake to build the contact geometry [s]
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Contact:
 
     Attributes:
         compliant: Name of the compliant part, "plug" or "socket".
-        pieces: Its pieces.
-        snapping: Indices of its bodies that snap.
+        pieces: Pieces of the compliant part.
+        snapping: Indices of the compliant part's bodies that snap.
         modulus: Modulus of the bodies that do not snap [Pa].
         snap_modulus: Modulus of the snapping bodies [Pa].
         time_step: Time step of the simulation [s]; the default if None.
@@ -81,7 +81,7 @@ class Choice:
         contact: Contact geometry and settings.
         push: Commanded depth below the target [m].
         aligned: Trial with the socket in place.
-        deepest: Largest penetration, also with the plug pushed on the rim [m].
+        deepest: Largest penetration in all trials, those with the plug on the rim included [m].
         speed: Smallest real-time factor of the trials.
         misaligned: Trials at `MISALIGNMENTS`.
         seconds: CPU time of cutting, meshing and checking geometry, before any trial [s].
@@ -108,13 +108,13 @@ def choose_contact(
     clearance: float,
     say: Callable[[str], None],
 ) -> Choice:
-    """Return the best contact by `rank`; its files are in the folder.
+    """Return the best contact by `rank`, and write its files into the folder.
 
     Args:
         folder: Folder of the task.
         surfaces: Contact surfaces of plug and socket.
         make_file: See `MakeFile`.
-        tolerance: Largest deviation of pieces [m].
+        tolerance: Largest deviation of the pieces from the surfaces [m].
         clearance: Clearance between the walls [m].
         say: Called with a sentence on each result.
 
@@ -159,11 +159,13 @@ def choose_contact(
 
 
 def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
-    """Return a sort key, larger is better: the fastest without deep penetration, else the least penetration.
+    """Return a sort key, larger is better: seated plug, allowed penetration, and at least `MIN_SPEED`, in this order.
+
+    If these agree, the faster contact is better if its penetration is allowed, and otherwise the one with less.
 
     Args:
         choice: Contact with its trials.
-        allowed: Largest allowed penetration [m]; a speed below `MIN_SPEED` counts more.
+        allowed: Largest allowed penetration [m].
     """
     seats = bool(choice.aligned.success)
     is_shallow = seats and choice.deepest <= allowed
@@ -173,7 +175,7 @@ def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
 def _refusal_of_drake(
     folder: Path, contact: Contact, surfaces: dict[str, ContactSurface], make_file: MakeFile
 ) -> str | None:
-    """Return the reason for which Drake cannot use the geometry, or None; an abort ends only a child process."""
+    """Return the reason why Drake rejects the geometry, or None; Drake runs in a child process, as it may abort."""
     _write_pieces(folder, contact, surfaces)
     try:
         run_isolated(_make_station, folder, make_file(contact, PUSHES[0]), cpu_seconds=CHECK_SECONDS)
@@ -197,10 +199,10 @@ def _adapt_settings(
     allowed: float,
     say: Callable[[str], None],
 ) -> list[Choice]:
-    """Return the choices tried, each with settings that follow from the depth measured in the one before.
+    """Return the choices tried, each with settings derived from the penetration measured with the previous ones.
 
-    Depth that remains while the plug is pushed needs a larger modulus. Depth that passes is the overshoot of a step,
-    which is proportional to the time step. The dissipation is that of `Piece`: less would eject the plug.
+    Penetration that remains while the plug is pushed at rest needs a larger modulus. Transient penetration is an
+    overshoot proportional to the time step. The dissipation is that of `Piece`, because less would eject the plug.
     """
     choices: list[Choice] = []
     start = _cpu_time()
@@ -235,7 +237,7 @@ def _cpu_time() -> float:
 
 
 def _try_contact(folder: Path, contact: Contact, surfaces: dict[str, ContactSurface], make_file: MakeFile) -> Choice:
-    """Return the trials over snap moduli and push depths with the first that seats the plug; else the last ones."""
+    """Return the trials with the first snap modulus and push depth that seat the plug, or the last ones tried."""
     from guiderail.tools.parts.trial import insert
 
     for soft in SNAP_MODULI if contact.snapping else (contact.modulus,):

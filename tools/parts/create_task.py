@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 DENSITY = 2700.0  # density of a part, that of aluminum [kg/m³]; a gantry is weightless
 CLEAR = 3.0 * MM  # height of the start above the rim
-MAX_GAP = 1.0 * MM  # between the bounding boxes of parts that are assembled
+MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
 MAX_FORCE = 1e4  # largest force limit [N]
-MAX_SEATED_TURN = 20.0  # turn of a plug in a straight socket that counts as seated [degrees]
+MAX_SEATED_TURN = 20.0  # largest turn of a seated plug if the insertion has no turn [degrees]
 MAX_EPISODES = 100  # largest number of episodes of a calibration
-MAX_CENTER = 1.0  # largest distance of the axis from the plug's own [m]
+MAX_CENTER = 1.0  # largest distance of the insertion axis from the plug's center of mass [m]
 
 
 def read_parts(
@@ -131,13 +131,14 @@ def create_task(
         axis: See `read_parts`.
         center: See `read_parts`.
         out: Folder; it must not exist.
-        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; drawn turned.
+        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; the files show
+            the plug after it.
         shrink: Distance by which the plug's surface is moved inwards [m].
         force_limit: Contact force that ends an episode as a collision [N].
         friction: Friction coefficient of all surfaces.
         scenario: Files of Drake model directives of the surroundings.
-        hard_episodes: Episodes of each baseline policy for each setting in the calibration of `difficulty=hard`; with 0
-            it is not calibrated.
+        hard_episodes: Number of episodes of each baseline policy for each setting in the calibration of
+            `difficulty=hard`; 0: no calibration.
         only_insert: Stop after the scripted insertions and leave no folder; for benchmarks.
         say: Called with a sentence on each intermediate result.
 
@@ -202,7 +203,7 @@ def create_task(
 
 
 class Stopwatch:
-    """CPU time since the construction, that of finished child processes included."""
+    """CPU time since the construction, including finished child processes."""
 
     def __init__(self) -> None:
         self._start = sum(os.times()[:4])
@@ -234,7 +235,7 @@ def _check_arguments(
     scenario: Sequence[Path],
     hard_episodes: int,
 ) -> None:
-    """Raise InputError for arguments that would be refused only after minutes."""
+    """Raise InputError for arguments that would otherwise be refused only after minutes."""
     if not np.isfinite(plug_pose).all():
         raise InputError(f"--plug-pose is finite, not {list(plug_pose)}")
     if not abs(turn) <= MAX_TURN:
@@ -260,16 +261,16 @@ def _check_arguments(
 
 
 def _snapping(plug: Part, socket: Part, path: InsertionMotion, deviation: float) -> frozenset[int]:
-    """Return the indices of the plug's bodies that overlap the socket on the way.
+    """Return the indices of the plug's bodies that overlap the socket during the motion.
 
     Args:
         plug: Plug.
         socket: Socket.
         path: Motion of the plug.
-        deviation: Overlap by the decimation of both parts [m].
+        deviation: Largest overlap caused by the decimation of both parts [m].
 
     Raises:
-        InputError: If all bodies do: the plug is a rigid part that does not fit.
+        InputError: If all bodies overlap: the plug is a rigid part that does not fit.
     """
     ways = find_obstructions(plug, socket, path)
     blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > MAX_RESTING_OVERLAP + deviation)
@@ -334,7 +335,7 @@ def _write_task(
     clock: Stopwatch,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Write demonstrations, task file and page, and return the measurements with those of the demonstrations."""
+    """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
     from guiderail.diagrams.tasks.part.file import write_task_file
     from guiderail.tools.parts.difficulty import calibrate
     from guiderail.tools.parts.trial import demonstrate, demonstration_time, triangles_of, write_preview
@@ -397,7 +398,7 @@ def _task_file(
             {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push},
             "a motion",
         ),
-        # Without a turn at the end, the depth shows that the walls accept the orientation, or that any one fits.
+        # Without a turn at the end, the walls accept the orientation of a plug at full depth, or any orientation fits.
         tolerance=Tolerance.model_validate({} if path.turn else {"turn": MAX_SEATED_TURN}),
         force_limit=values["force_limit"],
         time_step=contact.time_step,
@@ -420,7 +421,7 @@ def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
     if given is not None or all(find_unit(path, None) for path in paths) or not sys.stdin.isatty():
         return given
     if any(not path.is_file() for path in paths):
-        return given  # the reader of the files has the better message
+        return given  # reading the files raises a clearer error later
     try:
         # The prompt goes to standard error: standard output may be read by a program.
         print(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ", end="", file=sys.stderr, flush=True)

@@ -24,17 +24,17 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.rollout import rollout
 
-EPISODES = 10  # of each policy for each setting
-MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates that a setting is hard with
-SEED = 3_000_000  # of the first episode; the conditions are those of training
+EPISODES = 10  # number of episodes of each policy for each setting
+MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates of random actions and of the search in a hard setting
+SEED = 3_000_000  # seed of the first episode, with conditions of training
 REACH = 2.3 * MM  # displacement of the command by an action of 1 at action_scale 1, late in the search [m]
-MARGIN = 0.75 * MM  # of the bound of commands beyond the offset [m]
+MARGIN = 0.75 * MM  # distance from the offset to the bound of commands [m]
 MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # least force limit [N]; force limit over the peak force of an aligned insertion
 MAX_TURN = 3.0  # largest turn of the socket [degrees]
-MAX_SECONDS = 300  # CPU time after which a calibration is given up [s]
+MAX_SECONDS = 300  # CPU time after which a calibration is stopped [s]
 SEARCH_END = 3  # index of the end of the search in the times of `plan_search`
 PATIENCE = 1.0  # time after the search in which the push may still seat a plug [s]
-NAME = "create-task/calibration"  # of the task in the process that calibrates it
+NAME = "create-task/calibration"  # name of the task in the process that calibrates it
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Setting:
     """Setting of the difficulty.
 
     Attributes:
-        offset: Largest offset of the socket [m]; the least is 85 % of it.
-        action_repeat: Control steps per action; random actions that change more often lead less far.
+        offset: Largest offset of the socket [m]; the smallest offset is 85 % of it.
+        action_repeat: Control steps per action; random actions that change more often move the plug less far.
     """
 
     offset: float
@@ -84,9 +84,9 @@ class Score:
 
     Attributes:
         random: Number of successes of uniform random actions.
-        random_episodes: Number of their episodes; fewer than `EPISODES` if the verdict was clear.
+        random_episodes: Number of episodes of random actions; fewer than requested if the result was clear earlier.
         scripted: Number of successes of the scripted search.
-        scripted_episodes: Number of its episodes; 0 if random actions succeed too often, so that it does not matter.
+        scripted_episodes: Number of its episodes; 0 if it was not run because random actions succeed too often.
     """
 
     random: int
@@ -106,7 +106,7 @@ class Score:
 
     @property
     def margin(self) -> float:
-        """Difference of the success rates; below all others if the search was not tried."""
+        """Success rate of the search minus that of random actions; a search that was not run counts as −1."""
         scripted = self.scripted / self.scripted_episodes if self.scripted_episodes else -1.0
         return scripted - self.random / self.random_episodes
 
@@ -120,11 +120,10 @@ class Score:
 def choose_setting(
     score: Callable[[Setting], Score], settings: Sequence[Setting] = SETTINGS, first: int = FIRST
 ) -> tuple[Setting, Score, bool]:
-    """Return a setting with its score, and whether it is as hard as required.
+    """Return a setting with its score, and whether it has the required success rates.
 
-    Starting at `first`, the settings are walked through towards the required success rates until one has them, the
-    direction changes, or there are no more. If none has them, the one with the largest difference of the success rates
-    is returned.
+    Starting at `first`, settings are tried in the direction of the required success rates until one has them, the
+    direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned.
 
     Args:
         score: Returns the score of a setting.
@@ -145,13 +144,13 @@ def choose_setting(
 def count_successes(
     run: Callable[[int], bool], episodes: int, *, most_successes: float = math.inf, most_failures: float = math.inf
 ) -> tuple[int, int]:
-    """Return the numbers of successes and of episodes, which end early once one of the limits is exceeded.
+    """Run episodes until a limit is exceeded or all have run; return the numbers of successes and of episodes.
 
     Args:
         run: Runs an episode by its index, and returns whether it succeeded.
         episodes: Largest number of episodes.
-        most_successes: Number of successes that may not be exceeded.
-        most_failures: Number of failures that may not be exceeded.
+        most_successes: Number of successes above which no further episode is run.
+        most_failures: Number of failures above which no further episode is run.
     """
     successes = 0
     for index in range(episodes):
@@ -162,7 +161,7 @@ def count_successes(
 
 
 class StopOnRim(gymnasium.Wrapper):
-    """Truncate an episode in which the plug still stands on the rim a while after the search: it cannot succeed."""
+    """Wrapper that truncates an episode if the plug is still on the rim `PATIENCE` after the search."""
 
     def __init__(self, env: gymnasium.Env, file: PartTaskFile):
         """Construct the wrapper for an environment with the task file `file`."""
@@ -184,9 +183,9 @@ def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episod
 
     Args:
         task: Name of the task.
-        file: Its task file.
-        options: Options of its environment.
-        episodes: Largest number of episodes of each.
+        file: Task file of the task.
+        options: Options of the environment.
+        episodes: Largest number of episodes of each policy.
     """
     env = StopOnRim(make_environment(task, options), file)
 
@@ -211,7 +210,7 @@ def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episod
 
 
 def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
-    """Return the force limit [N]: a multiple of what an aligned insertion takes, at most that of the task.
+    """Return the force limit [N]: a multiple of an aligned insertion's peak force, at most the task's limit.
 
     Args:
         file: Task file.
@@ -221,7 +220,7 @@ def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
 
 
 def turn_of(clearance: float | None, radius: float) -> float:
-    """Return the largest turn of the socket that its walls leave to the plug, at most `MAX_TURN` [degrees].
+    """Return the largest turn of the socket that the clearance allows, at most `MAX_TURN` [degrees].
 
     Args:
         clearance: Clearance between the walls [m]; None without walls.
@@ -235,11 +234,11 @@ def turn_of(clearance: float | None, radius: float) -> float:
 def calibrate(
     folder: Path, file: PartTaskFile, radius: float, episodes: int, say: Callable[[str], None]
 ) -> PartTaskFile:
-    """Return a task file with a calibrated `hard`, and its measurements; without them if the calibration fails.
+    """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
 
     Args:
         folder: Folder of the task.
-        file: Content of its file, as written.
+        file: Task file, as written to the folder.
         radius: Largest distance of the plug from the axis [m].
         episodes: Largest number of episodes of each policy for each setting.
         say: Called with a sentence on the result.
@@ -248,8 +247,8 @@ def calibrate(
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = turn_of(None if clearance is None else clearance * MM, radius)
     try:
-        source = read_task_file(folder).demonstrations  # with the digits that the file has
-        reference_of_file(folder / source.file, source.components, source.floor)  # the child inherits the fit
+        source = read_task_file(folder).demonstrations  # as rounded in the file
+        reference_of_file(folder / source.file, source.components, source.floor)  # cached for the child
         setting, score, is_hard = run_isolated(
             _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
         )
@@ -278,7 +277,7 @@ def calibrate(
 
 
 def _choose_for(folder: Path, force_limit: float, turn: float, episodes: int) -> tuple[Setting, Score, bool]:
-    """Return the setting of a folder; in a child process, whose registry of tasks has no other use."""
+    """Return the setting for a task folder; run in a child process, because it registers a task."""
     task = load_task_folder(folder)
     register_task(NAME)(task)
     return choose_setting(lambda one: score_setting(NAME, task.file, one.options(force_limit, turn), episodes))

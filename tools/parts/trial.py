@@ -39,9 +39,9 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
-_VERTICES = 8  # number of vertices of a contact surface, those of the highest pressure, for which depth is measured
+_VERTICES = 8  # number of vertices with the highest pressure at which the depth of a contact surface is measured
 _AT_REST = 1.0  # time at the end of a motion in which the plug does not move [s]
-_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # distance of the command below the plug [m], and its duration [s]
+_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # distance of the command below a blocked plug [m], and how long it lasts [s]
 _INTERVAL = 4  # simulator steps between two measurements of depth
 
 
@@ -54,7 +54,7 @@ class Trial:
         pose: Final pose of the plug in the socket, position and rotation vector (6,) [m, rad].
         peak_force: Largest contact force [N].
         penetration: Largest penetration of the parts [m], without snapping pieces.
-        resting_penetration: The same at the end of the motion, while the plug is pushed at rest [m].
+        resting_penetration: Penetration at the end of the motion, while the plug is pushed at rest [m].
         snap: Largest penetration of snapping pieces [m].
         real_time_factor: Simulated time per CPU time.
         recording: Poses, wrench and force at the control steps.
@@ -78,7 +78,7 @@ class Depths:
 
     Attributes:
         deepest: Largest penetration so far [m], without snapping pieces.
-        deepest_at_rest: The same while the plug is at rest [m].
+        deepest_at_rest: Largest penetration while the plug is at rest [m], without snapping pieces.
         deepest_snap: Largest penetration of snapping pieces so far [m].
         seconds: CPU time of the measurements [s].
     """
@@ -146,7 +146,7 @@ def insert(
         folder: Folder with the meshes.
         file: Task file, which need not be written yet.
         offset: Offset (x, y) of the socket [m].
-        motion: Times and poses; straight in by default.
+        motion: Times (N,) [s] and poses (N, 6); a straight insertion by default.
         snapping: Names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
         measure_depth: Whether penetration is measured, which takes longer than the simulation.
     """
@@ -175,7 +175,7 @@ def insert(
         if measure_depth:
             depths.monitor(root_context)
         now = root_context.get_time()
-        # A plug that stays above the target although the command is far below it is blocked: the rest would be slow.
+        # A plug that stays far above its command is blocked. Stop then, because the rest would simulate slowly.
         below = _plug_pose(driven)[2] - np.interp(now, times, poses[:, 2])
         blocked = blocked + 1 if below > _BLOCKED else 0
         if blocked * _INTERVAL * station.plant.time_step() < _BLOCKED_TIME:
@@ -185,7 +185,7 @@ def insert(
     driven.simulator.set_monitor(monitor)
     start = time.process_time()
     recording = driven.run()
-    driven.simulator.clear_monitor()  # Drake never frees the diagram, which would keep the surfaces
+    driven.simulator.clear_monitor()  # Drake never frees the diagram; a monitor would keep the surfaces
     spent = time.process_time() - start - depths.seconds
     pose = _plug_pose(driven)
     return Trial(
@@ -245,11 +245,11 @@ def _locator(path: Path) -> SurfaceLocator:
 
 
 _SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}
-_SCALE = 10.0  # enlarges parts of some centimeters, which are too close to the page's camera
+_SCALE = 10.0  # magnification, because the page's camera cannot get close to small parts
 
 
 def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
-    """Write the page of a trial: the parts, and hidden at first the contact pieces, each in its own color."""
+    """Write the page of a trial: the parts and, initially hidden, the contact pieces in different colors."""
     try:
         meshcat = MeshcatPage(is_served=False)
     except RuntimeError as error:
@@ -281,7 +281,7 @@ def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
 
 
 DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are no longer checked [s]
-MAX_SESSIONS = 3  # sessions of five attempts, until five attempts have seated the plug
+MAX_SESSIONS = 3  # largest number of sessions of five attempts; they end once five have seated the plug
 
 
 def demonstration_time(file: PartTaskFile) -> float:
@@ -314,7 +314,7 @@ def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarr
     return is_seated(file, _plug_pose(driven))
 
 
-CHECK_SECONDS = 30  # CPU time of the insertions in MuJoCo [s]
+CHECK_SECONDS = 30  # largest CPU time of the insertions in MuJoCo [s]
 OFFSET = 3.5e-3  # offset of the socket at which it must block the plug [m]
 
 
@@ -325,7 +325,7 @@ def add_convex_pieces(
     tolerance: float,
     say: Callable[[str], None],
 ) -> PartTaskFile:
-    """Write convex pieces of both parts, and return the task file with their names; without them if they are no use.
+    """Write convex pieces of both parts, and return the task file with their names; unchanged if they do not work.
 
     Args:
         folder: Folder of the task.
@@ -366,7 +366,7 @@ def _try_insertions(folder: Path, file: PartTaskFile) -> tuple[bool, bool]:
 
 
 def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> bool:
-    """Return True if a plug seats that moves straight in on `station=mujoco`.
+    """Return True if a straight insertion on `station=mujoco` seats the plug.
 
     Args:
         folder: Folder of the task.

@@ -15,16 +15,16 @@ from guiderail.diagrams.envs.scene import View, Viewpoint
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.interventions import Supervisor
 
-DEAD_ZONE = 0.15  # of a gamepad's axis that moves a slider
+DEAD_ZONE = 0.15  # largest deflection of a gamepad's axis that moves no slider
 CAMERA_NEAR = 1e-3  # near clipping distance of the page's camera [m]
 
-# Keys that lower and raise each input, by JavaScript's codes, and its gamepad axis with a sign.
+# Keys that lower and raise each input, by JavaScript's codes, and the gamepad axis of each input with its sign.
 KEY_PAIRS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "KeyL"), ("KeyK", "KeyI"), ("KeyH", "KeyY"))
 GAMEPAD_AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))
 
 
 class Teleoperator(Protocol):
-    """Source of an operator's inputs; `MeshcatDevice` and `MeshcatPanel` are two."""
+    """Source of an operator's inputs; implemented by `MeshcatDevice` and `MeshcatPanel`."""
 
     def read(self) -> np.ndarray:
         """Return the present inputs, (n,)."""
@@ -39,7 +39,7 @@ class Slider:
         step: Change by one key press.
         keys: Keys that lower and raise the value, by JavaScript's codes.
         scale: Factor from the slider's unit to that of the input.
-        speed: Change of the value per second at full deflection of its gamepad axis; 0 without one.
+        speed: Change of the value per second at full deflection of its gamepad axis; 0: no axis moves it.
     """
 
     limit: float
@@ -67,7 +67,7 @@ class MeshcatPanel(Teleoperator):
             meshcat.AddButton(name, key)
 
     def add_slider(self, name: str, slider: Slider) -> None:
-        """Add a slider at zero; one that exists is left as it is."""
+        """Add a slider at zero; an existing slider is left as it is."""
         if name not in self._sliders:
             self._sliders[name] = slider
             self.meshcat.AddSlider(name, -slider.limit, slider.limit, slider.step, 0.0, *slider.keys)
@@ -98,7 +98,7 @@ class MeshcatPanel(Teleoperator):
                 self.meshcat.SetSliderValue(name, float(np.clip(value, -slider.limit, slider.limit)))
 
     def take_click(self, button: str) -> bool:
-        """Return True once for each click on a button since the last call."""
+        """Return True if a click on a button has not been taken yet, and take one click."""
         clicks, taken = self.meshcat.GetButtonClicks(button), self._clicks.get(button, 0)
         self._clicks[button] = min(taken + 1, clicks)
         return clicks > taken
@@ -129,7 +129,7 @@ def page_address(meshcat: Any) -> str:
 LABELS = {"success (Enter)": "success", "failure (Backspace)": "failure", "stop (Escape)": "stop"}
 LABEL_KEYS = {"success (Enter)": "Enter", "failure (Backspace)": "Backspace", "stop (Escape)": "Escape"}
 RELEASE, RELEASE_KEY = "let go (Space)", "Space"
-LIMIT, STEP = 4.0, 0.25  # of a slider, in units of a full action
+LIMIT, STEP = 4.0, 0.25  # limit and step of a slider, in units of a full action
 
 
 class MeshcatSupervisor(Supervisor):
@@ -157,7 +157,7 @@ class MeshcatSupervisor(Supervisor):
             time.sleep(0.1)
 
     def on_episode_start(self, env: gymnasium.Env) -> None:
-        """Show an episode of `env` with all sliders at zero; of earlier clicks only a stop is kept."""
+        """Show an episode of `env` with all sliders at zero; earlier clicks except a stop are discarded."""
         base = cast(Any, env.unwrapped)
         self._add_sliders(base)
         if base.task.query is not None:

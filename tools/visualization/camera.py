@@ -63,7 +63,7 @@ class Frames(EnvCallback):
 
 
 def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write `ROWS` × `COLUMNS` camera frames of it as one picture; return its row.
+    """Run an episode and write `ROWS` × `COLUMNS` of its camera frames as one picture; return the episode's row.
 
     Raises:
         InputError: If this machine cannot render, or the picture cannot be written.
@@ -78,7 +78,7 @@ def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
 
 
 def write_video(video: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write its camera frames as an animated image in real time; return its row.
+    """Run an episode and write its camera frames as an animated image in real time; return the episode's row.
 
     Raises:
         InputError: If this machine cannot render, or the video cannot be written.

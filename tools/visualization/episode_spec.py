@@ -21,7 +21,7 @@ class EpisodeSpec:
     Attributes:
         task: Name of the task.
         environment: Options of the environment.
-        policy: Makes the policy for an environment.
+        policy: Function that returns the policy for an environment.
         acting: Label of the policy.
         title: Text next to task and guidance in a heading.
         run_seed: Seed of the run, from which its hidden values are sampled.
@@ -48,17 +48,17 @@ class EpisodeSpec:
         task: str | None = None,
         trust_policy: bool = False,
     ) -> EpisodeSpec:
-        """Return an episode of a policy of any origin; one of a run acts deterministically.
+        """Return an episode of a policy of any origin; a run's policy acts deterministically.
 
         Args:
             policy: Folder of a run, or `pretrained:NAME`; with `task`, any policy that `find_subject` takes.
             environment: Options of the environment that differ from the run's, or from the task's defaults.
             seed: Seed of the episode.
             task: Task of a policy without a run.
-            trust_policy: Read a policy's file that can execute code.
+            trust_policy: Whether to read a policy file that can execute code.
 
         Raises:
-            InputError: If there is no such policy, or its actions mean something else with another guidance.
+            InputError: If there is no such policy, or `environment` has another guidance than its run.
         """
         subject = find_subject(policy, task, environment, trust_policy=trust_policy)
         config, folder = subject.config, subject.folder

@@ -30,15 +30,15 @@ from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.visualization.episode_spec import EpisodeSpec, outcome
 from guiderail.tools.visualization.style import is_demonstrated
 
-POINTS = 400  # most samples of an episode: a page is not wider
+POINTS = 400  # largest number of samples of an episode, about the width of a page in pixels
 DRAWN = "/drake/visualizer"  # path of Drake's visualizer in Meshcat's tree
 DIGITS = 5  # significant digits of a plotted number
 
 
 class Motion(EnvCallback):
-    """Record the poses of all visible bodies and the actions, control step by control step.
+    """Recorder of the poses of all visible bodies and of the actions at every control step.
 
-    It replaces the simulator's monitor.
+    The recorder replaces the simulator's monitor.
     """
 
     def __init__(self, env: Any):
@@ -63,7 +63,7 @@ class Motion(EnvCallback):
         self.base.simulator.set_monitor(self._record_poses)
 
     def on_episode_start(self) -> None:
-        """Clear the actions; the poses of time zero are recorded by then."""
+        """Clear the actions; the poses at time zero have already been recorded."""
         self._actions = []
 
     def on_step(self, transition: Transition) -> None:
@@ -75,8 +75,8 @@ class Motion(EnvCallback):
         """Return the episode as numbers for a page: `times` [s], `frames`, and the signals at those times.
 
         `frames` maps each body's path in Meshcat's tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32 in
-        base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the sample
-        before, so that no peak is lost. An episode that failed before its first control step has one sample.
+        base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the
+        previous sample, so that no peak is lost. An episode that failed before its first control step has one sample.
         """
         trace = self.base.trace
         stride = max(1, -(-len(trace) // POINTS))
@@ -172,16 +172,17 @@ class Side:
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
-    """Return the default page of a run, named after a changed station; in the current folder if `run` is no folder."""
+    """Return the default path of a run's page, which is in the current folder if `run` is no folder."""
     name = f"replay-{environment['station']}.html" if "station" in environment else "replay.html"
     return run / name if run.is_dir() else Path(name)
 
 
 def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None) -> dict[str, Any]:
-    """Run episodes and write them as a page; return the row of the first.
+    """Run episodes and write them as a page; return the row of the policy's first episode.
 
-    Each episode is run twice from the same conditions: by the policy shown, and without learning. The latter is the
-    demonstration alone (an action of zero) where the guidance has one, and uniform random actions otherwise.
+    Each episode is run twice from the same conditions: by the policy and by a baseline without learning.
+    The baseline is the demonstration alone (an action of zero) if the guidance has one, and otherwise uniform random
+    actions.
 
     Args:
         html: Page, .html.
@@ -257,7 +258,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         run=episode.run,
         # The frame of Meshcat's camera has y up.
         views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
-        # The name of a body cannot end the script, or open a comment in it.
+        # Escaped, so that the name of a body cannot end the script or open a comment in it.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
     )
     write_atomically(html, _insert(page, episode.heading, caption).encode())
@@ -272,7 +273,7 @@ def find_report(html: Path, run: Path | None) -> str | None:
 
 
 def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:
-    """Return the return and the largest constraint violations of a row, in a unit of `scale` per m or rad."""
+    """Return the return and the largest constraint violations of a row, with `scale` units per m or rad."""
     violations = (
         f"{name} {'none' if row[key] <= TOLERANCE else f'{scale * row[key]:.2g} {unit}'}"
         for name, key in (("commanded", "max_commanded_violation"), ("measured", "max_measured_violation"))

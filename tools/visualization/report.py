@@ -29,7 +29,7 @@ from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run, co
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
 )
-UNCONSTRAINED = -1e20  # violations below it mean that there is no constraint
+UNCONSTRAINED = -1e20  # violations below this value mean that there is no constraint
 DescribeDifferences = Callable[[RunConfig], Sequence[str]]
 
 
@@ -48,7 +48,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """Row of a table; `is_baseline` if its policy was not learned."""
+    """Row of a table; `is_baseline` is True if the row's policy was not learned."""
 
     cells: Sequence[Cell]
     is_baseline: bool = False
@@ -180,7 +180,7 @@ SAFETY_COLUMNS = {
     "fallback_steps": "fallback steps",
 }
 """Statistics of the safety table and their headings."""
-LARGEST = ("max_commanded_violation", "max_measured_violation", "peak_force")  # the others are counts
+LARGEST = ("max_commanded_violation", "max_measured_violation", "peak_force")  # maxima; the others are counts
 MUST_BE_ZERO = ("commanded_violations", "collisions", "collision_steps", "timed_out_steps")
 
 

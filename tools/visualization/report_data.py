@@ -27,7 +27,7 @@ from guiderail.tools.tables import read_table
 from guiderail.tools.visualization.style import color, is_demonstrated, label
 
 LEARNED = "learned"
-BASELINES = ("zero", "uniform_random", "constant")  # evaluated together with a run's policy
+BASELINES = ("zero", "uniform_random", "constant")  # baseline policies evaluated together with a run's policy
 STUDY_COLUMNS = {"method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"}
 REQUIRED_COLUMNS = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
@@ -52,7 +52,7 @@ class Run:
         path: Folder of the run.
         config: Configuration.
         episodes: Table of the training episodes.
-        method: Name of its method in the report.
+        method: Name of the run's method in the report.
     """
 
     path: Path
@@ -62,7 +62,7 @@ class Run:
 
     @property
     def safety(self) -> dict[str, Any]:
-        """Safety statistics: of every control step with a step log, otherwise of the table of episodes."""
+        """Safety statistics, from the step log if it is complete, otherwise from the table of episodes."""
         rows = self.episodes
         of_episodes: dict[str, Any] = {
             "source": "table",
@@ -109,7 +109,7 @@ class Gathered:
         name: Title.
         runs: Runs with at least one episode.
         held_out: Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
-        is_study: Whether the folder is that of a study.
+        is_study: Whether a folder is that of a study.
         folder_names: Unique name of each run's folder.
     """
 
@@ -145,8 +145,8 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
 
     Args:
         paths: Folders of runs, or folders that contain runs.
-        episodes: Held-out episodes to evaluate each run of `paths` on, together with baseline policies; stored episodes
-            are used again.
+        episodes: Number of held-out episodes on which to evaluate each run outside of studies, together with
+            baseline policies; stored episodes are reused.
 
     Raises:
         InputError: If a folder contains no run, or a file is damaged.
@@ -271,7 +271,7 @@ def _format_setting(key: str, value: Any) -> str:
 
 
 def flat(config: RunConfig) -> dict[str, Any]:
-    """Return the settings of a run by name, without its length and seed."""
+    """Return the settings of a run by name, without its number of episodes and its seed."""
     return {**config.environment, **asdict(config.learner)}
 
 

@@ -13,9 +13,9 @@ from guiderail.tools.evaluation.metrics import bootstrap_band, episodes_to_conve
 from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run
 from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above, new_figure
 
-SIZE = (4.6, 3.0)  # [in]; two side by side, or one below the other on a phone
+SIZE = (4.6, 3.0)  # size of a figure [in]; two fit side by side on a wide screen
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 9.0}
-DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that equal curves can be distinguished
+DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that coinciding curves can be distinguished
 
 
 def curve(gathered: Gathered, task: str, column: str, label: str) -> str:

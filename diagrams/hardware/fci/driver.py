@@ -1,8 +1,8 @@
-"""Driver on the Franka Control Interface: Cartesian impedance in a compiled loop at 1 kHz, desired poses from here.
+"""Driver for the Franka Control Interface: sends desired poses to a compiled Cartesian impedance loop at 1 kHz.
 
 The client is franky 2 (MIT license). It runs libfranka's loop in a thread without Python's lock, has a Cartesian
 impedance that follows references of any rate with bounded errors, forces and torque rates, and ends a torque motion by
-damping. pylibfranka, Franka's own binding, would leave the loop at 1 kHz to Python.
+damping. With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ DYNAMICS_SHARE = 0.2  # share of the robot's motion limits that commands may use
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
 POSTURE_STIFFNESS = 5.0  # stiffness of the nullspace's posture [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
-FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold as a multiple of the bounded force
-MAX_TOOL_ERROR = 1e-4  # of the tool center that the robot reports [m]
-MAX_MASS_ERROR = 0.05  # of the payload that the robot reports [kg]
-REALTIME_FILE = Path("/sys/kernel/realtime")  # of a kernel with real-time priorities
-TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # of external joint torques [Nm]; libfranka's examples
+FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold relative to the largest wrench of the impedance
+MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
+MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
+REALTIME_FILE = Path("/sys/kernel/realtime")  # contains 1 on a kernel with real-time priorities
+TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # of external torque [Nm], as in libfranka's examples
 
 
 @register_driver("fci")
@@ -38,14 +38,14 @@ class FciDriver(PoseDriver):
     """Franka Emika Panda or FR3 on the Franka Control Interface.
 
     The external torque of the interface is that of the arm on its surroundings. After a reflex the status is malformed
-    until `recover` has cleared the error, so the station stops. If this program ends or hangs, libfranka's loop ends
-    with it and the robot brakes, or keeps the last desired pose with the bounded wrench.
+    until `recover` has cleared the error, so the station stops. If this program ends, libfranka's loop ends as well and
+    the robot brakes; if it hangs, the robot keeps the last desired pose with the bounded wrench.
     """
 
     name = "panda"
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
-    hold_off = 0.25  # the robot needs none; statuses are watched before the arm is taken over
+    hold_off = 0.25  # not needed by the robot; statuses are checked before the arm is controlled
     motion_limits = FRANKA_LIMITS.scaled(DYNAMICS_SHARE)
 
     def __init__(self, url: str = "", *, client: Any = None):
@@ -53,10 +53,10 @@ class FciDriver(PoseDriver):
 
         Args:
             url: Host name or address of the robot.
-            client: Module franky, or a double of it.
+            client: Module franky, or a test double of it.
 
         Raises:
-            InputError: If franky is not installed, or no host is named.
+            InputError: If franky is not installed, or `url` is empty.
         """
         super().__init__(url)
         if not url:
@@ -70,10 +70,10 @@ class FciDriver(PoseDriver):
     def configure(self, impedance: RobotImpedance) -> None:
         """Set tool center, payload and collision thresholds, and the impedance of the next motion.
 
-        During a motion nothing changes, because the robot refuses it; another station takes over the same impedance.
+        During a motion nothing changes, because the robot would refuse it: the impedance stays that of the motion.
 
         Raises:
-            InputError: If the robot refuses them.
+            InputError: If the robot refuses the configuration.
         """
         if self._motion is not None:
             return
@@ -90,7 +90,7 @@ class FciDriver(PoseDriver):
         self._impedance = impedance
 
     def read(self) -> JointStatus | None:
-        """Return the newest status, None while no robot answers."""
+        """Return the newest status, malformed after a reflex or a lost connection; None before the robot answers."""
         franky = self._franky
         if self._is_lost:
             return MALFORMED_STATUS  # each further call of the client would wait for a second
@@ -103,7 +103,7 @@ class FciDriver(PoseDriver):
             if self.error:
                 return MALFORMED_STATUS
             state = self._robot.state
-        except (franky.NetworkException, RuntimeError):  # the latter is a socket's, "Net Exception"
+        except (franky.NetworkException, RuntimeError):  # a socket raises RuntimeError("Net Exception")
             self._is_lost = True
             return MALFORMED_STATUS
         q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
@@ -165,8 +165,8 @@ class FciDriver(PoseDriver):
         franky = self._franky
         limits = impedance.max_wrench
         motion = franky.CartesianImpedanceTrackingMotion(
-            # A bounded error bounds the spring's wrench; the limited speed of the poses bounds that of the damper.
-            # franky's own `force_constraints` (2.0.0) threw the simulated arm off at 5 rad/s.
+            # A bounded error bounds the spring's wrench; the limited speed of the poses bounds the damper's wrench.
+            # With franky's own `force_constraints` (2.0.0) the simulated arm accelerated to 5 rad/s.
             translational_error_clip=limits[:3] / np.diag(impedance.stiffness)[:3],
             rotational_error_clip=limits[3:] / np.diag(impedance.stiffness)[3:],
             max_delta_tau=MAX_TORQUE_STEP,

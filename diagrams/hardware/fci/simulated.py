@@ -1,8 +1,8 @@
-"""Rehearsal robot: the protocol's simulator franky-sim with a task's tool, workpiece and fixture in its world.
+"""Simulated robot for the driver fci: the simulator franky-sim with a task's tool, workpiece and fixture in its world.
 
 franky-sim simulates an FR3 in MuJoCo and answers libfranka's network protocol. It estimates no external wrench and does
-not check commands for discontinuities or collisions. The first is added here from the simulated contact; the second is
-tested where commands are made (`PoseMotionLimiter`).
+not check commands for discontinuities or collisions. The external torques are added here from the simulated contact.
+The tests of `PoseMotionLimiter`, which computes the commands, check that these are continuous.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from guiderail.diagrams.stations.mujoco import MujocoContact, mujoco_parts
 from guiderail.diagrams.stations.workcell import ConvexWorkcell
 from guiderail.models.common.errors import InputError
 
-ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # names in the simulator's model; flange from the seventh link [m]
+ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # prefix of names in the simulator; from seventh link to flange [m]
 STEP = 0.001  # period of the protocol [s]
-RESIDUAL_FRICTION = 0.1  # [Nm] of each joint; the interface's torques are "without gravity and friction" (libfranka)
+RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "without gravity and friction"
 FILTER_TIME = 0.02  # time constant of the external torque's low-pass filter [s]
 
 
@@ -39,7 +39,7 @@ class RehearsalRobot(FrankaMujocoRobot):
         self._external = np.zeros(7)
 
     def _post_step(self) -> None:
-        # Joint limits and friction are constraints too, but a task reaches none of them.
+        # The constraint forces include joint limits, which no task reaches, and `RESIDUAL_FRICTION`.
         contact = self._data.qfrc_constraint[self._dof_addrs]
         self._external += STEP / FILTER_TIME * (contact - self._external)
         super()._post_step()
@@ -59,8 +59,8 @@ class RehearsalSimulator(MujocoSimulator):
         """Construct the simulator.
 
         Args:
-            workcell: Workcell of the task, described by convex solids as well.
-            fixture_offset: Pose of the actual target in the nominal target.
+            workcell: Workcell of the task, a `ConvexWorkcell`.
+            fixture_offset: Pose of the actual target frame in the nominal target frame.
         """
         super().__init__()
         self.model_of_arm = ArmControllerPlant(workcell, "panda")
@@ -96,7 +96,7 @@ class RehearsalSimulator(MujocoSimulator):
             element.set("pos", " ".join(map(str, X.translation())))
             element.set("quat", " ".join(map(str, X.rotation().ToQuaternion().wxyz())))
             parent.append(element)
-        # The tool takes the place of the hand, which the simulator needs for its gripper.
+        # The tool replaces the hand, which stays in the model for the simulator's gripper but does not collide.
         for body in last.iter("body"):
             if body.get("name", "").startswith((ROBOT + "hand", ROBOT + "left", ROBOT + "right")):
                 for geometry in body.findall("geom"):
@@ -117,11 +117,11 @@ def serve(
     On a machine that is too slow for the rate, the robot's clock falls behind.
 
     Args:
-        simulator: The simulator.
+        simulator: Simulator of the robot and the parts.
         pose: Initial pose of the tool center, (6,).
         seconds: Simulated time to run [s].
         rate: Rate of the robot's clock relative to the wall clock.
-        host: Address to listen at, of this machine.
+        host: Address of this machine to listen on.
         on_ready: Function that is called with the address when clients can connect.
     """
     with simulator:

@@ -79,12 +79,12 @@ def check_handlers() -> None:
 
 
 class MessageCounter:
-    """Counts the messages of a channel; one that is sent again counts once, even with other torques.
+    """Counter of the messages of a channel; messages of the same type and time count once, even with other torques.
 
     Attributes:
         count: Number of different messages.
         repeats: Number of repeated messages.
-        head: Type and time of the newest message, which tell messages apart.
+        head: Type and time of the newest message, which identify it.
     """
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class LcmDriver(Driver):
         command_channel: Channel of the commands.
         status_type: Message class of the statuses.
         status_fields: Fields of `status_type` with position, velocity and external torque.
-        external_torque_sign: Factor that makes the external torque that of the surroundings on the arm.
+        external_torque_sign: Sign that converts the external torque to that of the surroundings on the arm.
         command_type: Message class of the commands, with the field ``joint_torque``.
         lcm: The bus.
         statuses: Counter of the statuses.
@@ -134,8 +134,8 @@ class LcmDriver(Driver):
         self.statuses = MessageCounter()
         self._status: JointStatus | None = None  # newest status
         self._sequence = StatusSequence(self.period)
-        self._num_contested = 0  # foreign commands since this program has commanded the arm
-        self._heartbeats: dict[int, Heartbeat] = {}  # by sender, the newest last
+        self._num_contested = 0  # foreign commands after the first command of this program
+        self._heartbeats: dict[int, Heartbeat] = {}  # newest heartbeat by sender, latest sender last
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
         self._listeners: list[CommandCallback] = []
         if handlers_are_safe():
@@ -155,7 +155,7 @@ class LcmDriver(Driver):
 
     @classmethod
     def decode(cls, message: bytes) -> JointStatus:
-        """Return the content of a status message, `MALFORMED_STATUS` if it cannot be decoded."""
+        """Return the content of a status message, or `MALFORMED_STATUS` if it cannot be decoded."""
         try:
             status = cls.status_type.decode(message)
             positions, velocities, external = (
@@ -167,7 +167,7 @@ class LcmDriver(Driver):
 
     @classmethod
     def decode_command(cls, message: bytes) -> tuple[np.ndarray, float] | None:
-        """Return the torques (n,) [Nm] and the time [s] of a command message, None if it cannot be decoded."""
+        """Return the torques (n,) [Nm] and the time [s] of a command message; None if it cannot be decoded."""
         try:
             command = cls.command_type.decode(message)
             return np.array(command.joint_torque, dtype=float), command.utime * MICROSECOND
@@ -188,7 +188,7 @@ class LcmDriver(Driver):
         self.lcm.Publish(self.command_channel, message)
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive what has arrived; wait at most `timeout` [s] if nothing has."""
+        """Receive the messages that have arrived; if there are none, wait at most `timeout` [s]."""
         self.lcm.HandleSubscriptions(max(1, int(1000 * timeout)) if timeout > 0.0 else 0)
 
     def check_usable(self) -> None:
@@ -196,7 +196,7 @@ class LcmDriver(Driver):
         check_handlers()
 
     def add_listener(self, on_command: CommandCallback) -> None:
-        """Call back for the torques and the time [s] of every readable command of another program."""
+        """Register a callback for the torques (n,) [Nm] and time [s] of each command that another program sends."""
         self._listeners.append(on_command)
 
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
@@ -209,7 +209,7 @@ class LcmDriver(Driver):
         self.lcm.Publish(self.heartbeat_channel(), message)
 
     def __str__(self) -> str:
-        """Return bus and channel of the statuses."""
+        """Return the URL of the bus and the channel of the statuses."""
         return f"{self.url or 'LCM'}, channel {self.status_channel}"
 
     def _on_status(self, message: bytes) -> None:
@@ -222,7 +222,7 @@ class LcmDriver(Driver):
     def _on_command(self, message: bytes) -> None:
         if message in self._written:
             return
-        # A safety monitor sends its heartbeat before it commands.
+        # A safety monitor sends its heartbeat before its commands, which are not foreign.
         if not any(heartbeat.is_stopping for heartbeat in self._heartbeats.values()):
             self.num_foreign_commands += 1
             self._num_contested += bool(self._written)
@@ -284,7 +284,7 @@ class PandaDriver(LcmDriver):
     def encode(cls, torque: np.ndarray, time: float) -> bytes:
         """Return the command message of torques (7,) [Nm], with the wall clock as its time.
 
-        The driver drops commands that are older than 0.1 s by the clock on which both machines agree.
+        The driver drops commands that are older than 0.1 s, so the clocks of both machines must be synchronized.
         """
         del time
         command = lcmt_panda_command()

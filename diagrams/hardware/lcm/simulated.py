@@ -1,4 +1,4 @@
-"""Simulated driver: an iiwa and Drake's driver around it, for another process on LCM."""
+"""Simulated driver: an iiwa with Drake's driver, which another process commands over LCM."""
 
 from __future__ import annotations
 
@@ -89,10 +89,10 @@ class SimulatedIiwa(Diagram):
         builder.BuildInto(self)
 
     def simulator(self) -> Simulator:
-        """Return a simulator of this diagram, not initialized.
+        """Return a simulator of this diagram that is not initialized.
 
-        The only continuous state is the driver's low-pass filter. An integrator computes the contact, the most
-        expensive part, for each evaluation of the filter's derivative: one evaluation a step is enough.
+        The only continuous state is the driver's low-pass filter. Each evaluation of its derivative computes the
+        contact, the most expensive part, so the integrator evaluates it only once per plant step.
         """
         simulator = Simulator(self)
         ResetIntegratorFromFlags(simulator, "explicit_euler", self.plant.time_step())
@@ -105,18 +105,18 @@ class SimulatedIiwa(Diagram):
 
 
 class LockstepClock:
-    """Advance a hardware station in lockstep with a simulated driver: one step per new status.
+    """Clock that advances a hardware station in lockstep with a simulated driver: one step per new status.
 
-    Before each step the newest used status is acknowledged. `serve_in_lockstep` waits for this acknowledgement; if a
-    status was sent twice, the second acknowledgement has no effect. The robot therefore stands still while this program
-    computes, and the result of a run does not depend on either side's speed.
+    Before each step the status of the previous step is acknowledged. `serve_in_lockstep` waits for this
+    acknowledgement; if a status was sent twice, the second acknowledgement has no effect. The robot therefore stands
+    still while this program computes, and the result of a run does not depend on the speed of either process.
     """
 
     def __init__(self, driver: LcmDriver, command_timeout: float, period: float | None = None):
         """Construct the clock.
 
-        A status is awaited for at most `command_timeout` [s of wall clock time]; then steps are made without one, and
-        the station's watchdog notices. The period of a step [s] is the driver's by default.
+        A step waits for its status for at most `command_timeout` [s of wall clock time]. It is then made without one,
+        which the station's watchdog detects. The period of a step [s] is the driver's by default.
 
         Raises:
             InputError: If the driver cannot receive in this environment.
@@ -137,7 +137,7 @@ class LockstepClock:
         context = simulator.get_mutable_context()
         start = context.get_time()
         for step in range(steps):
-            # A silent robot is waited for once, and not in every step.
+            # The full timeout is waited only once for a silent robot, not in every step.
             self._wait(self._period if self._has_timed_out else self._timeout)
             self._has_timed_out = self._driver.statuses.head == self._used
             self._used = self._driver.statuses.head
@@ -168,9 +168,9 @@ def serve_in_lockstep(
 ) -> float:
     """Simulate an arm for another process, and wait after each step until its status is acknowledged.
 
-    Neither side outruns the other, however slow the machine is. A `LockstepClock` acknowledges each status; before its
-    first acknowledgement, a command counts as one. The arm has a bus of its own, so that no message arrives within
-    a step: commands sent until then count for the next step, independently of timing.
+    Neither process runs ahead of the other, however slow the machine is. A `LockstepClock` acknowledges each status;
+    before its first acknowledgement, a command counts as an acknowledgement. The arm has a bus of its own, so that no
+    message arrives within a step: commands apply from the next step on, independently of timing.
 
     Args:
         simulator: Simulator of the arm, initialized.
@@ -190,7 +190,7 @@ def serve_in_lockstep(
     acknowledgements, commands = MessageCounter(), list[bytes]()
     lcm.Subscribe(IiwaDriver.status_channel + ACKNOWLEDGED, acknowledgements.add)
     lcm.Subscribe(IiwaDriver.command_channel, commands.append)
-    # A status's heartbeat is sent before it, so that the other process has both when it waits for the status.
+    # A heartbeat is sent before its status, so that the other process has both when the status arrives.
     outgoing = dict.fromkeys((IiwaDriver.heartbeat_channel(), IiwaDriver.status_channel), b"")
     for channel in outgoing:
         robot_lcm.Subscribe(channel, partial(outgoing.__setitem__, channel))
@@ -226,7 +226,7 @@ def serve_in_lockstep(
                 pass
             if is_acknowledged():
                 break
-            # A datagram may be lost, and the other process may have subscribed late.
+            # Send again: a datagram may be lost, and the other process may have subscribed late.
             send()
         else:
             break
@@ -248,10 +248,10 @@ def serve_in_real_time(
     rate: float = 1.0,
     log: Callable[[str], None] = print,
 ) -> None:
-    """Simulate an arm by the wall clock, as a real robot, which does not wait for commands.
+    """Simulate an arm in real time; like a real robot, it does not wait for commands.
 
-    Contact makes the simulation slower. If it falls so far behind that its statuses count as old, this is reported
-    once, because the commanding program is not at fault then.
+    Contact makes the simulation slower. If the simulation falls so far behind that its statuses count as old, this is
+    reported once, because the commanding program is not the cause.
 
     Args:
         simulator: Simulator of the arm, initialized.

@@ -16,7 +16,7 @@ from guiderail.systems.reward_system import RewardTerm
 
 OBSERVATIONS = ("state", "center_of_pressure")
 
-# The torques are small, and they indicate on which side of the rim the plug stands: 0.02 Nm at 4 N.
+# The scale of torques is small, because 0.02 Nm at 4 N indicate on which side of the rim the plug stands.
 POSE_CENTER = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
@@ -31,7 +31,7 @@ def observation_terms(
 ) -> tuple[ObservationTerm, ...]:
     """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
 
-    The `duration` is that of an episode [s].
+    `duration` is the duration of an episode [s].
     """
     half = 0.5 * duration
     state = (
@@ -57,12 +57,12 @@ def half_turn(observation: str) -> tuple[float, ...]:
 def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
 
-    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components about the axis
-    stay.
+    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components along and about
+    the axis of pose and wrench are unchanged.
 
     Returns:
-        Matrices of observations (7, n, n), of actions (7, A, A) and of what a privileged critic observes, (7, 9, 9);
-        None if actions move x and not y, or one tilt.
+        Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if
+        actions move only one of x and y, or only one of the tilts.
     """
     quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
@@ -81,15 +81,15 @@ def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.n
     return np.array(observations), np.array(actions), np.array(privileged)
 
 
-# The thesis gives no unit of f; here it is 10 N and 0.5 Nm.
+# The thesis gives no units of the wrench f; here they are 10 N and 0.5 Nm.
 ACTION_WEIGHT = FORCE_WEIGHT = 0.01
 REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 TERMINAL = {"success": 60.0, "collision": -50.0}
-# [1/mm] The connector locks when the demonstrations end, however early the plug dropped. With a terminal reward alone,
-# a policy that moves at random until it drops would be worth as much as one that uses the contact, and would sometimes
-# fail. The way from the start to the lock is 15.6 mm, the last 5.5 mm of it in the jack.
+# Reward per depth gained [1/mm]. The connector locks when the demonstrations end, however early the plug drops. With a
+# terminal reward alone, a policy that moves at random until the plug drops would earn as much as one that uses the
+# contact, and would sometimes fail. The path from start to lock is 15.6 mm long, with the last 5.5 mm in the jack.
 DEPTH_REWARD = 5.0
-# [1/mm] towards the jack's axis: on the rim, the depth does not indicate the direction.
+# Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
 ALIGNMENT_REWARD = 5.0
 
 REWARDS = ("sparse", "shaped", "aligned")
@@ -99,8 +99,8 @@ def reward_terms(reward: str, num_actions: int) -> list[RewardTerm]:
     """Return the terms of a reward, one of `REWARDS`.
 
     "sparse" is the thesis's reward, "shaped" adds the depth gained, and "aligned" also adds the distance gained towards
-    the jack's axis. The latter is privileged: it uses simulation state that the policy does not observe. Both additions
-    are differences of potentials.
+    the jack's axis. This distance is privileged: the policy does not observe this simulation state. Depth gained and
+    distance gained are differences of potentials.
     """
     terms = [
         RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),

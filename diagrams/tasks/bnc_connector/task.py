@@ -54,7 +54,7 @@ LOCKED_STEPS = 3  # consecutive steps of the default control period that count a
 
 @cache
 def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
-    """Return the Gaussian mixture regression of shipped demonstrations or of a file's, fitted once a process."""
+    """Return the Gaussian mixture regression of demonstrations, shipped or in a file, fitted once per process."""
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
     loaded = DEMONSTRATIONS[demonstrations]()
@@ -71,7 +71,7 @@ SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTER[2]) / POSE_SCALE[2]  # scaled height 
 CONTACT_FORCE = 0.2  # scaled force along z above which the plug is in contact
 
 # Parameters of `scripted_center_of_pressure`, for the demonstrations "search".
-STEP = 0.5 * MM  # displacement of the command per action [m]
+STEP = 0.5 * MM  # change of the command from one action to the next [m]
 REACH = 3.1 * MM  # displacement of the command at an action of 1 [m]
 ON_RIM = RIM - 0.5 * MM  # height above which the plug is not inserted [m]
 MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the rim [s]
@@ -110,7 +110,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
 class BncConnector(DemonstratedInsertion):
     """Insert, align and lock the connector.
 
-    Rewards: "sparse" is the thesis's (4.27, 4.28); "shaped" and "aligned" add to it.
+    Rewards: "sparse" is the thesis's reward (4.27, 4.28); "shaped" and "aligned" add terms to it.
     """
 
     Options = BncOptions
@@ -136,7 +136,7 @@ class BncConnector(DemonstratedInsertion):
         )
         self.collision = Threshold("contact_force", o.largest_force_limit)
         self._workcell = o.workcell()
-        # Fitting the shipped demonstrations takes seconds, and their duration is known.
+        # The duration of the shipped demonstrations is known, so they are not fitted here, which would take seconds.
         is_shipped, period = o.demonstrations in DEMONSTRATIONS, self.control_period
         duration = NUM_STEPS * CONTROL_PERIOD * o.time_scale
         self.num_steps = round(duration / period) if is_shipped else self.reference().num_steps
@@ -163,7 +163,7 @@ class BncConnector(DemonstratedInsertion):
         return D, y0
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
+        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
         return *observation_terms(
             self.config.observation, self.num_steps * self.control_period
         ), *self.force_limit_terms()
@@ -186,7 +186,7 @@ class BncConnector(DemonstratedInsertion):
         return signs.padded(len(self.force_limit_terms()))
 
     def near_symmetry(self) -> Symmetry:
-        """Return quarter turns and reflections too, which hold while the plug stands on the rim."""
+        """Return the half turn, and the quarter turns and reflections that hold while the plug stands on the rim."""
         sides = sides_of_the_rim(self.config.observation, self.action_dims())
         return self.symmetry() if sides is None else Symmetry(*sides).padded(len(self.force_limit_terms()))
 

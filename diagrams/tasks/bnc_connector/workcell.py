@@ -17,17 +17,17 @@ from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_
 from guiderail.models.objects.bnc_connector.surfaces import jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 
-# Pairs that cannot touch in a connector of these dimensions, or with contact that another surface carries.
+# Surfaces of jack and plug that cannot touch in a connector of these dimensions, or whose contact another pair carries.
 FILTERED_PAIRS = [
     (("lug_0", "lug_1", "pad"), ("bore",)),
     (("barrel", "pad"), ("slots",)),
     (("lug_0", "lug_1", "barrel"), ("seat",)),
 ]
 
-# The task board has no collision geometry; the locked plug's mouth is a little below the jack's bottom.
+# The task board has no collision geometry, because the locked plug's mouth reaches slightly below the jack's bottom.
 BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]  # [m]
-LOCKED_HEIGHT = 0.6e-3  # [m]
-LOCKED_ANGLE = np.deg2rad(4.0)
+LOCKED_HEIGHT = 0.6e-3  # [m] largest deviation of a locked plug along the jack's axis
+LOCKED_ANGLE = np.deg2rad(4.0)  # [rad] largest deviation of a locked plug about the jack's axis
 LOCKED_OFFSET = 1.0e-3  # [m] largest lateral offset of a locked plug
 
 # Signs after half a turn about the jack's axis, under which the jack is symmetric.
@@ -43,9 +43,9 @@ class BncWorkcell(MovableWorkcell):
         dimensions: Dimensions of the connector.
         p_WJ: Position of the jack, (3,) [m].
         friction: Friction coefficient of the connector's metal.
-        margin: Distance at which contact with the jack begins in Drake [m]; MuJoCo has none.
+        margin: Distance at which contact with the jack begins in Drake [m]; not used in MuJoCo.
         equal_area: True if the polygons of barrel and bore in Drake have the areas of their circles. Otherwise the
-            barrel's lies inside its circle and the bore's outside, and the plug drops in with a larger offset.
+            barrel's polygon lies inside its circle and the bore's outside, and the plug drops in at larger offsets.
     """
 
     fixture: ClassVar[str] = "jack"
@@ -96,7 +96,7 @@ class BncWorkcell(MovableWorkcell):
         """Return True if a plug is locked and on the jack's axis.
 
         Args:
-            plug: X_JPlug as position and rotation vector, (6,); of an upright plug the latter is its turn about z.
+            plug: X_JPlug as position and rotation vector, (6,); for an upright plug, `plug[5]` is the turn about z.
         """
         return bool(
             abs(plug[2] - self.dimensions.locked_height) < LOCKED_HEIGHT
@@ -106,9 +106,9 @@ class BncWorkcell(MovableWorkcell):
 
     @staticmethod
     def is_locked(X_LockedPlug: RigidTransform) -> bool:
-        """Return True if the pose in the frame of the locked plug is within 0.6 mm along and 4 degrees about the axis.
+        """Return True if a plug is within 0.6 mm along and 4 degrees about the axis of the locked pose.
 
-        The lugs are then past the apex, and only a torque brings them back.
+        The lugs are then past the apex of the slots, and only a torque unlocks the plug.
         """
         yaw = RollPitchYaw(X_LockedPlug.rotation()).yaw_angle()
         return bool(abs(X_LockedPlug.translation()[2]) < LOCKED_HEIGHT and abs(yaw) < LOCKED_ANGLE)

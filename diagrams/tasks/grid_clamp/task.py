@@ -31,10 +31,11 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-# [N] The cuboid allows commands 6 mm below the seat and 8 mm sideways, with which an impedance of 1500 N/m pushes less.
+# Force of a collision [N]. Commands in the cuboid are at most 6 mm below the seat and 8 mm sideways; an impedance of
+# 1500 N/m then pushes with less.
 COLLISION_FORCE = 35.0
-START_HEIGHT = (0.015, 0.018)  # [m] the preceding skill ends with the tips of the pegs 3 to 6 mm above the table
-HEIGHTS = (0.013, 0.060)  # [m] range of start heights: above the table, and well inside the cuboid
+START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
+HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
 NOMINAL = GridClampDimensions()
 
 
@@ -81,16 +82,16 @@ class GridClampOptions(ForceOptions):
 HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
 """Options of difficulty="hard": little time, and a force limit of 10 N; snapping in takes 6 N.
 
-The impedance's force is bounded below the limit, so that an untrained policy cannot end an episode by its force, only
-by running out of time. On the gantry with exact sensors random actions find the holes in 10 of 14 episodes of 10 s, and
-in 4 of 14 episodes of 6 s. A scripted search finds them in all.
+The impedance's force is bounded below the limit, so that an untrained policy fails by running out of time and not by a
+collision. On the gantry with exact sensors random actions find the holes in 10 of 14 episodes of 10 s, and in 4 of 14
+episodes of 6 s. A scripted search finds the holes in all of these episodes.
 """
 
 
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
-# Reward towards the holes' axis [1/m] and terminal reward of a collision. Steps are fractions of a millimeter, and a
-# policy that presses gently for long must not lose more than one that ends the episode at once.
+# Reward per distance gained towards the holes' axis [1/m], large because steps are fractions of a millimeter; and
+# terminal reward of a collision: ending an episode at once must not cost less than pressing gently for long.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
 REWARDS = ("shaped", "no_force", "sparse", "aligned")
@@ -99,9 +100,9 @@ REWARDS = ("shaped", "no_force", "sparse", "aligned")
 def reward_terms(reward: str, num_actions: int, action_repeat: int) -> list[RewardTerm]:
     """Return the terms of a reward.
 
-    "shaped" is the thesis's, "no_force" omits the cost of force, and "sparse" the distance gained. "aligned" adds the
-    distance gained towards the holes' axis, a privileged reward because the policy does not observe it, and a cost of
-    collisions. Values that the thesis defines per action are divided among its `action_repeat` control steps.
+    "shaped" is the thesis's reward; "no_force" omits its cost of force, and "sparse" its distance gained downwards.
+    "aligned" adds to "shaped" a cost of collisions and the distance gained towards the holes' axis, a privileged value
+    that the policy does not observe. Values per action in the thesis are divided among `action_repeat` control steps.
     """
     terms = [
         RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
@@ -139,8 +140,8 @@ def _collision_cost(termination: np.ndarray) -> float:
 
 NUM_PLACES = 6  # pick-up places of clamps
 # Parallel jaws center the clamp across the jaws (y), and not along them (x).
-ALONG_JAWS = 1.0 * MM  # largest offset of a place along the jaws
-ACROSS_JAWS = 0.2 * MM  # the same across the jaws
+ALONG_JAWS = 1.0 * MM  # largest grasp offset of a place along the jaws
+ACROSS_JAWS = 0.2 * MM  # largest grasp offset of a place across the jaws
 CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest offset of the table
 REPEATABILITY = 0.1 * MM  # largest change of the offset from one pick-up at a place to the next
 KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with "none"
@@ -150,12 +151,12 @@ class GridClampUncertainty(HiddenOffsets):
     """Sampler of the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
 
     - "per_run": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp offset,
-      all hidden and the same for a whole run. An episode picks up at a sampled place, with a repeatability of 0.1 mm.
-      This is the thesis's case.
+      all hidden and the same for a whole run. In an episode the clamp is picked up at one sampled place, with a
+      repeatability of 0.1 mm. The thesis uses this setting.
     - "per_episode": the offsets of the table and of the six places are sampled each episode.
-    - "none": the clamp is within 0.15 mm of its nominal place in the tool.
+    - "none": the clamp is within 0.15 mm of its nominal position in the tool.
 
-    The option `offset` sets the clamp's place in the tool, with the table at its nominal place.
+    The option `offset` sets the clamp's position in the tool, with the table at its nominal position.
     """
 
     def __init__(self, kind: str):
@@ -184,13 +185,13 @@ class GridClampUncertainty(HiddenOffsets):
 
 SEATED_STEPS = 3  # consecutive control steps that count as seated
 
-MAX_TRACKING_ERROR = 8.0 * MM  # 12 N of the impedance, twice the force of snapping in
+MAX_TRACKING_ERROR = 8.0 * MM  # the impedance then pushes with 12 N, twice the force needed to snap in
 
 START_OFFSET = 0.2 * MM  # largest offset of the start along x and y
 
 
 def make_template() -> SharedControlTemplate:
-    """The template of section 3.4.2."""
+    """Return the template of the thesis, section 3.4.2."""
     return load_template("grid_clamp")
 
 
@@ -199,34 +200,34 @@ CENTER = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 
 ON_TABLE = GridClampDimensions().peg_length  # height of the clamp while the pegs stand on the table [m]
-NEAR = 1.5 * MM  # height above the table below which it descends slowly and searches
+NEAR = 1.5 * MM  # height above the table below which the clamp descends slowly and searches
 IN_HOLE = 0.5 * MM  # depth below the table at which a peg is in its hole
-LANES = np.array([-1.1, 0.0, 1.1]) * MM  # places along y; no peg can pass between two of them without dropping
-LANE_ENDS = 3.7 * MM  # along x, beyond the largest offset
+LANES = np.array([-1.1, 0.0, 1.1]) * MM  # y of the search lanes, so close that the pegs drop in from at least one
+LANE_ENDS = 3.7 * MM  # |x| of the ends of a lane, beyond the largest offset
 PAST_LANES = 0.3 * MM  # overshoot along y from lane to lane; a clamp beyond the last lane starts again
 PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
-SNAP_FORCE = 12.0  # largest force while it snaps in [N]
-GENTLE_SNAP_FORCE = 8.5  # the same for a force limit of 10 N
+SNAP_FORCE = 12.0  # largest force while the clamp snaps in [N]
+GENTLE_SNAP_FORCE = 8.5  # largest force while the clamp snaps in, for a force limit of 10 N [N]
 HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N], [m/s/N] and [1/s]
 _PARAMETERS = load_template("grid_clamp").parameters
-SPEED = _PARAMETERS["speed_m_per_s"]  # speed of a full input
-LIFT = _PARAMETERS["lift"]  # fraction of it, upwards
+SPEED = _PARAMETERS["speed_m_per_s"]  # speed at an input of 1
+LIFT = _PARAMETERS["lift"]  # fraction of `SPEED` at an upward input of 1
 STIFFNESS = Impedance().stiffness[0]
 
 
 def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
-    """Return the inputs of a search without memory, (3,) in [−1, 1], for a scaled position and force, (6,).
+    """Return the inputs (3,) in [−1, 1] of a memoryless search, for a scaled position and force, (6,).
 
     Above the table the clamp moves to the start of the first lane. On the table it presses lightly and follows the
     lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in, with at
     most `snap_force` [N].
     """
     position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:6] * SCALE[3:]
-    command = position - force / STIFFNESS  # the impedance's spring separates it from the measured position
+    command = position - force / STIFFNESS  # the impedance's spring separates command and position
     if position[2] > ON_TABLE + NEAR:
         velocity = np.array([*(LANE_GAIN * (np.array([-LANE_ENDS, LANES[0]]) - position[:2])), -SPEED])
         if position[2] < ON_TABLE + 3 * NEAR and np.hypot(position[0] + LANE_ENDS, position[1] - LANES[0]) > 0.5 * MM:
-            velocity[2] = 0.0  # no descent before it is at the start
+            velocity[2] = 0.0  # no descent before the clamp is at the start of the first lane
     elif position[2] > ON_TABLE - IN_HOLE and command[1] > LANES[-1] + 0.5 * PAST_LANES:
         velocity = np.array([0.0, 0.0, SPEED])  # lift, and begin at the first lane again
     elif position[2] > ON_TABLE - IN_HOLE:
@@ -243,7 +244,7 @@ def _lane_velocity(xy: np.ndarray) -> np.ndarray:
     forward = 1.0 if lane % 2 == 0 else -1.0
     if forward * xy[0] < LANE_ENDS - 0.1 * MM:
         return np.array([forward * SEARCH_SPEED, LANE_GAIN * (LANES[lane] - xy[1])])
-    # Slower towards the next lane: with a delayed force it would otherwise pass the lane.
+    # Slower towards the next lane: because the force is delayed, the clamp would otherwise overshoot this lane.
     return np.array([0.0, LANE_GAIN * (LANES[min(lane + 1, len(LANES) - 1)] + PAST_LANES - xy[1])])
 
 
@@ -253,7 +254,7 @@ def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:
 
 
 def straight_descent(observation: np.ndarray) -> np.ndarray:
-    """Return a full input downwards, (3,)."""
+    """Return the largest downward input, (3,)."""
     return np.array([0.0, 0.0, -1.0])
 
 
@@ -261,9 +262,8 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 class GridClamp(InsertionTask):
     """Insert the clamp.
 
-    Rewards: "shaped" is the thesis's (3.11, 3.12), "no_force" omits the cost of force, "sparse" the distance gained,
-    and "aligned" adds the distance gained towards the holes' axis. Without `active_constraints`, only the impedance
-    limits the forces of a policy.
+    Rewards: "shaped" is the thesis's reward (3.11, 3.12); see `reward_terms` for "no_force", "sparse" and "aligned".
+    Without `active_constraints`, only the impedance limits the forces of a policy.
     """
 
     Options = GridClampOptions
@@ -312,7 +312,7 @@ class GridClamp(InsertionTask):
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of equations 3.11 and 3.12, and those of the other rewards."""
+        """Return the terms of the reward `config.reward`."""
         return reward_terms(self.config.reward, num_actions, self.config.action_repeat)
 
     def termination_terms(self) -> list[TerminationTerm]:
@@ -323,7 +323,7 @@ class GridClamp(InsertionTask):
         return [seated, self.force_limit()]
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Return a sampled pose of the hand-over by the preceding skill."""
+        """Return a sampled pose (6,) at which the preceding skill ends and an episode starts."""
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
         start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start

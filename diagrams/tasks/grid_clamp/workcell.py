@@ -21,14 +21,14 @@ STICTION_TOLERANCE = 1e-5
 """Largest creep of a sticking contact [m/s].
 
 A clamp that stands next to its holes, pressed with 27 N and pushed sideways with 2 N, a third of the friction limit,
-drifts at 0.18 mm/s with Drake's 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s it decides between
-slipping in by itself and standing still.
+drifts at 0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s this drift
+decides whether the clamp slips in by itself or stands still.
 """
 SEATED_HEIGHT = 0.5e-3  # [m] height below which a clamp has snapped in
 SEATED_OFFSET = 1.0e-3  # [m] largest lateral offset of a seated clamp
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
-# Contacts: a peg and its own hole, bead and lip, pad and slab.
+# All pairs of surfaces except a peg and its own hole, bead and lip, and pad and slab.
 FILTERED_PAIRS = [
     *(((hole,), tuple(peg for peg in PEGS if peg[-1] != hole[-1])) for hole in HOLES),
     (HOLES, ("bead", "pad")),

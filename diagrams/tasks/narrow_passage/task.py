@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
 DEFAULT_GEOMETRY = PassageGeometry()
-SECOND_OBSTACLE = (0.446, 0.78)  # [m] half way through the wide part behind the gap, on the demonstrations' mean
+SECOND_OBSTACLE = (0.446, 0.78)  # [m] center, half way through the wide part behind the gap, on the mean demonstration
 
 HARD: Mapping[str, Any] = {
     "gap_width": 0.03,
@@ -46,7 +46,7 @@ HARD: Mapping[str, Any] = {
     "obstacles_end": True,
     "start_deviation": 0.03,
 }
-"""A gap half as wide, and a slalom around two obstacles that end the episode when touched, on sampled sides."""
+"""Options of difficulty="hard": half the gap, and two obstacles on sampled sides that end the episode when touched."""
 
 
 class NarrowPassageOptions(Options):
@@ -78,7 +78,7 @@ class NarrowPassageOptions(Options):
 
     @property
     def has_sampled_obstacles(self) -> bool:
-        """True if a reset sets the obstacles; otherwise there is the default one, which only costs reward."""
+        """True if a reset sets the obstacles; otherwise there is one fixed obstacle, which ends no episode."""
         return self.obstacle_beside > 0 or self.obstacles_end or self.second_obstacle
 
     def workcell(self) -> PassageGeometry:
@@ -95,9 +95,9 @@ class NarrowPassageOptions(Options):
 
 
 def avoids_obstacle_from(rows: Any, cost: float = 1.0, streak: int = 5) -> int | None:
-    """Return the first episode, from 1, of a table that begins a streak with obstacle costs below `cost`, or None.
+    """Return the number, from 1, of the first episode that begins a streak of obstacle costs below `cost`, or None.
 
-    A path through the obstacle's middle costs about a hundred; a policy that explores touches its margin now and then.
+    A path through the obstacle's middle costs about 100; an exploring policy sometimes touches the obstacle's margin.
     """
     index = find_streak(rows["reward_obstacle_cost"] > -cost, streak)
     return None if index is None else index + 1
@@ -118,8 +118,8 @@ PROGRESS = 100.0  # shaped reward for progress [1/m]
 def reward_terms(reward: str, geometry: PassageGeometry, has_sampled_obstacles: bool = False) -> list[RewardTerm]:
     """Return the terms of a reward.
 
-    "sparse" is the thesis's (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
-    With `has_sampled_obstacles` the signal `obstacles` holds the obstacles' positions, each of which costs.
+    "sparse" is the thesis's reward (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
+    With `has_sampled_obstacles`, each obstacle of the signal `obstacles`, which holds their positions, adds a cost.
     """
     two_poses = {"pose": 2, "last_pose": 2}
 
@@ -144,8 +144,8 @@ def _terminal_reward(termination: np.ndarray) -> float:
     return SUCCESS_REWARD * (termination[0] == SUCCESS)
 
 
-BLOCKED_STEPS = 20
-BLOCKED_PROGRESS = 1e-4  # [m] along y
+BLOCKED_STEPS = 20  # control steps at a wall without progress after which the robot is blocked
+BLOCKED_PROGRESS = 1e-4  # [m] smallest increase of y that counts as progress
 
 
 def termination_terms(geometry: PassageGeometry, is_touching_collision: bool = False) -> list[TerminationTerm]:
@@ -179,29 +179,29 @@ def termination_terms(geometry: PassageGeometry, is_touching_collision: bool = F
 # Phases, from −1 to 1, in which the demonstrations pass the first and the second obstacle.
 PASSING = ((-0.8, -0.25), (0.1, 0.7))
 SLALOM_ACTION = 1.0
-# Indices into the observation [phase, first obstacle, second obstacle]: x and y each, x as a side from −1 to 1.
+# Indices into the observation [phase, x and y of the first obstacle, x and y of the second]; x is the side, −1 or 1.
 PHASE, SIDES = 0, (1, 3)
 
 
 def scripted_slalom(observation: np.ndarray) -> np.ndarray:
-    """Return an action away from the obstacle that is being passed, along x, (2,)."""
+    """Return an action (2,) along x, away from the obstacle that the robot is passing."""
     for (first, last), side in zip(PASSING, SIDES, strict=True):
         if first < observation[PHASE] < last:
             return np.array([-SLALOM_ACTION * observation[side], 0.0])
     return np.zeros(2)
 
 
-IMAGE_SIZE = (144, 110)  # width and height of the observed image [pixels] (4.4.1, end)
-COMPONENTS = 20  # of the mixture; 8 to 16 blur the gap
-FLOOR = 0.002  # [m] repeatability of a hand, added to the demonstrations' covariance as a standard deviation
+IMAGE_SIZE = (144, 110)  # width and height of the observed image [pixels] (thesis, end of section 4.4.1)
+COMPONENTS = 20  # components of the Gaussian mixture; with 8 to 16 the gap is blurred
+FLOOR = 0.002  # [m] standard deviation of a hand's repeatability; its square is added to the fitted variances
 HELD_OUT_DEVIATION = 0.01  # [m] standard deviation of a held-out start
-MAX_DEVIATIONS = 4.0  # clip of a sampled start along x and y [standard deviations]: exceeded by 1 in 8000 samples
+MAX_DEVIATIONS = 4.0  # limit of a sampled start along x and y [standard deviations]; 1 of 8000 starts is clipped
 MAX_START = 2.0  # [m] largest coordinate of a given start
 
 
 @lru_cache(maxsize=1)
 def reference_trajectory() -> ReferenceTrajectory:
-    """Return the Gaussian mixture regression of the nine demonstrations, fitted once a process."""
+    """Return the Gaussian mixture regression of the nine demonstrations, fitted once per process."""
     return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
 
 
@@ -256,11 +256,11 @@ class NarrowPassage(Task):
         return self.on_clock(reference_trajectory())
 
     def constraints(self) -> LinearConstraints:
-        """Return the constraint that the restricted zone is not entered."""
+        """Return the constraint that keeps commands out of the restricted zone."""
         return self._geometry.constraints
 
     def motion_constraints(self) -> MotionConstraints | None:
-        """Return the obstacle as a disc to stay outside of, with `obstacles_constrain`."""
+        """Return the obstacle as a disc to stay outside of; None without the option `obstacles_constrain`."""
         if not self.options.obstacles_constrain:
             return None
         from guiderail.models.control.shapes import Sphere

@@ -24,7 +24,7 @@ from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints
 
 FILE_NAME = "task.yaml"
-_FILE_NAME = re.compile(r"[\w()+ -][\w.()+ /-]*")  # of a file in the folder; the name is also written into XML
+_FILE_NAME = re.compile(r"[\w()+ -][\w.()+ /-]*")  # path of a file in the folder; it is also written into XML
 FILE_FORMAT = "guiderail task 1"
 NAMESPACE = "parts"
 HARD: dict[str, Any] = {
@@ -35,7 +35,7 @@ HARD: dict[str, Any] = {
     "observation": "center_of_pressure",
     "action_repeat": 5,
 }
-"""Options of difficulty="hard" without a calibration: the socket is farther off than most lead-ins catch."""
+"""Options of difficulty="hard" if task.yaml has none: the socket's offset is larger than most lead-ins can catch."""
 
 AUTOMATE: dict[str, Any] = {
     "fixture_offset": "per_episode",
@@ -60,8 +60,8 @@ class Piece(Options):
         None, gt=0, description="hydroelastic modulus of a compliant convex mesh [Pa]; default: rigid"
     )
     friction: Number = Field(0.2, ge=0, le=2, description="friction coefficient of the surface, static and dynamic")
-    # A contact that is a micrometer too deep after a step would otherwise eject the plug: with 100 s/m nothing leaves a
-    # contact faster than 10 mm/s.
+    # With 100 s/m no part leaves a contact faster than 10 mm/s. Otherwise a contact that is a micrometer too deep after
+    # a step would eject the plug.
     dissipation: Number = Field(100.0, ge=0, description="Hunt-Crossley dissipation [s/m]")
 
 
@@ -103,7 +103,7 @@ class Tolerance(Options):
 
 
 class Bounds(Options):
-    """Bounds of every command, [x y z Rz Ry Rx]; one list for all steps, or one for each."""
+    """Bounds of every command, [x y z Rz Ry Rx]: one list for all steps, or one list for each phase."""
 
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
@@ -126,7 +126,7 @@ class Bounds(Options):
     @classmethod
     def _fit(cls, phases: tuple[float, ...] | None, others: ValidationInfo) -> tuple[float, ...] | None:
         if not {"lower", "upper"} <= others.data.keys():
-            return phases  # the error of those fields is reported instead
+            return phases  # the errors of `lower` and `upper` are reported instead
         lower, upper = _filled(others.data["lower"], -np.inf), _filled(others.data["upper"], np.inf)
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
             raise ValueError("bounds that change need phases, and a list of lower and of upper ones for each")
@@ -138,11 +138,11 @@ class Bounds(Options):
         return phases
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds, (6,) or one row for each phase (K, 6), infinite if absent."""
+        """Return lower and upper bounds, (6,) or one row for each phase (K, 6); an absent bound is infinite."""
         return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
 
     def constraints(self, num_steps: int) -> LinearConstraints:
-        """Return G y ≥ c, constant or of the phase of each of `num_steps` steps."""
+        """Return the bounds as G y ≥ c, constant or for each of `num_steps` steps by its phase."""
         lower, upper = self.arrays()
         if self.phases is None:
             return LinearConstraints.box(lower, upper)
@@ -185,7 +185,7 @@ class DemonstrationFile(Options):
 
 
 class Recommended(Options):
-    """Defaults of environment and learner."""
+    """Default options of environment and learner."""
 
     environment: dict[str, Any] = Field(
         {
@@ -204,7 +204,7 @@ class Recommended(Options):
 
 
 class SearchNumbers(Options):
-    """Response of a plug on the rim, which the scripted search uses."""
+    """Parameters of the scripted search for a plug on the rim."""
 
     lever_sign: int = Field(
         -1,
@@ -258,7 +258,7 @@ class PartTaskFile(Options):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files that it refers to, in its folder."""
+        """Names of the files in the task folder that `task.yaml` refers to."""
         models = (self.plug, self.socket)
         meshes = [*(model.visual for model in models), *(piece.file for model in models for piece in model.pieces)]
         convex = [file for model in models for file in model.convex if file not in meshes]
@@ -266,12 +266,12 @@ class PartTaskFile(Options):
 
     @property
     def is_convex(self) -> bool:
-        """True if both parts have convex pieces, and no other objects are around."""
+        """True if both parts have convex pieces, and `scenario` adds no other objects."""
         return bool(self.plug.convex and self.socket.convex) and not self.scenario
 
     @cached_property
     def turn(self) -> float:
-        """Turn at the bottom [rad]."""
+        """Turn of the plug about z at the bottom [rad]."""
         return self.motion.turn * DEGREE
 
 
@@ -279,7 +279,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
     """Read the task of a folder.
 
     Raises:
-        InputError: If the folder is missing or not a task, a value is invalid, or a file that it names is missing.
+        InputError: If the folder is missing or not a task, a value is invalid, or a named file is missing.
     """
     path = folder / FILE_NAME
     if not folder.is_dir():
@@ -312,7 +312,7 @@ def task_folder_digest(folder: Path) -> str:
 
 
 def write_task_file(folder: Path, file: PartTaskFile) -> Path:
-    """Write `task.yaml`; reading it returns an equal task."""
+    """Write `task.yaml` with numbers of nine significant digits, and return its path."""
     path = folder / FILE_NAME
     values = _plain(file.model_dump())
     text = yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None)

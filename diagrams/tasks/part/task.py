@@ -1,4 +1,4 @@
-"""Task of two meshes, with every number declared in its folder."""
+"""Insertion task of two meshes, with all of its numbers declared in `task.yaml`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
 
 
 class PartUncertainty(BncUncertainty):
-    """Sampler of the socket's offset: as the connector's, or uniform in a square, sampled in each episode."""
+    """Sampler of the socket's offset: as for BncConnector, or uniform in a square in each episode."""
 
     def __init__(self, options: PartOptions):
         super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
@@ -90,9 +90,9 @@ class PartUncertainty(BncUncertainty):
 class ScriptedSearch:
     """Search by the center of pressure: on the rim, the action moves steadily towards the socket's axis.
 
-    Until the plug touches the rim and after it has dropped in, the action stays as it is. It is zero at the start of an
-    episode, which is where the observed time does not increase. The action is integrated here, because the displacement
-    by an action depends on the guidance and changes during the motion.
+    Before the plug touches the rim and after it has dropped in, the action does not change. An episode starts where the
+    observed time does not increase; the action is then zero. The search integrates the action and not the displacement,
+    because the displacement per action depends on the guidance and changes during the motion.
     """
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
@@ -100,7 +100,7 @@ class ScriptedSearch:
 
         Args:
             file: Task file.
-            duration: Returns the duration of the reference trajectory [s]; called at the first observation.
+            duration: Function that returns the duration of the reference trajectory [s]; called at each observation.
         """
         self._file, self._duration = file, duration
         self._time, self._action = np.inf, np.zeros(2)
@@ -169,7 +169,7 @@ class PartInsertion(DemonstratedInsertion):
         return self.on_clock(reference_of_file(self.folder / source.file, source.components, source.floor))
 
     def constraints(self) -> LinearConstraints:
-        """Return the folder's bounds, with those of x and y replaced by the option `bound`."""
+        """Return the bounds of `task.yaml`; the option `bound`, if given, replaces the bounds of x and y."""
         bounds, limit = self.file.bounds, self.options.bound
         if limit is not None:
             if bounds.phases is not None:
@@ -191,12 +191,12 @@ class PartInsertion(DemonstratedInsertion):
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
-        """Return the kinds of prior knowledge; walls to keep out of cannot change between phases."""
+        """Return the kinds of prior knowledge, without walls ("keep_out") if the bounds change between phases."""
         changes = cls.file.bounds.phases is not None
         return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
+        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
@@ -221,7 +221,7 @@ class PartInsertion(DemonstratedInsertion):
         return self._select_symmetries(self.file.sides)
 
     def near_symmetry(self) -> Symmetry | None:
-        """Return these and the symmetries that nearly hold for a plug on the rim."""
+        """Return the symmetries of both parts, and those that nearly hold for a plug on the rim."""
         return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
 
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
@@ -233,7 +233,7 @@ class PartInsertion(DemonstratedInsertion):
 
     @classmethod
     def is_seated(cls, plug: np.ndarray) -> bool:
-        """Return True if a plug, as position and rotation vector in the socket (6,), is at the target."""
+        """Return True if a plug is at the target; `plug` is its position and rotation vector in the socket, (6,)."""
         tolerance = cls.file.tolerance
         return bool(
             abs(plug[2]) < tolerance.height
@@ -268,7 +268,7 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
     """Write the SDF files of a task folder next to its meshes, and return its workcell.
 
     Raises:
-        InputError: If they cannot be written.
+        InputError: If the SDF files cannot be written.
     """
     for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
         text = part_sdf(
@@ -282,7 +282,7 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         )
         path = folder / f"{name}.sdf"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            write_atomically(path, text.encode())  # other processes read it at the same time
+            write_atomically(path, text.encode())  # other processes may read it meanwhile
     return PartWorkcell(
         folder,
         cast(tuple[float, float, float], file.place),

@@ -18,12 +18,12 @@ from guiderail.models.common.parsing import add_models
 from guiderail.models.objects.surfaces import Hull, Surface
 
 PLUG, SOCKET = "plug", "socket"
-"""Names of the bodies, and of the SDF files that hold them."""
+"""Names of the bodies, and of their SDF files without the suffix."""
 
 
 @dataclass(frozen=True)
 class PartWorkcell(MovableWorkcell):
-    """Socket in the world and plug in the tool; both meshes are in the target frame, in which they are assembled.
+    """Socket in the world and plug in the tool; the vertices of the assembled parts are given in the target frame.
 
     Attributes:
         folder: Folder with the SDF files of plug and socket.
@@ -45,7 +45,7 @@ class PartWorkcell(MovableWorkcell):
 
     @property
     def X_WF(self) -> RigidTransform:
-        """Pose of the nominal socket, which is the target's."""
+        """Pose of the nominal socket, equal to that of the target."""
         return RigidTransform(np.array(self.place))
 
     @property
@@ -71,12 +71,12 @@ class PartWorkcell(MovableWorkcell):
         """Return the convex pieces of the socket.
 
         Raises:
-            InputError: If the part has none; without them, nothing would be in the plug's way.
+            InputError: If the socket has no convex pieces, so that the plug would touch nothing.
         """
         return self._surfaces(SOCKET, self.convex[1])
 
     def workpiece_surfaces(self) -> list[Surface]:
-        """Return the convex pieces of the plug; as `fixture_surfaces`."""
+        """Return the convex pieces of the plug; raises like `fixture_surfaces`."""
         return self._surfaces(PLUG, self.convex[0])
 
     def _surfaces(self, body: str, files: Sequence[str]) -> list[Surface]:

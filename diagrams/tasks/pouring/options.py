@@ -15,20 +15,20 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, Ball
 from guiderail.models.templates import SharedControlTemplate, load_template
 
-FULL_SPEED = 0.15  # speed of a full input along one axis [m/s]
-FULL_TILT = 0.8  # [rad/s]
-SPARSE_INPUT_SPEED = 1.7  # a sparse reward is only found if random inputs sometimes succeed
+FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]
+FULL_TILT = 0.8  # tilting speed at an input of 1 [rad/s]
+SPARSE_INPUT_SPEED = 1.7  # default input_speed with the sparse reward: random inputs must sometimes succeed
 
 
 def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
-    """Pouring template for this scene's vessels, with all speeds multiplied by `input_speed`."""
+    """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`."""
     return _load("pouring", config, input_speed)
 
 
 def make_aimed_template(
     config: PouringConfig, input_speed: float, aim_speed: float, pour_speed: float
 ) -> SharedControlTemplate:
-    """Return the template that can be aimed in Pour; `aim_speed` and `pour_speed` are fractions of its full speeds."""
+    """Return the template with aiming in the state Pour; `aim_speed` and `pour_speed` are fractions of full speeds."""
     return _load("pouring_aimed", config, input_speed, aim_speed=aim_speed, pour_speed=pour_speed)
 
 
@@ -44,15 +44,15 @@ def _load(name: str, config: PouringConfig, input_speed: float, **others: float)
 
 
 def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
-    """The poses of a template's objects for a mug at its actual or estimated position."""
+    """Return the poses of a template's objects for a mug at X_TMug, its actual or estimated pose."""
     if "behind_mug" in template.frames:
         return {"behind_mug": X_TMug @ RigidTransform([0.0, template.parameters["behind_m"], 0.0])}
     return {"mug_tip": X_TMug}
 
 
-MAX_MUG_OFFSET = 0.04  # [m] along x and y; beyond it the arm reaches few of the starts
-POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in the observation
-MAX_MUG_ERROR = 0.06  # [m] largest distance that an aimed Pour leads from the estimated mug position
+MAX_MUG_OFFSET = 0.04  # [m] largest mug offset along x and y; beyond it the arm reaches few of the starts
+POSITION_SCALE = 5.0  # [1/m] scale with which observed positions near the mug are as large as observed angles
+MAX_MUG_ERROR = 0.06  # [m] largest distance from the estimated mug position that aiming can reach
 
 HARD: Mapping[str, Any] = {
     "aim": True,
@@ -114,7 +114,7 @@ class PouringOptions(Options):
         )
 
     def check(self) -> None:
-        """Refuse incompatible options.
+        """Check that the options are compatible.
 
         Raises:
             InputError: If the least error is larger than the largest one, more balls are needed than there are, or the

@@ -12,19 +12,19 @@ REWARDS = ("sparse", "shaped", "hand_shaped")
 TERMINAL = {"success": 200.0, "collision": -10.0}  # equation 3.5
 SHAPING = 200.0  # equation 3.7
 APPROACH = 15.0  # [1/m] equation 3.9
-NEAR_BONUS = 0.2  # per action
+NEAR_BONUS = 0.2  # bonus per action within `NEAR`
 TILT = 20.0  # [1/rad] equation 3.10
-NEAR = 0.07  # [m] distance at which pouring begins; the rims of these vessels keep the tips beyond the thesis's 0.04
-POUR = 2  # the template's state in which it pours
-AIM = np.array([0.0, -0.045])  # [m] place of the tip in the mug's frame from which both balls are poured
-AIMING = 2000.0  # [1/m] 50 mm are worth half of the whole tilt
+NEAR = 0.07  # [m] distance of the tips at which pouring begins: the rims keep them beyond the 0.04 of the thesis
+POUR = 2  # index of the template's state Pour
+AIM = np.array([0.0, -0.045])  # [m] position of the tip in the mug's frame from which both balls fall into the mug
+AIMING = 2000.0  # reward per distance gained towards `AIM` [1/m]: 50 mm earn half as much as the whole tilt
 
 
 def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = False) -> list[RewardTerm]:
     """Return the terms of a reward, one of `REWARDS`.
 
     The reward of an action is the sum over its control steps. Values that the thesis defines per action are therefore
-    divided by `action_repeat`. If Pour can be aimed, "shaped" includes the distance gained towards the aim in Pour.
+    divided by `action_repeat`. If `aimed`, "shaped" includes the distance gained towards `AIM` in the state Pour.
 
     Raises:
         InputError: If there is no such reward.
@@ -61,7 +61,7 @@ def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = Fal
 
 
 def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarray) -> float:
-    """Return the reward towards the aim in the state Pour."""
+    """Return the reward for the distance gained towards `AIM` in the state Pour."""
     if state[0] != POUR:
         return 0.0
     before, after = (float(np.linalg.norm(tip[:2] - AIM)) for tip in (last_tip_in_mug, tip_in_mug))
@@ -69,14 +69,14 @@ def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarr
 
 
 def _approach(tip: np.ndarray, last: np.ndarray, action_repeat: int) -> float:
-    """Return equation 3.9."""
+    """Return the reward of equation 3.9."""
     distance = np.linalg.norm(tip[:3])
     bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
     return float(APPROACH * (np.linalg.norm(last[:3]) - distance) + bonus)
 
 
 def _tilting(tip: np.ndarray, last: np.ndarray) -> float:
-    """Return equation 3.10; the thermos comes from the mug's −y side, so a negative roll pours."""
+    """Return the reward of equation 3.10; the thermos is on the mug's −y side, so that a negative roll pours."""
     change = _euler(tip) - _euler(last)
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
     if np.linalg.norm(tip[:3]) > NEAR:

@@ -44,10 +44,10 @@ if TYPE_CHECKING:
 
 
 def sample_mug_error(episode: np.random.Generator, options: PouringOptions, reset: PouringReset) -> np.ndarray:
-    """Sample (x, y) [m] from the mug to the estimated mug position, also if a reset's option replaces it.
+    """Return (x, y) [m] from the actual to the estimated mug position: sampled, or the reset option `mug_error`.
 
     Raises:
-        InputError: If the reset's option is farther than an aimed Pour leads.
+        InputError: If the reset option is longer than `MAX_MUG_ERROR`.
     """
     error = in_ring(episode, options.mug_error_least, options.mug_error_most)
     if reset.mug_error is None:
@@ -60,7 +60,7 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
 def termination_terms(config: PouringConfig, needed: int) -> list[TerminationTerm]:
     """Return the termination terms; a collision has priority, so that an episode that touched the mug is no success.
 
-    An episode is spilled if fewer balls than are `needed` in the mug can still get there.
+    An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug.
     """
     mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2
     fall = config.mug.height + config.stand_height
@@ -93,7 +93,7 @@ MAX_TRACKING_ERROR = 0.05  # [m]
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
 START_HEIGHT = (0.08, 0.19)  # [m]
-MAX_START_SAMPLES = 20  # samples of an unreachable start before the reset fails
+MAX_START_SAMPLES = 20  # number of samples, all unreachable, after which the reset fails
 
 
 # Indices into the observation [tip in the mug's frame, error of the estimated mug pose, template's state].
@@ -101,12 +101,12 @@ ERROR, STATE = slice(6, 8), 8
 
 OVER_THE_RIM = (0.045, 0.055)  # [m] goal of the tip: distance from the mug's axis, height above its rim
 POURING_DISTANCE = 0.078  # [m] distance from the mug's opening below which the inputs are only horizontal
-SOFTNESS = 0.03  # [m] distance from the goal below which the inputs are proportional to it
+SOFTNESS = 0.03  # [m] distance from the goal below which the inputs are proportional to this distance
 
-AIM_OVER_THE_RIM = (0.03, 0.045)  # [m] the same for the estimated mug pose; reached, state Pour begins
-AIM_SOFTNESS = 0.02  # [m] distance from the aim below which the inputs are proportional to it
+AIM_OVER_THE_RIM = (0.03, 0.045)  # [m] goal of the tip at the estimated mug, at which the state Pour begins
+AIM_SOFTNESS = 0.02  # [m] distance from the aim below which the inputs are proportional to this distance
 AIM_TOLERANCE = 0.008  # [m] distance from the aim below which the policy tilts the thermos
-POURING_TILT = 95.0  # [degrees] tilt above which the policy always continues, because the balls roll
+POURING_TILT = 95.0  # [degrees] tilt above which the policy always tilts further, because the balls already roll
 
 
 def scripted_pour(observation: np.ndarray) -> np.ndarray:
@@ -151,9 +151,9 @@ def _tilt(observation: np.ndarray) -> float:
 class Pouring(Task):
     """Pour both balls into the mug.
 
-    Rewards: "sparse" is (3.5, 3.6), "shaped" adds the template's transition distances (3.7), "hand_shaped" is (3.8 to
-    3.10). With the standard template a constant action pours. With difficulty="hard" the mug is not where the template
-    assumes.
+    Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
+    "hand_shaped" follows 3.8 to 3.10. With the standard template a constant action pours. With difficulty="hard" the
+    mug is not where the template assumes.
     """
 
     workcell_kind = "pouring"
@@ -198,14 +198,14 @@ class Pouring(Task):
         return self._scene_config
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Return the error of the estimated mug position, if Pour can be aimed."""
+        """Return the error of the estimated mug position, if the option `aim` is set."""
         if not self.options.aim:
             return {}
         self.episode_constants["mug_error"] = EpisodeConstant(builder, "mug_error", 2)
         return {"mug_error": self.episode_constants["mug_error"].port}
 
     def template(self) -> PlacedTemplate:
-        """Return the template of figure 2.2 and table 3.3, or the one that can be aimed."""
+        """Return the template of the thesis (figure 2.2, table 3.3), or the template with aiming in the state Pour."""
         active = self.config.options["active_constraints"]
         return PlacedTemplate(
             self._template,
@@ -215,9 +215,9 @@ class Pouring(Task):
         )
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Return the tip's pose in the frame of the mug's tip, position in units of 0.2 m and a rotation vector.
+        """Return the tip's pose in the frame of the mug's tip: position in units of 0.2 m, then rotation vector.
 
-        If Pour can be aimed, the error of the estimated mug position and the template's state, from −1 to 1, follow.
+        With the option `aim`, the error of the estimated mug position and the template's state, from −1 to 1, follow.
         """
         tip = ObservationTerm("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3)
         return (
@@ -227,7 +227,7 @@ class Pouring(Task):
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of equations 3.5 to 3.10, and of aiming."""
+        """Return the terms of the reward `config.reward`."""
         return reward_terms(self.config.reward, num_actions, self.config.action_repeat, self.options.aim)
 
     def termination_terms(self) -> list[TerminationTerm]:
@@ -239,7 +239,7 @@ class Pouring(Task):
     ) -> dict[str, Any]:
         """Place the mug, the upright thermos and the balls at sampled poses; an unreachable start is sampled again.
 
-        Values that an option replaces are sampled too.
+        Values that a reset option replaces are sampled nevertheless.
         """
         assert isinstance(station, PouringStation)
         episode = episode_stream(rng, options.held_out)
@@ -253,10 +253,10 @@ class Pouring(Task):
             if np.abs(p_TMug).max() > MAX_MUG_OFFSET:
                 raise InputError(f"the mug can be moved by {MAX_MUG_OFFSET} m along x and y: not more")
             error = sample_mug_error(episode, self.options, options)
-            # The estimated mug position stays within reach; the actual mug is moved.
+            # The error moves the actual mug, so that the estimated mug position stays within reach.
             estimated, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
             frames = frames_of(self._template, estimated)
-            # Turned as in the template's first state, so that all kinds of guidance start from the same pose.
+            # The thermos is turned as in the template's first state, so that all kinds of guidance start at one pose.
             X_TP = self._template.project(self._template.initial_state, RigidTransform(estimated @ p_MP), frames)
             try:
                 station.set_pose(context, transform_to_pose(X_TP))
@@ -285,7 +285,7 @@ class Pouring(Task):
         return Camera((480, 360), np.deg2rad(40), look_at(target - forward, target))
 
     def scene(self) -> Scene:
-        """Return the drawing of the tip's paths."""
+        """Return the frame, viewpoint and line width in which the tip's paths are drawn."""
         center = self._scene_config.X_WT.translation()
         to_world = in_frame(self._scene_config.X_WT)
         return Scene(to_world, viewpoint=viewpoint(center + [0.25, -0.5, 0.25], center), line_radius=0.001)

@@ -4,7 +4,7 @@ The scripted demonstrator replaces the human hand of the thesis (section 4.4.2).
 approaches the jack roughly, wanders over the rim with a light push until the plug drops in, is precise where the
 connector guides the motion, and varies its speed. It moves the *desired* pose of a station with impedance control. The
 file holds the commanded and the measured poses. A primitive learns the commanded ones, because the push is the
-difference of both.
+difference between commanded and measured poses.
 
 `python -m research.generate connector-demonstrations` records them again.
 """
@@ -60,7 +60,7 @@ _DEVIATIONS = {
 }
 _CORRELATION = {"x": 0.22, "y": 0.22, "z": 0.35, "Rz": 0.5, "Ry": 0.3, "Rx": 0.3}  # correlation times [s]
 _CENTRING = 0.9  # part of the mean of the five random curves that is removed
-_TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and correlation time of the lead [s]
+_TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and correlation time of the lead in time [s]
 
 
 def poses(z: np.ndarray | float, yaw: np.ndarray | float) -> np.ndarray:

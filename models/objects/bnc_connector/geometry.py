@@ -30,7 +30,7 @@ BORE_SIDES = 24  # sides of the polygon that approximates the bore
 
 @dataclass(frozen=True)
 class BncDimensions:
-    """Dimensions in meters and radians; depths and heights of the slot are those of the lug's center from the mouth."""
+    """Dimensions in meters and radians; heights of the slot are those of a lug's center above the mouth."""
 
     barrel_radius: float = 4.825 * MM
     barrel_height: float = 10.0 * MM
@@ -69,7 +69,7 @@ class BncDimensions:
         return round(self.bore_radius - self.barrel_radius, 9)
 
     def with_bore_clearance(self, clearance: float) -> "BncDimensions":
-        """Return the connector with a bore of another clearance."""
+        """Return the dimensions with a bore of another clearance."""
         return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
 
     @property
@@ -175,7 +175,7 @@ def _faces_between_entries(
 
 
 def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
-    """Return the collision mesh of the lugs: the slots' walls, and the mouth's face with chamfers at the entries."""
+    """Return the mesh that collides with the lugs: walls of the slots, and the mouth's face with chamfered entries."""
     d = dimensions
     outer_radius = d.bore_radius + d.slot_depth
     walls = _slot_walls(d, outer_radius, d.mouth_chamfer)
@@ -186,7 +186,7 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
 
 
 def bore_mesh(dimensions: BncDimensions, equal_area: bool = False) -> TriangleMesh:
-    """Return the collision mesh of the barrel: the mouth's face, its chamfer and the bore.
+    """Return the mesh that collides with the barrel: the mouth's face, its chamfer and the bore.
 
     The bore is a polygon around the true circle, or with `equal_area` a polygon of the same area.
     """

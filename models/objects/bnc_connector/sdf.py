@@ -23,8 +23,8 @@ from guiderail.models.objects.sdf import (
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
 FRICTION = 0.2  # metal on metal
-# Without a margin the plug penetrates by its motion in a step of 10 ms, and the next step ejects it. With one, fast
-# sliding is decelerated by more than friction, depending on the step (`python -m research.benchmarks engines`).
+# Without a margin the plug penetrates by its motion in a step of 10 ms, and the next step ejects it. With a margin,
+# fast sliding is decelerated by more than friction, depending on the step (`python -m research.benchmarks engines`).
 MARGIN = 0.1 * MM
 # Stiffness of brass. A softer barrel distributes the load of a rim, which results in a torque on a misaligned plug that
 # metal parts do not have (docs/experiments.md, "Where a plug on the rim feels its force").
@@ -48,7 +48,7 @@ def jack_sdf(
 ) -> str:
     """Return the jack's model: link `jack` is frame J, with geometry `barrel`, `pad`, `lug_0` and `lug_1`.
 
-    The collision geometry of the barrel is a polygon in the circle, or with `equal_area` one of the same area.
+    The collision geometry of the barrel is an inscribed polygon, or with `equal_area` a polygon of the same area.
     """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
@@ -95,7 +95,7 @@ def files(
 def folder_of(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> Path:
-    """Return the folder with a connector's files: this one, or a temporary one for other dimensions."""
+    """Return the folder with a connector's files: that of this module, or a temporary one for other dimensions."""
     if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
         return FOLDER
     return generate_assets(files, dimensions, friction, margin, equal_area)

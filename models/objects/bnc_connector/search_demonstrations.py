@@ -3,11 +3,11 @@
 The demonstrator circles around the expected position of the jack with a light push, and then inserts the plug. The five
 circles begin a fifth of a turn apart. At every time of the search the five lie evenly on a circle: their mean is its
 center, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
-the same effect in every direction of the whole search.
+the same effect in every direction during the whole search.
 
 There are two sets. The push of "search" is light. That of "firm_search", recorded on an arm, is four times as large.
-The torque of the rim shows on which side of it the plug stands: with the firm push it is as large as the errors of an
-arm's joint torques, with the light push a quarter of them.
+The torque from the rim shows on which side of the rim the plug stands. With the firm push this torque is as large as
+the errors of an arm's joint torques, with the light push it is a quarter of these errors.
 
 `python -m research.generate connector-search-demonstrations` and `connector-firm-search-demonstrations` record them
 again.

@@ -9,7 +9,7 @@ from guiderail.models.objects.bnc_connector.sdf import FRICTION, PAD
 from guiderail.models.objects.sdf import cylindrical
 from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
 
-MAX_ANGLE = np.deg2rad(6.0)  # of a prism about the axis; its flat face is then 7 µm inside the circle
+MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism about the axis; its flat face is then 7 µm inside the circle
 # A rigid disc on a spring models the gasket, with the force of Drake's pad within 15 % up to 0.6 mm.
 PAD_STIFFNESS = 1.5e5  # [N/m]
 
@@ -44,7 +44,7 @@ def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
 
 
 def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """Return the pieces of the ring around the barrel, the same polygon as `bore_mesh`."""
+    """Return the convex pieces of the ring around the barrel, with the polygonal surface of `bore_mesh`."""
     d = dimensions
     profile = [
         [d.bore_radius + d.mouth_chamfer, 0.0],
@@ -57,7 +57,7 @@ def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
 
 
 def slot_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """Return the pieces of the ring with both slots cut: prisms over, under and between the slots."""
+    """Return the convex pieces of the ring with both slots cut: prisms over, under and between the slots."""
     outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_between_the_slots(dimensions)]
     return [_prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines]
 

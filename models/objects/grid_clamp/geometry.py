@@ -6,7 +6,7 @@ on the table.
 
 Contact. Every hole is an open rigid surface that collides only with its own peg: the face around it, a chamfer and a
 short wall, because a wall of the hole's full depth would take half of the simulation time. Pegs are compliant convex
-solids with as many sides as their holes, so that few triangles leave the full clearance. The middle hole has a lip and
+solids with as many sides as their holes, so that few triangles keep the full clearance. The middle hole has a lip and
 the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains the clamp. The body
 is a soft pad, thick enough for impacts, that collides only with the table's slab.
 
@@ -30,7 +30,7 @@ NUM_VISUAL_SIDES = 12  # sides of a polygon in visual geometry
 
 @dataclass(frozen=True)
 class GridClampDimensions:
-    """Dimensions in meters; a radius is that of the circle inside the polygon, a depth is from the table's face."""
+    """Dimensions in meters; a radius is that of the circle inside the polygon, depths are from the table's face."""
 
     peg_radius: float = 4.0 * MM
     peg_length: float = 12.0 * MM  # from the shoulder to the tip
@@ -41,14 +41,14 @@ class GridClampDimensions:
     hole_chamfer: float = 0.5 * MM
     hole_land: float = 3.0 * MM  # height of the wall; the hole is wider below
     hole_depth: float = 13.0 * MM
-    face_radius: float = 14.0 * MM  # radius of the table's face for a misaligned peg
+    face_radius: float = 14.0 * MM  # radius of the face around a hole, for a misaligned peg
 
     lip_radius: float = 4.15 * MM
     lip_depth: float = 0.6 * MM  # depth of the narrow part
     lip_land: float = 0.4 * MM
     lip_flank: float = 0.4 * MM  # size of the flanks, at 45 degrees
     bead_radius: float = 4.35 * MM
-    bead_depth: float = 1.5 * MM  # depth of its crest with the shoulder on the table
+    bead_depth: float = 1.5 * MM  # depth of the bead's crest with the shoulder on the table
     bead_entry: float = 1.2 * MM  # length of the flank that meets the lip first
     bead_exit: float = 0.6 * MM
 

@@ -31,7 +31,7 @@ from guiderail.models.objects.sdf import (
 STEEL, ALUMINIUM, ANODIZED = "0.62 0.64 0.68 1", "0.80 0.81 0.82 1", "0.20 0.35 0.60 1"
 GLASS = "0.20 0.35 0.60 0.3"  # transparent body, so that pegs and holes are visible
 
-FRICTION = 0.2  # pegs, holes and the table's face
+FRICTION = 0.2  # friction coefficient of pegs, holes and the table's face
 PEG = ContactMaterial(friction=FRICTION, modulus=5e8)
 BEAD = ContactMaterial(friction=0.1, modulus=2e7)
 PAD = ContactMaterial(friction=FRICTION, modulus=1e6)
@@ -40,7 +40,7 @@ LIP = ContactMaterial(friction=0.1)
 SLAB = ContactMaterial(friction=FRICTION)
 
 CLAMP_MASS = 0.15  # [kg]
-STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # stem by which it is held
+STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # stem by which the clamp is held
 
 
 def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
@@ -90,7 +90,7 @@ def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[s
 
 
 def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
-    """Return the folder with the files of a clamp and its table: this one, or a temporary one for other dimensions."""
+    """Return the folder with the files of clamp and table: that of this module, or a temporary one."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
     return generate_assets(files, dimensions, friction)

@@ -1,8 +1,8 @@
 """Nine synthetic demonstrations through the narrow passage.
 
-They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), which are not published. Like those they
-are smooth, have the same start, goal and duration, vary where the plane is free and agree in the passage. They ignore
-the obstacle and the restricted zone: their mean crosses the obstacle, and two of them enter the zone.
+They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), which are not published. Like those,
+they are smooth, have the same start, goal and duration, vary where the plane is free and agree in the passage. They
+ignore the obstacle and the restricted zone: their mean crosses the obstacle, and two of them enter the zone.
 """
 
 from pathlib import Path
@@ -45,7 +45,7 @@ _DEVIATION_Y = [
     (0.95, 0.01),
     (1, 0.01),
 ]
-_Y = (0.05, 0.95)  # of start and goal [m]
+_Y = (0.05, 0.95)  # y of start and goal [m]
 _ARRIVAL = 0.95  # part of the duration after which the goal is reached
 _CORRELATION = 0.22  # correlation time of the deviations, as part of the duration
 _CENTRING = 0.7  # part of the mean of the nine random curves that is removed

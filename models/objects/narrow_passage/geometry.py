@@ -17,15 +17,15 @@ class PassageGeometry:
         start, goal: Start and goal (x, y) of the robot.
         goal_radius: Distance within which the goal is reached.
         wall_y: Lower and upper face of the two walls.
-        gap_x: Left and right side of the gap between them.
+        gap_x: Left and right side of the gap between the walls.
         wall_length: Length of each wall, beyond the reach of the robot.
         zone_x: Lower bound of x in the restricted zone.
         obstacle, obstacle_radius: Disc on the path of the demonstrations, which were recorded without it. It has a
             cost and does not collide.
-        second_obstacle: Another such disc, or None.
+        second_obstacle: Position of a second such disc, or None.
         obstacles_move: True if the positions of the discs are sampled in every episode.
         obstacle_margin: Distance from a disc within which it has a cost.
-        robot_radius: Radius of the robot; its visible walls are smaller by it than those of the center.
+        robot_radius: Radius of the robot; the visible walls are smaller by this radius than those for its center.
     """
 
     start: tuple[float, float] = (0.30, 0.05)
@@ -78,16 +78,16 @@ class PassageGeometry:
 
         Args:
             pose: Pose of the robot (2,) [m].
-            obstacle: Position (x, y) of the obstacle; None: that of `obstacle`.
+            obstacle: Position (x, y) of the obstacle; that of `obstacle` by default.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius
 
     def obstacle_cost(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
-        """Return the cost r_o of one obstacle (equation 4.24)."""
+        """Return the cost r_o of one obstacle as a negative reward (equation 4.24)."""
         return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose, obstacle), 0.0)
 
 
 def action_cost(displacement: np.ndarray) -> float:
-    """Return the cost r_a of the robot's displacement (2,) [m] in a control step (equation 4.23)."""
+    """Return the cost r_a of a displacement (2,) [m] in a control step, as a negative reward (equation 4.23)."""
     return -10.0 * float(displacement @ displacement)

@@ -24,8 +24,8 @@ class Vessel:
 
     inner_diameter: float  # [m]
     depth: float  # inner depth [m]
-    wall: float = 0.004  # [m]
-    bottom: float = 0.006  # [m]
+    wall: float = 0.004  # thickness [m]
+    bottom: float = 0.006  # thickness [m]
     mass: float = 0.3  # [kg]
 
     def __post_init__(self) -> None:
@@ -77,7 +77,7 @@ class Ball:
 
     diameter: float = 0.040  # [m]
     mass: float = 0.0027  # [kg]
-    # A stiff ball needs a short plant step. With this stiffness and 2 ms no ball passed through a vessel's wall.
+    # A stiff ball needs a short plant step. With this stiffness and a step of 2 ms no ball passed through a wall.
     stiffness: float = 1e3  # [N/m]
     dissipation: float = 0.5  # [s/m]
 

@@ -38,11 +38,11 @@ _ALSO = {
     "ns": ("nsec",),
 }  # other spellings of units
 _SAME_UNIT = {other: unit for unit, others in _ALSO.items() for other in others}
-_PERIODS = (1e-4, 1.0)  # plausible sampling periods of a robot [s]; other values mean another unit
+_PERIODS = (1e-4, 1.0)  # range of plausible sampling periods of a robot [s]; a step outside means another unit
 _PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
 _NO_POSE = re.compile(
     r"(?:.*[._/ ])?(v|vel|velocity|speed|twist|omega|gyro|acc|accel|acceleration|f|force|torque|wrench)[._/ ].*"
-)  # prefixes of an axis that is not one of the position
+)  # names of axes of other quantities than a pose
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
 _EULER = (("roll", "pitch", "yaw"), ("rx_rpy", "ry_rpy", "rz_rpy"))
 _UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
@@ -83,13 +83,13 @@ def read_csv_files(
     Args:
         path: File, or a folder of files.
         unit: Unit of positions, m, cm or mm, for columns without a unit in their name.
-        time_unit: Unit of time, s, ms, us or ns, if neither its name nor its step determines it.
+        time_unit: Unit of time, s, ms, us or ns, if neither the column's name nor its step size determines it.
         quaternion: Order of numbered quaternion columns, "xyzw" or "wxyz".
         angles: Unit of roll, pitch and yaw, "deg" or "rad", for columns without a unit in their name.
         target: See `poses_in_target`.
 
     Raises:
-        InputError: If a file is invalid, does not state a unit that has to be given, or states another one.
+        InputError: If a file is invalid, a unit is neither stated nor given, or both are and differ.
     """
     for option, given, known in (
         ("--unit", unit, UNITS),
@@ -164,7 +164,7 @@ def _table(file: Path) -> list[_Column]:
     """Return the columns of a table, empty fields as NaN.
 
     Raises:
-        InputError: If it is not a table of numbers, or a line has more or fewer fields than the header.
+        InputError: If the file is not a table of numbers, or a line has more or fewer fields than the header.
     """
     try:
         data = read_bytes(file, "table", MAX_FILE_SIZE)
@@ -194,7 +194,7 @@ def _table(file: Path) -> list[_Column]:
 def _units(
     file: Path, columns: Sequence[_Column], known: Collection[str], given: str | None, option: str
 ) -> list[str | None]:
-    """Return the unit of each column: that of its own name, else the given one.
+    """Return the unit of each column: the one in its name, else the given one.
 
     Raises:
         InputError: If a column states another unit than the given one, or an unknown one.
@@ -214,7 +214,7 @@ def _unit_of_name(file: Path, name: str, known: Collection[str]) -> str | None:
     """Return the unit in a column's name, in brackets or as its ending; None if it has neither.
 
     Raises:
-        InputError: If it has brackets without a known unit.
+        InputError: If the name has brackets that contain no known unit.
     """
     plain = unicodedata.normalize("NFKC", name).lower()  # maps the micro sign to the Greek letter
     if inside := [text.strip() for text in re.findall(r"[\[(]([^\[\]()]*)", plain)]:
@@ -234,7 +234,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | None:
-    """Return the column `wanted`, or the only position whose name ends in it; None if there is none.
+    """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if there is none.
 
     Raises:
         InputError: If there are several.
@@ -274,7 +274,7 @@ def _time(
     if not (steps > 0.0).any():
         raise InputError(f"{file}: time, which is {clock.name}, does not increase: a motion needs increasing time")
     if unit is None:
-        step = float(np.median(steps[steps > 0.0]))  # a recorder faster than its robot logs samples twice
+        step = float(np.median(steps[steps > 0.0]))  # a recorder faster than the robot repeats time stamps
         fitting = [name for name, scale in _TIME_UNITS.items() if _PERIODS[0] <= step * scale < _PERIODS[1]]
         if fitting[:1] != ["s"]:
             candidates = " or ".join(fitting) or "s, ms, us or ns"

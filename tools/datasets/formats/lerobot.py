@@ -1,4 +1,4 @@
-"""LeRobot datasets of version 3, read and written with pyarrow: LeRobot itself requires other versions of packages."""
+"""LeRobot datasets of version 3, read and written with pyarrow, because LeRobot requires other package versions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
         signal: Feature of one dimension, such as action; the only candidate by default.
 
     Raises:
-        InputError: If it is not such a dataset, or several features could be imported.
+        InputError: If the folder is not such a dataset, or several features could be imported.
     """
     import pyarrow.parquet as parquet
 
@@ -56,7 +56,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     try:
         tables = [parquet.read_table(file, columns=columns) for file in files]
         values = np.concatenate([np.array(table[chosen].to_pylist(), dtype=float) for table in tables])
-        values = values.reshape(len(values), -1)  # a feature of one number is stored as numbers, not as lists of one
+        values = values.reshape(len(values), -1)  # a feature of size 1 is stored as scalars, not as lists
         frames, episodes = (
             np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
         )

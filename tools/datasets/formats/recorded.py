@@ -25,7 +25,7 @@ class Recorded:
         times: Times (N_m,) of each motion [s].
         outputs: Outputs (N_m, O) of each motion.
         names: Names of the outputs.
-        assumptions: Sentences on what the file does not state.
+        assumptions: Assumptions about facts that the file does not state, one sentence each.
     """
 
     times: list[np.ndarray]
@@ -39,7 +39,7 @@ def rotations_of(quaternions: np.ndarray, where: str) -> Rotation:
 
     Args:
         quaternions: Quaternions.
-        where: Name of their file, for the message.
+        where: Name of the file, for the message.
 
     Raises:
         InputError: If a quaternion is not of length one, or contains NaN.
@@ -65,9 +65,10 @@ def poses_in_target(
     Args:
         positions: Positions (N, 3) in the recording's frame [m].
         rotations: Rotations (N,) in the recording's frame.
-        target: Target in that frame, [x y z] in meters and [rx ry rz] in degrees; None keeps the recording's frame.
-        like: Poses of an earlier demonstration, (N', 6). Of all equivalent angles, those nearest to its angles are
-            returned: a full turn between two demonstrations would be learned as their spread.
+        target: Pose of the target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees;
+            None keeps the recording's frame.
+        like: Poses of an earlier demonstration, (N', 6). Angles are shifted by full turns to be nearest to the angles
+            of these poses, because a full turn between two demonstrations would be learned as variance.
     """
     if target is not None:
         turn = Rotation.from_euler("xyz", np.asarray(target[3:], dtype=float), degrees=True)
@@ -81,7 +82,7 @@ def poses_in_target(
 
 
 def describe_time_shift(demonstrations: Demonstrations) -> list[str]:
-    """Return a sentence if demonstrations do not start at time zero, to which an export shifts them; else nothing."""
+    """Return a remark that an export shifts demonstrations to start at time zero; nothing if all start there."""
     starts = sorted(float(t[0]) for t in demonstrations.times)
     if not any(starts):
         return []
@@ -97,7 +98,7 @@ def is_commanded(name: str) -> bool:
 def choose_signal(candidates: Sequence[str], given: str | None, where: str, option: str) -> tuple[str, list[str]]:
     """Return the signal that is imported, with the assumption made.
 
-    It is the given one, else the only one, else the only commanded one, which a primitive should learn.
+    It is the given one, else the only candidate, else the only commanded one, because primitives should learn commands.
 
     Args:
         candidates: Names of all signals.
@@ -106,7 +107,7 @@ def choose_signal(candidates: Sequence[str], given: str | None, where: str, opti
         option: Option that takes the name, for messages.
 
     Raises:
-        InputError: If that does not determine one signal.
+        InputError: If these rules do not determine one signal.
     """
     if not candidates:
         raise InputError(f"{where} holds no poses, transforms or joint positions: nothing can be imported")

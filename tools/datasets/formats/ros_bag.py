@@ -20,7 +20,7 @@ from guiderail.tools.datasets.formats.recorded import (
 )
 from guiderail.tools.files import atomic_folder, in_order
 
-# Attributes that lead to the pose in a message, by its type.
+# Attributes that lead to the pose in a message, by message type.
 POSES = {
     "geometry_msgs/msg/PoseStamped": ("pose",),
     "geometry_msgs/msg/Pose": (),
@@ -46,7 +46,7 @@ def _rosbags() -> Any:
 
 
 def find_bags(path: Path) -> list[Path]:
-    """Return the bag at a path, or those in the folder, sorted by name."""
+    """Return the bag at a path, or all bags in the folder, sorted by name."""
     if path.suffix == ".mcap" or (path / "metadata.yaml").is_file():
         return [path]
     return in_order(one for one in path.iterdir() if one.suffix == ".mcap" or (one / "metadata.yaml").is_file())
@@ -103,7 +103,7 @@ def _read_bag(
         rows = [(stamp, reader.deserialize(raw, kinds[chosen])) for _, stamp, raw in reader.messages(connections)]
     except InputError:
         raise
-    except Exception as error:  # as above
+    except Exception as error:  # the reader raises many types for damaged messages
         raise InputError(f"{bag} holds a message that cannot be read: {brief(str(error))}") from error
     finally:
         reader.close()
@@ -139,7 +139,7 @@ def _read_bag(
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
     """Return positions (N, J) in the order of the first message's names; the order may differ in every message.
 
-    Messages of other joints are refused instead of skipped, because the topic's first message is arbitrary.
+    Messages of other joints are refused instead of skipped, because any device may have sent the first message.
     """
     expected = list(messages[0].name)
     rows = []
@@ -160,7 +160,7 @@ def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
 
 
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
-    """Return the time since the first message [s] (N,), by its stamps where they increase, with remarks."""
+    """Return the time since the first message [s] (N,), from the header stamps if they increase, with remarks."""
     headers: list[Any] = [getattr(message, "header", None) for _, message in rows]
     if all(header is not None for header in headers):
         stamps = np.array([header.stamp.sec * 10**9 + header.stamp.nanosec for header in headers], dtype=np.int64)
@@ -195,7 +195,7 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
     """Write a folder of ROS 2 bags in MCAP, one per demonstration, as arrays with named dimensions; return remarks.
 
     Raises:
-        InputError: If a bag cannot represent their time, or the folder cannot be written.
+        InputError: If a bag cannot represent the demonstrations' times, or the folder cannot be written.
     """
     _rosbags()
     from rosbags.rosbag2 import StoragePlugin, Writer

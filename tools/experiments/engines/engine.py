@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 
-MAX_ATTEMPTS = 3  # workers that a job may lose before it is given up, because it may be the job that kills them
+MAX_ATTEMPTS = 3  # lost workers after which a job is given up, because the job itself may kill them
 GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
 
 
@@ -21,7 +21,7 @@ class Outcome:
 
     Attributes:
         rows: Rows of its table.
-        failure: One sentence why there are none; empty if the job succeeded.
+        failure: One sentence on why the job failed; empty if it succeeded.
     """
 
     rows: tuple[dict[str, Any], ...] = ()
@@ -34,11 +34,11 @@ Work: TypeAlias = Callable[[Any], Outcome]
 class Engine(AbstractContextManager[Any]):
     """Engine that runs jobs on workers, one at a time per worker and with one thread.
 
-    Use it as a context: entering it finds or prepares the workers, and leaving it ends all that it started, also after
-    an error. A job resumes from its folder, so the job of a lost worker is given to another one.
+    An engine is a context manager: entering it finds or prepares the workers, and leaving it ends all processes that it
+    started, also after an error. A job resumes from its folder, so the job of a lost worker is given to another worker.
 
     Attributes:
-        processes: Number of jobs that run at once; None if the engine does not decide it.
+        processes: Number of jobs that run at once; None if the engine does not set it.
     """
 
     processes: int | None = None
@@ -48,7 +48,7 @@ class Engine(AbstractContextManager[Any]):
         """Yield keys and outcomes of the jobs as they finish, in any order.
 
         Args:
-            work: Function of a job; it can be pickled and raises nothing.
+            work: Function from a job to its outcome; it can be pickled and raises nothing.
             jobs: Jobs by key; they can be pickled.
         """
 
@@ -64,7 +64,7 @@ register_engine = ENGINES.register
 
 
 def make_engine(name: str = "process", processes: int | None = None, address: str | None = None) -> Engine:
-    """Return the engine of a registered name for a number of jobs at once, or for the address of a cluster.
+    """Return the engine registered as `name`, for `processes` jobs at once or for the cluster at `address`.
 
     Raises:
         InputError: If the name is unknown, or an argument is out of range or not supported by the engine.

@@ -19,7 +19,7 @@ DEFAULT_PROCESSES = 2
 
 @register_engine("process")
 class ProcessEngine(Engine):
-    """Processes of this machine; a single one is the current process."""
+    """Engine of processes on this machine; with one process, jobs run in the current process."""
 
     def __init__(self, processes: int | None = None, address: str | None = None):
         """Construct the engine with a number of processes, 2 by default; raise an InputError if `address` is given."""
@@ -61,7 +61,7 @@ class ProcessEngine(Engine):
                 self._workers.append(worker)
             if worker.begin(waiting[0], jobs[waiting[0]]):
                 waiting.popleft()
-            else:  # it died while idle
+            else:  # the worker died while idle
                 self._workers.remove(worker)
 
     def __exit__(self, *error: object) -> None:
@@ -80,7 +80,7 @@ class _Worker:
         self.key: int | None = None
         self._process = context.Process(target=_serve, args=(child_connection, work), daemon=True)
         self._process.start()
-        child_connection.close()  # the connection then ends with the process
+        child_connection.close()  # so that the connection closes when the process ends
 
     def begin(self, key: int, job: Any) -> bool:
         """Send a job; return False if the process has ended."""
@@ -92,7 +92,7 @@ class _Worker:
         return True
 
     def finish(self) -> tuple[int, Outcome | None]:
-        """Return the key of the job and its outcome; None if the process ended before it answered."""
+        """Return the job's key and its outcome; the outcome is None if the process ended before the job was done."""
         assert self.key is not None
         key, self.key = self.key, None
         try:
@@ -115,7 +115,7 @@ class _Worker:
 
 def _serve(connection: Connection, work: Work) -> None:
     """Run the jobs that arrive until the connection is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent handles it
     os.environ["OMP_NUM_THREADS"] = "1"
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:

@@ -18,21 +18,21 @@ CONNECT_TIMEOUT = 5.0  # time within which a cluster must answer [s]; Ray itself
 
 @register_engine("ray")
 class RayEngine(Engine):
-    """Ray cluster that runs as many jobs at once as it has cores.
+    """Engine on a Ray cluster, which runs as many jobs at once as it has cores.
 
-    The study's folder must be on a path that all machines share; there the job of a lost worker or machine resumes.
+    The study's folder must be on a path that all machines share, so that the job of a lost machine can resume.
     """
 
     def __init__(self, processes: int | None = None, address: str | None = None):
         """Construct the engine.
 
         Args:
-            processes: Number of jobs that run at once without a cluster; 2 by default.
+            processes: Number of jobs that run at once on a local Ray; 2 by default.
             address: Address of a cluster, as `ray.init` takes it; the variable RAY_ADDRESS by default. Without either,
                 a local Ray is started.
 
         Raises:
-            InputError: If Ray is not installed, or both arguments are given.
+            InputError: If Ray is not installed, or `processes` is given for a cluster.
         """
         try:
             import ray
@@ -73,7 +73,7 @@ class RayEngine(Engine):
             yield key, outcome
 
     def __exit__(self, *error: object) -> None:
-        self._ray.shutdown()  # ends the tasks that the cluster still runs for this process
+        self._ray.shutdown()  # also ends this study's remaining tasks on the cluster
 
 
 def _reach(address: str) -> None:
