@@ -24,7 +24,6 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.rollout import rollout
 
-EPISODES = 10  # number of episodes of each policy for each setting
 MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates of random actions and of the search in a hard setting
 SEED = 3_000_000  # seed of the first episode, with conditions of training
 REACH = 2.3 * MM  # displacement of the command by an action of 1 at action_scale 1, late in the search [m]

@@ -29,7 +29,7 @@ _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
 _ORDERS = ("wxyz", "xyzw")
 _ALSO = {
-    "m": ("meter", "meters", "meter", "meters"),
+    "m": ("meter", "meters", "metre", "metres"),
     "deg": ("degree", "degrees", "\u00b0"),
     "rad": ("radian", "radians"),
     "s": SECONDS,

@@ -24,6 +24,7 @@ def file(tmp_path):
     [
         ("t,x_mm,y_mm,z_m", None, (1e-3, 1e-3, 1)),
         ("t,x [cm],y (mm),z_m", None, (1e-2, 1e-3, 1)),
+        ("t,x [metres],y [meters],z_mm", None, (1, 1, 1e-3)),
         ("t,x_mm,y_mm,z_mm", "mm", (1e-3, 1e-3, 1e-3)),
         ("t,x_mm,y,z", "mm", (1e-3, 1e-3, 1e-3)),
     ],
