@@ -33,6 +33,7 @@ ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared co
 getcontext().prec = 60
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
 MAX_BYTES = 2**30  # largest size of the arrays of one file
+MAX_WINDOW = 500  # upper limit of history and horizon together [steps]; environments accept 200 of each
 # First half of the SHA-256 of the assumptions: six sentences always, one for a budget, one for another period
 ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
 # Arrays of each file: kind, and shape in terms of steps, outputs, rows of constraints and rounds of multipliers
@@ -156,9 +157,9 @@ class Primitive:
         self.means, self.covariances, self.G, self.c = p["means"], p["covariances"], p["G"], p["c"]
         (self.steps, self.outputs), self.past, self.horizon = self.means.shape, int(p["history"]), int(p["horizon"])
         self.beta, self.hbar = float(p["beta"]), float(p["lambda"]) + float(p["beta"])
-        valid = [self.steps >= 2, self.past >= 0, self.horizon >= 0, self.beta >= 0, p["lambda"] >= 0, self.hbar > 0]
-        valid += [p["clock"] > 0, p["length_scale"] > 0, p["history_variance"] > 0, (p["start_within"] >= 0).all()]
-        require(all(valid), "a parameter of the primitive is out of range")
+        valid = [self.steps >= 2, min(self.past, self.horizon) >= 0, self.past + self.horizon < MAX_WINDOW]
+        valid += [self.beta >= 0, p["lambda"] >= 0, self.hbar > 0, p["clock"] > 0, p["length_scale"] > 0]
+        require(all([*valid, p["history_variance"] > 0, *(p["start_within"] >= 0)]), "a parameter is out of range")
         norms = np.linalg.norm(self.G, axis=2)
         is_row = (np.abs(norms - 1) <= 8 * EPS) | (((self.G == 0).all(axis=2)) & (self.c <= 0))
         require(is_row.all(), "rows of constraints are not of unit norm")
@@ -273,6 +274,7 @@ class Primitive:
             if claimed[n] and P == 0:
                 alphas = witness["multipliers"][claimed[:n].sum()]
                 corrected[:, n] = cells(n, y, by, L[:outs], (rows @ L, rows, c, room), alphas)
+                require(not np.isnan(corrected[:, n]).any(), f"step {n}: the multipliers are too large")
         if P:
             require(witness["multipliers"].size == 0, "multipliers prove nothing with a history")
             tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"] != 0).any(axis=(0, 1))
@@ -373,6 +375,7 @@ def compare(claims: dict[str, Arrays], found: dict[str, Arrays]) -> None:
     """Reject a claim that is tighter than the computed quantity, or much wider, and name the worst step."""
     for regime, name in itertools.product(found, QUANTITIES):
         own, claimed, sign = found[regime][name], claims[regime][name], -1.0 if name == "lower" else 1.0
+        require(not np.isnan(own).any(), f"{regime} {name} has no value: numbers are too large")
         require((np.isnan(claimed) == np.isinf(own)).all(), f"{regime} {name} has other unbounded entries")
         own = np.where(np.isinf(own), np.nan, own)
         room = AGREEMENT * np.maximum(np.nan_to_num(np.abs(own)).max(axis=0), 1e-9)

@@ -488,6 +488,45 @@ def test_checker_rejects_a_changed_budgeted_regime(budgeted, tmp_path, what):
         checker.check(write(tmp_path, BUDGETED[what](budgeted)))
 
 
+@pytest.mark.parametrize("largest", [1.0, 1.7e308])
+def test_checker_rejects_a_claim_that_overflows(budgeted, tmp_path, largest):
+    """A bound of NaN is neither tighter nor wider than a claim; 300 large multipliers make one from finite numbers."""
+    with np.load(io.BytesIO(budgeted["witness.npz"])) as witness:
+        steps, outputs, multipliers = (witness[f"lagrange_{name}"] for name in ("steps", "outputs", "multipliers"))
+    pad = [(0, 0)] * 4 + [(0, 300 - multipliers.shape[-1])]
+    large, last = np.pad(multipliers, pad), np.pad(steps, pad)
+    large[0, 1, -1, 0], last[0, 1, -1, 0] = largest, STEPS - 1
+    changed = altered(
+        budgeted, "witness.npz", lagrange_steps=lambda _: last, lagrange_outputs=lambda _: np.pad(outputs, pad),
+        lagrange_multipliers=lambda _: large,
+    )  # fmt: skip
+    changed = signed(changed, budgeted__excess=lambda rows: [rows[0], rows[0]])
+    with pytest.raises(checker.Rejected, match="has no value" if largest > 1.0 else "tighter|wider"):
+        checker.check(write(tmp_path, changed))
+
+
+@pytest.mark.parametrize("largest", [1.0, 1.7e308])
+def test_checker_rejects_a_correction_that_overflows(tmp_path, largest):
+    """A correction of NaN must not count as none; multipliers of constraints on one side can make one."""
+    contents = small(0, lower=(-0.02, -3.0), upper=(np.inf, np.inf))[2]
+    checker.check(write(tmp_path, contents))
+    with np.load(io.BytesIO(contents["witness.npz"])) as witness:
+        multipliers = witness["multipliers"]
+    multipliers[0] = np.array([1e-2, 1.0]) * largest
+    changed = signed(altered(contents, "witness.npz", multipliers=lambda _: multipliers))
+    with pytest.raises(checker.Rejected, match="too large" if largest > 1.0 else "violates a constraint"):
+        checker.check(write(tmp_path, changed))
+
+
+def test_checker_bounds_the_length_of_the_window(tmp_path, monkeypatch):
+    contents = small(3)[2]
+    monkeypatch.setattr(checker, "MAX_WINDOW", 8)
+    checker.check(write(tmp_path, contents))
+    monkeypatch.setattr(checker, "MAX_WINDOW", 7)
+    with pytest.raises(checker.Rejected, match="out of range"):
+        checker.check(tmp_path)
+
+
 def test_signature_needs_the_key(tmp_path):
     made = skill(0)
     contents = files(made, certify(made), KEY)
@@ -580,12 +619,12 @@ def test_checker_is_short_and_imports_numpy_only():
 
 
 @cache
-def small(history):
+def small(history, lower=(-0.21, -np.inf), upper=(0.21, np.inf)):
     """Return a short constrained loop, its bounds and its certificate."""
     phase = np.linspace(0.0, 1.0, 14)
     means = np.column_stack([0.2 * np.sin(np.pi * phase), phase])
     covariances = np.tile(np.array([[0.01, 0.002], [0.002, 0.01]]), (14, 1, 1))
-    constraints = LinearConstraints.box([-0.21, -np.inf], [0.21, np.inf])
+    constraints = LinearConstraints.box(lower, upper)
     reference = ReferenceTrajectory(PERIOD * np.arange(14), means, covariances)
     primitive = LcNsKmp(reference, horizon=4, history=history, constraints=constraints)
     gains = authority_gains(primitive, outputs=np.array([0]))
