@@ -116,7 +116,7 @@ THESIS = {
         (
             _HARDER,
             _SIMULATED,
-            ("five demonstrations of a scripted motion (thesis: from a person)", _always),
+            ("{number} of a scripted motion (thesis: from a person)", _always),
             (
                 "a plug with a lead-in chamfer of {mouth_chamfer_mm:g} mm (thesis: no dimensions given)",
                 _always,
@@ -236,7 +236,8 @@ def describe_differences(config: RunConfig, *, learns: bool = True) -> list[str]
         )
     differences += _non_defaults(config, setting)
     chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
-    remarked = {"action_scale": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
+    number = "one demonstration" if environment.get("num_demonstrations") == 1 else "five demonstrations"
+    remarked = {"action_scale": 1.0, "mouth_chamfer_mm": chamfer / MM, "number": number, **environment}
     return differences + [text.format(**remarked) for text, applies in setting.remarks if applies(environment)]
 
 

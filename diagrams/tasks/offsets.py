@@ -15,6 +15,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+from guiderail.models.primitives.reference import interpolate_prior
 
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 
@@ -40,13 +41,42 @@ class FixtureOffsetOptions(Options):
         return value
 
 
-def reference_of_file(path: Path, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
+MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # larger ones are probably in mm or degrees [m], [rad]
+
+
+class PriorOptions(Options):
+    """Option of a task with demonstrations of poses that may be a single one."""
+
+    prior_std: Numbers | None = Field(
+        None,
+        description="standard deviation of a single demonstration, x y z Rz Ry Rx [m], [rad], added to its own; or "
+        "rows of a phase from 0 to 1 and these six; required for one demonstration",
+        examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
+    )
+
+    @field_validator("prior_std")
+    @classmethod
+    def _check_prior(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and (interpolate_prior(value, 101, POSE_SIZE) > MAX_PRIOR_STD).any():
+            raise ValueError(f"give meters and radians, at most {MAX_PRIOR_STD[0]:g} m and {MAX_PRIOR_STD[-1]:g} rad")
+        return value
+
+
+def reference_of_file(
+    path: Path,
+    components: int | None,
+    floor: tuple[float, ...],
+    prior_std: tuple[float, ...] | None = None,
+    count: int | None = None,
+) -> ReferenceTrajectory:
     """Fit a reference trajectory to a file's demonstrations; its duration is their mean duration.
 
     Args:
         path: File .npz or .csv with poses (N, 6) in the target frame.
         components: Number of components of the Gaussian mixture; None: chosen by the Bayesian information criterion.
         floor: Standard deviation (6,) of a hand's repeatability; its square is added to the fitted variances.
+        prior_std: As in `ReferenceTrajectory.from_demonstrations`.
+        count: Number of demonstrations that are used, from the first on; None: all.
 
     Raises:
         InputError: If there is no such file, or its demonstrations are not poses.
@@ -54,18 +84,24 @@ def reference_of_file(path: Path, components: int | None, floor: tuple[float, ..
     if not path.is_file():
         raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
     with path.open("rb") as file:
-        key = hashlib.file_digest(file, "sha256").digest(), components, floor
+        key = hashlib.file_digest(file, "sha256").digest(), components, floor, prior_std, count
     if key not in _REFERENCES:
-        _REFERENCES[key] = _fit(path, components, floor)
+        _REFERENCES[key] = _fit(path, components, floor, prior_std, count)
     return _REFERENCES[key]
 
 
 # Fitted trajectories, because a fit takes seconds. A key has the file's digest, as `create-task` moves the folder.
-_REFERENCES: dict[tuple[bytes, int | None, tuple[float, ...]], ReferenceTrajectory] = {}
+_REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 
 
-def _fit(path: Path, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
-    demonstrations = Demonstrations.load(path)
+def _fit(
+    path: Path,
+    components: int | None,
+    floor: tuple[float, ...],
+    prior_std: tuple[float, ...] | None,
+    count: int | None,
+) -> ReferenceTrajectory:
+    demonstrations = Demonstrations.load(path).first(count)
     if demonstrations.num_outputs != POSE_SIZE:
         raise InputError(
             f"{path} has {demonstrations.num_outputs} outputs: an insertion needs the six of a pose, "
@@ -74,7 +110,7 @@ def _fit(path: Path, components: int | None, floor: tuple[float, ...]) -> Refere
     duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
     num_steps = round(duration / CONTROL_PERIOD) + 1
     fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor)
+        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), prior_std=prior_std
     )
     return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
 

@@ -94,6 +94,18 @@ class Demonstrations:
         """Number of outputs O."""
         return self.outputs[0].shape[1]
 
+    def first(self, count: int | None) -> "Demonstrations":
+        """Return the first `count` demonstrations, or all if it is None.
+
+        Raises:
+            InputError: If there are not as many.
+        """
+        if count is None:
+            return self
+        if not 1 <= count <= self.num_demonstrations:
+            raise InputError(f"there are {self.num_demonstrations} demonstrations, of which {count} cannot be used")
+        return Demonstrations(self.times[:count], self.outputs[:count], self.names)
+
     def resampled(self, num_steps: int | None = None) -> "Demonstrations":
         """Return all demonstrations on one uniform clock, by linear interpolation.
 

@@ -77,8 +77,12 @@ class ReferenceTrajectory:
         seed: int = 0,
         num_steps: int | None = None,
         floor: float | np.ndarray = 0.0,
+        prior_std: float | Sequence[float] | np.ndarray | None = None,
     ) -> ReferenceTrajectory:
         """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR).
+
+        The covariance of a single demonstration holds only what the mixture does not resolve, such as a circling
+        search; `prior_std` adds the variance that other demonstrations would have shown.
 
         Args:
             demonstrations: Demonstrations, resampled to one clock if their clocks differ.
@@ -87,10 +91,23 @@ class ReferenceTrajectory:
             num_steps: Number of steps N; that of the longest demonstration by default.
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
                 such as the resolution of a sensor or a controller if demonstrations differ by less.
+            prior_std: Standard deviation of a single demonstration, as in `interpolate_prior`; required for one
+                demonstration, refused for several.
 
         Raises:
-            InputError: If an argument is out of range, or a covariance is singular.
+            InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is
+                singular.
         """
+        number = demonstrations.num_demonstrations
+        if prior_std is None and number == 1:
+            raise InputError(
+                "a single demonstration has no variance: give prior_std, the standard deviation of each output"
+            )
+        if prior_std is not None and number > 1:
+            raise InputError(
+                f"prior_std is for a single demonstration, and there are {number}, which have a variance of their own: "
+                "leave prior_std out, or use one demonstration"
+            )
         demonstrations = demonstrations.resampled(num_steps)
         times, outputs = demonstrations.times[0], np.stack(demonstrations.outputs)
         floor = np.broadcast_to(np.asarray(floor, dtype=float), outputs.shape[-1:])
@@ -98,7 +115,10 @@ class ReferenceTrajectory:
             raise InputError(f"floor is a standard deviation and must not be negative: {floor}")
         mixture = fit_mixture(times, outputs, components, seed)
         means, covariances = regress(mixture, times)
-        return cls(times, means, covariances + np.diag(floor**2))
+        covariances = covariances + np.diag(floor**2)
+        if prior_std is not None:
+            covariances += np.eye(len(floor)) * (interpolate_prior(prior_std, len(times), len(floor)) ** 2)[:, None]
+        return cls(times, means, covariances)
 
     @property
     def num_steps(self) -> int:
@@ -166,6 +186,39 @@ class ReferenceTrajectory:
                 f"the covariance at step {int(np.argmax(bad))} is singular or not positive definite; add a small "
                 "variance to its diagonal (from_demonstrations has floor= for that)"
             )
+
+
+def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps: int, num_outputs: int) -> np.ndarray:
+    """Return the standard deviations (N, O) of a single demonstration over its steps [unit of the output].
+
+    Args:
+        prior_std: One number, O numbers, or rows of a phase and O numbers, one after another. The phase is the fraction
+            of the duration, from 0 to 1; between two rows the standard deviations are interpolated linearly.
+        num_steps: Number of steps N.
+        num_outputs: Number of outputs O.
+
+    Raises:
+        InputError: If there is another number of numbers, phases do not increase or are not in 0 to 1, or a standard
+            deviation is not positive and finite.
+    """
+    numbers = np.ravel(np.asarray(prior_std, dtype=float))
+    size = 1 + num_outputs
+    if len(numbers) in (1, num_outputs):
+        rows = np.append(0.0, np.broadcast_to(numbers, num_outputs))[None]
+    elif len(numbers) and len(numbers) % size == 0:
+        rows = numbers.reshape(-1, size)
+    else:
+        raise InputError(
+            f"prior_std is {num_outputs} standard deviations, or rows of a phase and {num_outputs} of them, not "
+            f"{len(numbers)} numbers"
+        )
+    phases, deviations = rows[:, 0], rows[:, 1:]
+    if not (np.isfinite(rows).all() and (deviations > 0).all()):
+        raise InputError("prior_std is a standard deviation: give positive numbers")
+    if phases[0] < 0 or phases[-1] > 1 or (np.diff(phases) <= 0).any():
+        raise InputError(f"the phases of prior_std must increase from 0 to 1, not {phases.tolist()}")
+    at = np.linspace(0.0, 1.0, num_steps)
+    return np.column_stack([np.interp(at, phases, column) for column in deviations.T])
 
 
 def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel: Kernel) -> ReferenceTrajectory:

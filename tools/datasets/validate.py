@@ -195,10 +195,17 @@ def _follow_by_default(common: Demonstrations) -> dict[str, Any]:
     if components < 1:
         return {}
     floor = _variance_floor(outputs.reshape(-1, outputs.shape[-1]))
-    reference = ReferenceTrajectory.from_demonstrations(common, components, floor=floor)
+    reference = _fit_reference(common, components, floor)
     deviation, miss = measure_deviation(reference, SquaredExponential(), lambda_=6.0, beta=6.0, horizon=40)
     remark = {} if deviation <= 1.0 else {"remark": describe_deviation(deviation, miss)}
     return {"default_deviation": float(f"{deviation:.4g}"), **remark}
+
+
+def _fit_reference(common: Demonstrations, components: int | None, floor: np.ndarray) -> ReferenceTrajectory:
+    """Return the reference of demonstrations; for a single one `floor` (O,) is its standard deviation."""
+    if common.num_demonstrations == 1:
+        return ReferenceTrajectory.from_demonstrations(common, components, prior_std=floor)
+    return ReferenceTrajectory.from_demonstrations(common, components, floor=floor)
 
 
 def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
@@ -229,7 +236,7 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
 
     outputs = np.stack(common.outputs)
     floor = _variance_floor(outputs.reshape(-1, outputs.shape[-1]))
-    reference = ReferenceTrajectory.from_demonstrations(common, floor=floor)
+    reference = _fit_reference(common, None, floor)
     figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))
     for o, (axis, name) in enumerate(zip(axes[:, 0], common.names, strict=True)):
         axis.plot(common.times[0], outputs[..., o].T, color="0.6", linewidth=0.8)

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file
 from guiderail.diagrams.tasks.part.task import IN_SOCKET, TIME, Z, load_task_folder
 from guiderail.diagrams.tasks.registry import register_task
@@ -246,8 +245,7 @@ def calibrate(
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = turn_of(None if clearance is None else clearance * MM, radius)
     try:
-        source = read_task_file(folder).demonstrations  # as rounded in the file
-        reference_of_file(folder / source.file, source.components, source.floor)  # cached for the child
+        read_task_file(folder).demonstrations.reference(folder)  # as rounded in the file; cached for the child
         setting, score, is_hard = run_isolated(
             _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
         )

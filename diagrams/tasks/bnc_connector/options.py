@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.options import Number
+from guiderail.diagrams.envs.options import Integer, Number
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions
-from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, PriorOptions, in_ring
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
@@ -90,7 +90,7 @@ NOMINAL = BncDimensions()
 SHIPPED = ("insert", "search", "firm_search")  # demonstrations
 
 
-class BncOptions(FixtureOffsetOptions, ForceOptions):
+class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
 
     jack_turn: Number = Field(0.0, ge=0, le=10, description="largest sampled turn of the jack about its axis [degrees]")
@@ -126,7 +126,9 @@ class BncOptions(FixtureOffsetOptions, ForceOptions):
     demonstrations: str = Field(
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )
-
+    num_demonstrations: Integer | None = Field(
+        None, ge=1, description="number of demonstrations that are used, from the first on; one needs prior_std"
+    )
     time_scale: Number = Field(
         1.0,
         ge=0.5,

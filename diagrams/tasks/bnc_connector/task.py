@@ -53,12 +53,14 @@ LOCKED_STEPS = 3  # consecutive steps of the default control period that count a
 
 
 @cache
-def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
+def reference_trajectory(
+    demonstrations: str, count: int | None = None, prior_std: tuple[float, ...] | None = None
+) -> ReferenceTrajectory:
     """Return the Gaussian mixture regression of demonstrations, shipped or in a file, fitted once per process."""
     if demonstrations not in DEMONSTRATIONS:
-        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
-    loaded = DEMONSTRATIONS[demonstrations]()
-    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
+        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), prior_std, count)
+    loaded = DEMONSTRATIONS[demonstrations]().first(count)
+    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, prior_std=prior_std)
 
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
@@ -147,7 +149,8 @@ class BncConnector(DemonstratedInsertion):
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the chosen demonstrations."""
-        return self.on_clock(reference_trajectory(self.options.demonstrations), self.options.time_scale)
+        o = self.options
+        return self.on_clock(reference_trajectory(o.demonstrations, o.num_demonstrations, o.prior_std), o.time_scale)
 
     def constraints(self) -> LinearConstraints:
         """Return |x|, |y| ≤ `bound`: 2 mm in equation 4.26."""
@@ -209,7 +212,7 @@ class BncConnector(DemonstratedInsertion):
         demonstrations = DEMONSTRATIONS[name]() if name in DEMONSTRATIONS else Demonstrations.load(Path(name))
         return Scene(
             to_world=to_world,
-            demonstrations=tuple(demonstrations.outputs),
+            demonstrations=tuple(demonstrations.first(self.options.num_demonstrations).outputs),
             constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},

@@ -14,6 +14,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
 from guiderail.diagrams.stations.station import ContactOptions
+from guiderail.diagrams.tasks.offsets import PriorOptions, reference_of_file
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean
@@ -21,7 +22,7 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATABILITY_STD
 from guiderail.models.parts.symmetry import SYMMETRIES
-from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
 FILE_NAME = "task.yaml"
 _FILE_NAME = re.compile(r"[\w()+ -][\w.()+ /-]*")  # path of a file in the folder; it is also written into XML
@@ -169,7 +170,7 @@ def _replaced(rows: Any, missing: float) -> Any:
     return missing if rows is None else rows
 
 
-class DemonstrationFile(Options):
+class DemonstrationFile(PriorOptions):
     """Demonstrations in the folder."""
 
     file: str = Field("demonstrations.npz", description="file .npz or .csv of poses in the target frame")
@@ -182,6 +183,10 @@ class DemonstrationFile(Options):
         max_length=6,
         description="standard deviation of a hand, added to theirs [m], [rad]",
     )
+
+    def reference(self, folder: Path) -> ReferenceTrajectory:
+        """Return the reference trajectory of the demonstrations in a task folder, fitted once per process."""
+        return reference_of_file(folder / self.file, self.components, self.floor, self.prior_std)
 
 
 class Recommended(Options):

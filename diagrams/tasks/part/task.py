@@ -25,7 +25,7 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import (
     sides_of_the_rim,
 )
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, ForceOptions
-from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, reference_of_file
+from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions
 from guiderail.diagrams.tasks.part.file import AUTOMATE, Bounds, PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
@@ -165,8 +165,7 @@ class PartInsertion(DemonstratedInsertion):
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the folder's demonstrations."""
-        source = self.file.demonstrations
-        return self.on_clock(reference_of_file(self.folder / source.file, source.components, source.floor))
+        return self.on_clock(self.file.demonstrations.reference(self.folder))
 
     def constraints(self) -> LinearConstraints:
         """Return the bounds of `task.yaml`; the option `bound`, if given, replaces the bounds of x and y."""
@@ -185,9 +184,7 @@ class PartInsertion(DemonstratedInsertion):
 
     @classmethod
     def _reference_duration(cls) -> float:
-        source = cls.file.demonstrations
-        reference = reference_of_file(cls.folder / source.file, source.components, source.floor)
-        return reference.num_steps * CONTROL_PERIOD
+        return cls.file.demonstrations.reference(cls.folder).num_steps * CONTROL_PERIOD
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 import guiderail  # noqa: F401 (registers the environments)
-from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import ALIGNMENT_REWARD, DEPTH_REWARD
 from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, reference_trajectory, scripted_torque_search
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
+from guiderail.models.objects.bnc_connector import demonstrations as inserting
 from guiderail.models.objects.insertion import COLLISION_FORCE
+from guiderail.models.primitives import Demonstrations
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
@@ -153,6 +155,41 @@ def test_a_hard_push_is_a_collision():
     assert info["contact_force"] > COLLISION_FORCE
     assert env.trace.statistics()["collisions"] == 1
     assert total < -45.0
+
+
+PRIOR = (1.73 * MM, 1.73 * MM, 0.5 * MM, 0.02, 0.005, 0.005)
+
+
+def test_single_demonstration_needs_its_prior_std(tmp_path):
+    with pytest.raises(InputError, match="give prior_std"):
+        make_env("BncConnector", guidance="kgrl", num_demonstrations=1)
+    with pytest.raises(InputError, match="there are 5, which have"):
+        make_env("BncConnector", guidance="kgrl", prior_std=PRIOR)
+    with pytest.raises(InputError, match="6 cannot be used"):
+        make_env("BncConnector", guidance="kgrl", num_demonstrations=6)
+    with pytest.raises(InputError, match="give meters and radians"):
+        make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=(1.7, *PRIOR[1:]))
+    one = Demonstrations.load(inserting.PATH).first(1)
+    one.save(tmp_path / "one.npz")
+    shipped = make_prior_knowledge("BncConnector", num_demonstrations=1, prior_std=PRIOR).demonstrations.reference
+    file = str(tmp_path / "one.npz")
+    stored = make_prior_knowledge("BncConnector", demonstrations=file, prior_std=PRIOR).demonstrations.reference
+    np.testing.assert_allclose(stored.means, shipped.means, atol=1e-6)
+    np.testing.assert_allclose(shipped.means[:, 2], one.outputs[0][:, 2], atol=2.5 * MM)
+    assert (shipped.standard_deviations[:, :2] >= 1.73 * MM).all()
+
+
+def test_action_reaches_the_offset_that_the_prior_declares():
+    """An action of 1 displaces the command by √3 standard deviations: 3 mm for a prior of 1.73 mm."""
+    env = make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=PRIOR, bound=6.0 * MM)
+    commands = []
+    for action in (0.0, 1.0):
+        env.reset(seed=0)
+        for _ in range(30):
+            env.step(np.array([action, 0.0]))
+        commands.append(env.trace.commanded[:, 0].copy())
+    env.close()
+    assert np.mean(commands[1] - commands[0]) == pytest.approx(3.0 * MM, rel=0.15)
 
 
 def test_reward_is_the_sum_of_its_terms(kgrl):

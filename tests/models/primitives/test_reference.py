@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
-from guiderail.models.primitives.reference import Mixture, fit_mixture, regress
+from guiderail.models.primitives.reference import Mixture, fit_mixture, interpolate_prior, regress
 
 
 def hourglass(num=9, n=120, seed=0):
@@ -47,14 +47,56 @@ def test_reference_is_deterministic_for_a_seed():
     np.testing.assert_array_equal(a.covariances, b.covariances)
 
 
-def test_reference_of_equal_or_single_demonstrations_needs_floor():
+def test_reference_of_equal_demonstrations_needs_floor():
     """EM's regularization keeps the covariance regular; a floor sets its scale."""
     t = np.linspace(0, 1, 50)
     same = Demonstrations(t, [np.column_stack([np.sin(t), np.zeros(50)])] * 3)
     assert (ReferenceTrajectory.from_demonstrations(same, 5).standard_deviations > 0).all()
     floored = ReferenceTrajectory.from_demonstrations(same, 5, floor=[0.01, 0.02])
     assert (floored.standard_deviations >= [0.01, 0.02]).all()
-    assert ReferenceTrajectory.from_demonstrations(hourglass(1), 5).num_outputs == 2
+
+
+def test_variance_of_a_single_demonstration_is_added():
+    """The mean is the demonstration; a motion that the mixture does not resolve adds its own variance."""
+    t = np.linspace(0, 2, 200)
+    slow = Demonstrations(t, [np.column_stack([np.sin(t), t])])
+    reference = ReferenceTrajectory.from_demonstrations(slow, 12, prior_std=[0.1, 0.2])
+    np.testing.assert_allclose(reference.means, slow.outputs[0], atol=5e-3)
+    np.testing.assert_allclose(reference.standard_deviations, np.tile([0.1, 0.2], (200, 1)), rtol=2e-3)
+    searching = Demonstrations(t, [np.column_stack([np.sin(t) + 0.3 * np.sin(100 * t), t])])
+    reference = ReferenceTrajectory.from_demonstrations(searching, 12, prior_std=[0.1, 0.2])
+    np.testing.assert_allclose(reference.means[:, 0], np.sin(t), atol=0.12)
+    assert np.median(reference.standard_deviations[:, 0]) == pytest.approx(np.hypot(0.1, 0.3 / np.sqrt(2)), rel=0.1)
+
+
+def test_prior_is_interpolated_between_phases():
+    rows = [0.0, 0.1, 1.0, 0.5, 0.3, 1.0]  # phases 0 and 0.5, the last row is held
+    prior = interpolate_prior(rows, 5, 2)
+    np.testing.assert_allclose(prior, [[0.1, 1.0], [0.2, 1.0], [0.3, 1.0], [0.3, 1.0], [0.3, 1.0]])
+    np.testing.assert_array_equal(interpolate_prior(0.1, 2, 2), np.full((2, 2), 0.1))
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        (None, "single demonstration has no variance: give prior_std"),
+        ([0.1, 0.0], "positive"),
+        ([0.1, np.nan], "positive"),
+        ([0.1] * 4, "2 standard deviations, or rows of a phase"),
+        ([], "2 standard deviations"),
+        ([0.0, 0.1, 0.1, 0.0, 0.1, 0.1], "increase"),
+        ([-0.1, 0.1, 0.1], "from 0 to 1"),
+        ([0.0, 0.1, 0.1, 1.1, 0.1, 0.1], "from 0 to 1"),
+    ],
+)
+def test_prior_of_a_single_demonstration_is_refused(prior, words):
+    with pytest.raises(InputError, match=words):
+        ReferenceTrajectory.from_demonstrations(hourglass(1), 5, prior_std=prior)
+
+
+def test_prior_is_refused_for_several_demonstrations():
+    with pytest.raises(InputError, match="there are 9, which have a variance"):
+        ReferenceTrajectory.from_demonstrations(hourglass(), 5, prior_std=0.1)
 
 
 def test_inputs_are_extrapolated_beyond_the_ends():
