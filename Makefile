@@ -73,10 +73,10 @@ adversary: $(VENV)/.ready  ## obstacles, limits of motion and of joints against 
 	$(BIN)/python tests/harness/motion_adversary.py
 	$(BIN)/python tests/harness/joint_adversary.py
 
-fci:  ## rehearse a Franka on the simulator of its protocol, minutes
+fci:  ## run a Franka on the simulator of its protocol, minutes
 	$(PYTHON) -m venv .venv-fci
 	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[fci,mujoco]" franky-sim
-	.venv-fci/bin/python tests/harness/fci/rehearse.py
+	.venv-fci/bin/python tests/harness/fci/simulated_franka.py
 
 lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its own, minutes (downloads 4 GB)
 	python3.12 -m venv .venv-lerobot

@@ -198,7 +198,8 @@ class CartesianPositionController(LeafSystem):
         """Return joint velocities for the tool velocity V, or None on failure, and True if V cannot be followed."""
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
-            velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))
+            lower, upper = self._velocity_limits
+            velocities /= max(1.0, float(np.maximum(velocities / lower, velocities / upper).max()))
             return velocities, not is_following(J, velocities, V)
         if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, position_limits):
             return velocities, False  # no limit is active: the closed form is optimal, and faster

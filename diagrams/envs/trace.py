@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.common.errors import InputError
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -84,7 +86,12 @@ class EpisodeTrace:
         """Record one control step: poses (O,), contact force [N], reward and signals.
 
         NaN is recorded for every signal if `signals` is None.
+
+        Raises:
+            InputError: If a signal of the trace is missing.
         """
+        if signals is not None and (missing := [name for name in self._signals if name not in signals]):
+            raise InputError(f"a control step lacks the signal {missing[0]!r} of its trace, and has {sorted(signals)}")
         n = self._length
         self._commanded[n] = commanded
         self._measured[n] = measured

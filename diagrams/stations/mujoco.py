@@ -267,6 +267,18 @@ class MujocoStation(Station):
         self.gantry.set_contact(self.gantry.GetMyMutableContextFromRoot(context), friction, modulus)
 
 
+def constraint_torques(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the generalized force of contacts and joint limits on the model (nv,), without that of joint friction.
+
+    MuJoCo's own sum, `qfrc_constraint`, includes joint friction.
+    """
+    engine = mujoco_engine()
+    force = np.where(data.efc_type == engine.mjtConstraint.mjCNSTR_FRICTION_DOF, 0.0, data.efc_force)
+    result = np.zeros(model.nv)
+    engine.mj_mulJacTVec(model, data, result, force)
+    return result
+
+
 def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell) -> MovedBodies:
     """Add fixture, tool and workpiece to a plant without joints, and finalize it."""
     plant.RegisterAsSourceForSceneGraph(scene_graph)

@@ -21,7 +21,7 @@ NUM_DEMONSTRATIONS = 5
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
 _NARROW = np.array([0.12 * MM, 0.12 * MM, 0.4 * MM, 0.5 * DEGREE, 0.15 * DEGREE, 0.15 * DEGREE])
 _CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # correlation times of the deviations [s]
-_CENTRING = 0.9  # part of the mean of the five random curves that is removed
+_CENTERING = 0.9  # part of the mean of the five random curves that is removed
 
 
 def plan_straight_insertion(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +90,7 @@ def demonstrator_motions(
     wide = np.clip((heights - press_from) / (3.0 * MM) + 1.0, 0.0, 1.0)[:, None]
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
     curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
-    wander = curves - _CENTRING * curves.mean(axis=0)
+    wander = curves - _CENTERING * curves.mean(axis=0)
     nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
     return nominal + scale * wander
 

@@ -7,7 +7,7 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.damped_inverse import TOOL_SCALE
+from guiderail.models.control.damped_inverse import LEVER, TOOL_SCALE
 
 _ITERATIONS = 60
 _TOLERANCE = 1e-9  # largest norm of the pose error, as a scaled twist [m]
@@ -90,12 +90,16 @@ class JointRange:
         return G, G @ output + c[used] / norms[used]
 
     def violation(self, output: np.ndarray) -> float:
-        """Return the violation of a pose (6,) [rad], negative inside; infinite if it cannot be reached."""
+        """Return the largest violation of a pose (6,), negative inside; infinite if it cannot be reached.
+
+        A violation of a joint limit is an angle [rad]. That of the singular value [m] is converted to an angle by
+        `LEVER`, as rotations are in the scaled Jacobian.
+        """
         q = self.solve(output)
         if q is None:
             return np.inf
         violation = float(np.maximum(self._lower - q, q - self._upper).max())
-        return max(violation, self._smallest - self._singular_value(q)[0]) if self._smallest else violation
+        return max(violation, (self._smallest - self._singular_value(q)[0]) / LEVER) if self._smallest else violation
 
     def _error_and_jacobian(self, q: np.ndarray, X: RigidTransform | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the scaled twist (6,) from the pose at `q` to X, rotation first, and the scaled Jacobian (6, n)."""

@@ -255,8 +255,11 @@ SINGULAR = np.array([-0.2448, -1.3796, 1.8297, -2.021, 0.0, 0.0])
 class SixJoints(Commanded):
     """Controller of a UR5e that starts in a singular posture."""
 
-    def __init__(self, shift):
+    def __init__(self, shift, lower_share=1.0):
         known = ArmControllerPlant(BncWorkcell(), "ur5e")
+        for index in known.plant.GetJointIndices():
+            joint = known.plant.get_joint(index)
+            joint.set_velocity_limits(lower_share * joint.velocity_lower_limits(), joint.velocity_upper_limits())
         self.plant, self.q_start = known.plant, SINGULAR
         self.system = CartesianPositionController(
             known.plant, known.arm.target, known.arm.tool_center, posture=known.posture
@@ -289,6 +292,18 @@ def test_tool_leaves_a_singular_posture_without_a_jump(shift):
     assert errors[-1, :3].max() < 2e-3
     assert errors[-1, 3:].max() < 0.05
     assert max(stuck) == float(bool(np.any(shift)))
+
+
+def test_lower_velocity_limits_hold_in_a_singular_posture_when_they_are_smaller():
+    commanded = SixJoints(np.array([0.05, 0.0, 0.0, 0.3, 0.0, 0.0]), lower_share=0.05)
+    lower, slowest = commanded.plant.GetVelocityLowerLimits(), np.zeros(6)
+    commanded.advance(0.005)
+    for _ in range(60):
+        q = commanded.joints
+        commanded.advance(0.01)
+        slowest = np.minimum(slowest, (commanded.joints - q) / 0.01)
+    assert (slowest >= lower - 1e-6).all()
+    assert (slowest / lower).max() > 0.99  # a limit was reached
 
 
 def test_tool_follows_its_path_near_a_singular_posture():

@@ -55,7 +55,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         horizon: H, future points at which the constraints are satisfied.
         orientation: Meaning of outputs 3 to 6: "rotation_vector" or "euler_zyx".
         observe: What is appended to the observation: "phase" (1,), and "command" (O,), the last command in the
-            segment's frame, scaled to the demonstrations' range.
+            segment's frame, scaled to the demonstrations' range. A template's is in its first frame, in units of 0.2 m
+            and π.
 
     Raises:
         InputError: If an argument is out of range. In `reset`, if the measured pose is not finite. In `step`, if the

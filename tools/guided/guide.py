@@ -25,6 +25,9 @@ from guiderail.tools.guided.segment import Frame, Segment
 PRIMITIVE_GUIDANCE = ("kgrl", "skgrl", "kmp", "residual", "clipped_residual")
 GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
 
+# Unit of an observed command of a template, which has no demonstrations with a range [m, rad].
+_COMMAND_SCALE = np.array([0.2, 0.2, 0.2, np.pi, np.pi, np.pi])
+
 Request = tuple[LcNsKmp, int, np.ndarray, np.ndarray | None]
 """Primitive, and the arguments of its `predict`."""
 
@@ -401,8 +404,10 @@ class TemplateGuide(Guide):
         return self.template.states[self._state].name
 
     def scaled_command(self) -> np.ndarray:
-        """Return the last command (6,) in the world [m, rad]."""
-        return transform_to_pose(self._X)
+        """Return the last command (6,) in the template's first frame, in units of `_COMMAND_SCALE`."""
+        X_WF = self._frames[self.template.frames[0]] if self.template.frames else None
+        X_FE = self._X if X_WF is None else X_WF.inverse() @ self._X
+        return transform_to_pose(X_FE) / _COMMAND_SCALE
 
 
 def predict(request: Request | None) -> np.ndarray | None:

@@ -206,14 +206,15 @@ def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np
 
     Args:
         signals: M arrays (N_m, S), such as outputs and a gripper.
-        conditions: Conditions on a sample (S,), in the order of the events.
+        conditions: Conditions on a sample (S,), in the order of the events; the first may hold at sample 0, where
+            `cut_demonstrations` cannot cut.
 
     Raises:
         InputError: If an event does not occur in a recording.
     """
     found = []
     for m, signal in enumerate(signals):
-        at, events = 0, []
+        at, events = -1, []
         for number, condition in enumerate(conditions):
             at = next((k for k in range(at + 1, len(signal)) if condition(signal[k])), -1)
             if at < 0:

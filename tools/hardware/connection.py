@@ -17,10 +17,10 @@ from guiderail.diagrams.hardware.lcm.driver import LcmDriver
 from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import MM
 from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.tools.hardware.scenario import load_scenario
 
+MILLISECOND = 0.001  # [s]
 LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall clock time]
 COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
 MAX_DURATION = 7 * 24 * 3600.0  # longest run of a simulated driver, by the robot's clock [s]
@@ -141,9 +141,9 @@ class RobotConnection:
             return {}
         return {
             "milliseconds_between_statuses": {
-                "period": station.period / (self.rate if self.sim else 1.0) / MM,
-                "99 %": clock.intervals.quantile(0.99) / MM,
-                "longest": clock.intervals.longest / MM,
+                "period": station.period / (self.rate if self.sim else 1.0) / MILLISECOND,
+                "99 %": clock.intervals.quantile(0.99) / MILLISECOND,
+                "longest": clock.intervals.longest / MILLISECOND,
             }
         }
 

@@ -75,12 +75,12 @@ def run_sim_driver(
     if driver == "fci":
         if scenario is not None:
             raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
-        from guiderail.diagrams.hardware.fci.simulated import RehearsalSimulator, serve  # needs franky-sim
+        from guiderail.diagrams.hardware.fci.simulated import WorkcellSimulator, serve  # needs franky-sim
 
         fixture = RigidTransform()
         if reset is not None:
             fixture = pose_to_transform(insertion.offsets.draw(np.random.default_rng(0), reset)[0])
-        simulator = RehearsalSimulator(insertion.workcell(), fixture)
+        simulator = WorkcellSimulator(insertion.workcell(), fixture)
         serve(simulator, start, seconds, 1.0 if rate is None else rate, url, log)
         return True
     directives = [] if scenario is None else load_scenario(scenario).directives

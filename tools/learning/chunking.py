@@ -47,6 +47,7 @@ class ChunkLearner(BcLearner):
         self._seen: list[np.ndarray] = []  # observations of the episode
         self._starts: list[int] = []  # control steps of these observations
         self._groups: list[int] = []  # number of the demonstration of each observation
+        self._step, self._num_outputs = 0, 0
         self._center, self._scale = np.zeros(1), np.ones(1)
         self.network = torch.nn.Sequential()
 

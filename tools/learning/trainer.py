@@ -258,7 +258,8 @@ def _resume(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[st
         env.unwrapped.np_random.bit_generator.state = values["environment"]
     except InputError:
         raise
-    except Exception as error:  # the digest matches, so the content is complete but of another learner
+    # The digest matches, so the content is complete but of another learner.
+    except (LookupError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
         ) from error

@@ -85,7 +85,7 @@ class FciDriver(PoseDriver):
             robot.set_ee(_flat(X_NP))
             robot.set_load(impedance.mass, impedance.center_of_mass.tolist(), impedance.inertia.ravel("F").tolist())
             robot.set_collision_behavior(list(TORQUE_THRESHOLD), [force] * 3 + [torque] * 3)
-        except Exception as error:
+        except (self._franky.Exception, RuntimeError, ValueError) as error:
             raise InputError(f"the robot at {self.url} refuses its configuration: {error}") from None
         self._impedance = impedance
 

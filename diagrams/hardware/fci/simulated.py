@@ -17,7 +17,7 @@ from franky_sim.mujoco_simulator import FrankaMujocoRobot, MujocoSimulator
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.stations.mujoco import MujocoContact, mujoco_parts
+from guiderail.diagrams.stations.mujoco import MujocoContact, constraint_torques, mujoco_parts
 from guiderail.diagrams.stations.workcell import ConvexWorkcell
 from guiderail.models.common.errors import InputError
 
@@ -27,7 +27,7 @@ RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "wi
 FILTER_TIME = 0.02  # time constant of the external torque's low-pass filter [s]
 
 
-class RehearsalRobot(FrankaMujocoRobot):
+class SimulatedFranka(FrankaMujocoRobot):
     """Robot that reports the external torques of the simulated contact.
 
     Args:
@@ -39,8 +39,8 @@ class RehearsalRobot(FrankaMujocoRobot):
         self._external = np.zeros(7)
 
     def _post_step(self) -> None:
-        # The constraint forces include joint limits, which no task reaches, and `RESIDUAL_FRICTION`.
-        contact = self._data.qfrc_constraint[self._dof_addrs]
+        # As libfranka's estimate, without the joint friction; with the forces of joint limits, which no task reaches.
+        contact = constraint_torques(self._model, self._data)[self._dof_addrs]
         self._external += STEP / FILTER_TIME * (contact - self._external)
         super()._post_step()
 
@@ -52,7 +52,7 @@ class RehearsalRobot(FrankaMujocoRobot):
         return state.replace(tau_ext_hat_filtered=tuple(-self._external), m_ee=0.0)
 
 
-class RehearsalSimulator(MujocoSimulator):
+class WorkcellSimulator(MujocoSimulator):
     """Simulated FR3 with a task's parts: the workpiece on the flange, and the fixture in the world."""
 
     def __init__(self, workcell: Any, fixture_offset: RigidTransform = RigidTransform()):  # noqa: B008
@@ -69,19 +69,19 @@ class RehearsalSimulator(MujocoSimulator):
         X_FlangeTool = self.model_of_arm.arm.tool_center.CalcPose(context, plant.GetFrameByName("panda_flange"))
         X_WFixture = workcell.X_WT @ fixture_offset @ workcell.X_FT.inverse()
         if not isinstance(workcell, ConvexWorkcell):
-            raise InputError(f"the rehearsal robot collides convex solids, and {type(workcell).__name__} has none")
+            raise InputError(f"the simulated robot collides convex solids, and {type(workcell).__name__} has none")
         fixture, workpiece, assets = mujoco_parts(
             workcell.fixture_surfaces(), workcell.workpiece_surfaces(), MujocoContact()
         )
         self._parts = ((fixture, X_WFixture), (workpiece, RigidTransform([0, 0, FLANGE_HEIGHT]) @ X_FlangeTool))
         self._assets = assets
-        self._arm: RehearsalRobot | None = None
+        self._arm: SimulatedFranka | None = None
 
-    def add_arm(self, pose: np.ndarray) -> RehearsalRobot:
+    def add_arm(self, pose: np.ndarray) -> SimulatedFranka:
         """Add the robot with its tool center at a pose (6,) in the target frame, and the task's parts."""
         positions = self.model_of_arm.solve(pose, self.model_of_arm.posture)
         self.add_robot(initial_q=tuple(positions))
-        self._arm = self._robots[0] = RehearsalRobot(positions)
+        self._arm = self._robots[0] = SimulatedFranka(positions)
         root = self.scene
         option = root.find("option")
         assert option is not None
@@ -105,7 +105,7 @@ class RehearsalSimulator(MujocoSimulator):
 
 
 def serve(
-    simulator: RehearsalSimulator,
+    simulator: WorkcellSimulator,
     pose: np.ndarray,
     seconds: float,
     rate: float = 1.0,

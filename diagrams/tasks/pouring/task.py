@@ -57,10 +57,11 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
     return np.array(reset.mug_error)
 
 
-def termination_terms(config: PouringConfig, needed: int) -> list[TerminationTerm]:
+def termination_terms(config: PouringConfig, needed: int, poured_steps: int) -> list[TerminationTerm]:
     """Return the termination terms; a collision has priority, so that an episode that touched the mug is no success.
 
-    An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug.
+    An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug. It is a
+    success when they have been in the mug for `poured_steps` control steps, because a ball can bounce out again.
     """
     mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2
     fall = config.mug.height + config.stand_height
@@ -82,13 +83,13 @@ def termination_terms(config: PouringConfig, needed: int) -> list[TerminationTer
     balls = {"balls_in_mug": 6 * config.num_balls, "balls_in_thermos": 6 * config.num_balls}
     return [
         TerminationTerm("collision", {"touched": 1}, lambda touched: touched[0] > 0),
-        # For a tenth of a second, because a ball can bounce out again.
-        TerminationTerm("success", {"balls_in_mug": 6 * config.num_balls}, poured, steps=10),
+        TerminationTerm("success", {"balls_in_mug": 6 * config.num_balls}, poured, steps=poured_steps),
         TerminationTerm("spill", balls, spilled),
     ]
 
 
 MAX_TRACKING_ERROR = 0.05  # [m]
+POURED_STEPS = 10  # consecutive steps of the default control period that count as poured
 # Start of the thermos in the frame of the mug's tip, inside the template's workspace.
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
@@ -232,7 +233,7 @@ class Pouring(Task):
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return collision when touched, success when poured, and spill."""
-        return termination_terms(self._scene_config, self.options.needed)
+        return termination_terms(self._scene_config, self.options.needed, self.steps_of(POURED_STEPS))
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any

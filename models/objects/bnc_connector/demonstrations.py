@@ -59,7 +59,7 @@ _DEVIATIONS = {
     "Rx": np.array([1.2, 1.2, 1.2, 1.2, 0.5, 0.2, 0.2, 0.15]) * DEGREE,
 }
 _CORRELATION = {"x": 0.22, "y": 0.22, "z": 0.35, "Rz": 0.5, "Ry": 0.3, "Rx": 0.3}  # correlation times [s]
-_CENTRING = 0.9  # part of the mean of the five random curves that is removed
+_CENTERING = 0.9  # part of the mean of the five random curves that is removed
 _TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and correlation time of the lead in time [s]
 
 
@@ -86,7 +86,7 @@ def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
         script_time = np.clip(times + lead, 0.0, script_times[-1])
         scripted.append(np.stack([np.interp(script_time, script_times, column) for column in script.T], axis=1))
         curves.append(np.stack([correlated(rng, times, _CORRELATION[name]) for name in _DEVIATIONS], axis=1))
-    wander = np.stack(curves) - _CENTRING * np.mean(curves, axis=0)
+    wander = np.stack(curves) - _CENTERING * np.mean(curves, axis=0)
     scale = np.stack([np.interp(times, _TIMES, deviation) for deviation in _DEVIATIONS.values()], axis=1)
     return np.stack(scripted) + scale * wander
 

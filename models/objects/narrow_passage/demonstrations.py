@@ -48,7 +48,7 @@ _DEVIATION_Y = [
 _Y = (0.05, 0.95)  # y of start and goal [m]
 _ARRIVAL = 0.95  # part of the duration after which the goal is reached
 _CORRELATION = 0.22  # correlation time of the deviations, as part of the duration
-_CENTRING = 0.7  # part of the mean of the nine random curves that is removed
+_CENTERING = 0.7  # part of the mean of the nine random curves that is removed
 _SMOOTHING = 4.0  # standard deviation of the smoothing [steps]
 
 
@@ -61,7 +61,7 @@ def generate(seed: int = 0) -> Demonstrations:
     covariance = np.exp(-0.5 * ((phase[:, None] - phase) / _CORRELATION) ** 2) + 1e-6 * np.eye(NUM_STEPS)
     noise = rng.standard_normal((NUM_DEMONSTRATIONS, NUM_STEPS, 2))
     curves = np.einsum("ij,mjo->mio", np.linalg.cholesky(covariance), noise)
-    curves -= _CENTRING * curves.mean(axis=0)
+    curves -= _CENTERING * curves.mean(axis=0)
     x = _profile(_MEAN_X, progress) + _profile(_DEVIATION_X, progress) * curves[..., 0]
     y = _Y[0] + (_Y[1] - _Y[0]) * progress + _profile(_DEVIATION_Y, progress) * curves[..., 1]
     outputs = gaussian_filter1d(np.stack([x, y], axis=-1), _SMOOTHING, axis=1, mode="nearest")

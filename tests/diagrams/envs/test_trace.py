@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.trace import EpisodeTrace, mean_jerk
+from guiderail.models.common.errors import InputError
 
 SIGNALS = {"commanded_violation": 1, "measured_violation": 1, "collision": 1, "saturation": 2, "fallback": 1}
 QUIET = {"commanded_violation": -1.0, "measured_violation": -1.0}
@@ -61,6 +62,13 @@ def test_clear_deletes_every_control_step():
     assert empty.pop("max_commanded_violation") == empty.pop("max_measured_violation") == -np.inf
     assert set(empty.values()) == {0.0}
     assert len(trace) == len(trace.force) == 0
+
+
+def test_signal_that_is_missing_is_named():
+    trace = EpisodeTrace(2, 2, 0.1, SIGNALS)
+    with pytest.raises(InputError, match="lacks the signal 'collision'"):
+        trace.append(np.zeros(2), np.zeros(2), 0.0, 0.0, {name: 0.0 for name in SIGNALS if name != "collision"})
+    assert len(trace) == 0
 
 
 def test_mean_jerk_is_that_of_a_cubic():

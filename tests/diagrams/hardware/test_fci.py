@@ -1,6 +1,7 @@
 """Driver on the Franka Control Interface, with a double of its client; `make fci` tests the real client."""
 
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,7 +25,11 @@ WORKCELL = BncWorkcell()
 IMPEDANCE = Impedance().with_max_force(18.0)
 
 
-class NetworkError(Exception):
+class FrankyError(Exception):
+    """Base of the client's errors."""
+
+
+class NetworkError(FrankyError):
     """Error of a lost connection."""
 
 
@@ -104,6 +109,7 @@ def client(robot):
         Robot=connect,
         RealtimeConfig=SimpleNamespace(Ignore=0),
         NetworkException=NetworkError,
+        Exception=FrankyError,
         CartesianReference=lambda target: target.matrix,
         Affine=Affine,
         CartesianImpedanceTrackingMotion=lambda **options: Motion(**options),
@@ -129,6 +135,19 @@ def driver(robot, model):
     assert driver.read() is not None
     driver.configure(make_robot_impedance(model, IMPEDANCE))
     return driver
+
+
+@pytest.mark.parametrize("error", [FrankyError("in motion"), ValueError("mass")])
+def test_configuration_that_the_robot_refuses_is_an_input_error(robot, driver, model, error):
+    robot.set_collision_behavior = Mock(side_effect=error)
+    with pytest.raises(InputError, match="refuses its configuration"):
+        driver.configure(make_robot_impedance(model, IMPEDANCE))
+
+
+def test_defect_of_the_program_is_not_reported_as_a_refusal(robot, driver, model):
+    robot.set_collision_behavior = Mock(side_effect=AttributeError)
+    with pytest.raises(AttributeError):
+        driver.configure(make_robot_impedance(model, IMPEDANCE))
 
 
 def motions(robot):

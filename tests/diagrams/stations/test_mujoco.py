@@ -17,7 +17,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_
 pytest.importorskip("mujoco")
 import mujoco
 
-from guiderail.diagrams.stations.mujoco import MujocoStation
+from guiderail.diagrams.stations.mujoco import MujocoStation, constraint_torques
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
 STIFFNESS = Impedance().stiffness[2]
@@ -244,6 +244,27 @@ def test_engine_has_the_offsets_of_the_task():
     expected = (X_TT @ CONNECTOR.X_FT.inverse()).translation()
     np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)
     np.testing.assert_allclose(model.body("workpiece").pos[:2], info["grasp_offset"][:2], atol=1e-12)
+
+
+SLIDER = """
+<mujoco><option gravity="0 0 0"/><worldbody>
+<geom type="box" size="0.1 0.1 0.1" pos="0.3 0 0"/>
+<body>
+<joint type="slide" axis="1 0 0" frictionloss="2"/><geom type="box" size="0.1 0.1 0.1" mass="1" friction="0"/>
+</body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize(("applied", "expected"), [(1.0, 0.0), (7.0, -7.0)])
+def test_constraint_torques_leave_joint_friction_out(applied, expected):
+    model = mujoco.MjModel.from_xml_string(SLIDER)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qfrc_applied[:] = 0.1 if expected else 0.0, applied  # in contact, or held by the friction
+    for _ in range(2000):
+        mujoco.mj_step(model, data)
+    assert data.qfrc_constraint[0] == pytest.approx(-applied, abs=0.05)
+    assert constraint_torques(model, data)[0] == pytest.approx(expected, abs=0.05)
 
 
 class Unknown:

@@ -6,7 +6,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.task import scripted_pour_aimed, termination_terms
+from guiderail.diagrams.tasks.pouring.task import Pouring, scripted_pour_aimed, termination_terms
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import Ball
 
@@ -18,7 +18,7 @@ def judged(in_mug, fallen):
     """Return success and spill if five of six balls are needed; the others are in the thermos."""
     places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
     balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
-    _, success, spill = termination_terms(CONFIG, needed=5)
+    _, success, spill = termination_terms(CONFIG, needed=5, poured_steps=10)
     return success.condition(balls), spill.condition(balls, balls)
 
 
@@ -46,6 +46,13 @@ def test_balls_lie_in_the_thermos_and_not_in_each_other(number, diameter):
     assert apart.min() >= diameter - 1e-9
     assert all(config.thermos.contains(place) for place in places)
     assert np.abs(places[:, 0]).max() + diameter / 2 <= config.thermos.inner_diameter / 2 + 1e-9
+
+
+@pytest.mark.parametrize("control_period", [0.01, 0.02, 0.05])
+def test_balls_stay_in_the_mug_for_a_tenth_of_a_second(control_period):
+    task = Pouring(EnvConfig.resolve("Pouring", {"control_period": control_period}))
+    _, success, _ = task.termination_terms()
+    assert success.steps * control_period == pytest.approx(0.1)
 
 
 def test_options_that_do_not_go_together_are_refused():

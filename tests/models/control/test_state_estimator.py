@@ -101,6 +101,12 @@ def test_fault_is_reported_during_the_settling_time():
     assert [rig.check() for _ in range(3)][-1] == Fault.NONE
 
 
+@pytest.mark.parametrize(("late", "fault"), [(0.0, Fault.NO_STATUS), (1e-6, Fault.DEADLINE_MISSED)])
+def test_first_check_is_due_at_time_zero(late, fault):
+    rig = Rig()
+    assert rig.check(gap=LIMITS.max_check_interval + late) == fault
+
+
 def test_settling_time_is_exact():
     rig = Rig()
     while rig.check() == Fault.NO_STATUS:

@@ -6,6 +6,7 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.robots.joint_range import JointRange
@@ -70,7 +71,13 @@ def test_gradient_of_the_singular_value_is_that_of_a_difference(model):
     step = 1e-5 * np.array([1.0, -2.0, 1.0, 0.5, -1.0, 1.0, 2.0])
     assert joints._singular_value(q + step)[0] - value == pytest.approx(gradient @ step, rel=1e-2)
     assert len(joints.linearize(POSE)[0]) == 15
-    assert joints.violation(POSE) == max(joint_range(model).violation(POSE), SMALLEST - value)
+    assert joints.violation(POSE) == max(joint_range(model).violation(POSE), (SMALLEST - value) / LEVER)
+
+
+def test_violation_of_the_singular_value_is_an_angle(model):
+    value = joint_range(model)._singular_value(joint_range(model).solve(POSE))[0]
+    for excess in (-0.001, 0.001):  # [m]
+        assert joint_range(model, min_singular_value=value + excess).violation(POSE) == pytest.approx(excess / LEVER)
 
 
 @pytest.mark.parametrize("direction", [[0.6, 0.0, 0.0, 0.0, 0.0, 0.0], [-0.45, 0.0, -0.3, 0.0, 0.0, 0.0]])

@@ -7,11 +7,12 @@ from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
 
 from guiderail import Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segment
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import RigidTransform, transform_to_pose
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.models.templates import load_template
 from guiderail.tools.guided import guide
 
 TOLERANCE = 1e-9
@@ -321,6 +322,20 @@ def test_template_guides_within_its_active_constraints():
         states.add(info["segment"])
     assert len(states) > 1
     assert env.action_space.shape == (3,)
+
+
+def test_template_guide_scales_its_command_in_the_frame():
+    X_WF = RigidTransform(RotationMatrix.MakeZRotation(np.pi / 2), [6.0, -3.0, 3.0])
+    template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: {"mug_tip": X_WF}, 0.02)
+    X_FE = pose_to_transform(np.array([-0.1, -0.2, 0.15, 0.3, 0.1, -0.2]))
+    template_guide.reset(None, None, transform_to_pose(X_WF @ X_FE))
+    template_guide.request(None, None, np.zeros(3), None)
+    command = pose_to_transform(template_guide.finish(None).output)
+    scaled = template_guide.scaled_command()
+    np.testing.assert_allclose(
+        scaled * [0.2, 0.2, 0.2, np.pi, np.pi, np.pi], transform_to_pose(X_WF.inverse() @ command)
+    )
+    assert 0.1 < np.abs(scaled).max() < 1.5
 
 
 def test_gymnasium_checker_accepts_the_environment():

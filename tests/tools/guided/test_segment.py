@@ -16,7 +16,7 @@ def recordings():
 def test_events_are_found_one_after_the_other():
     signals = [np.array([[0], [1], [0], [1], [2]]), np.array([[1], [1], [0], [2], [1]])]
     events = find_events(signals, [lambda s: s[0] == 1, lambda s: s[0] == 2])
-    assert events == [[1, 4], [1, 3]]
+    assert events == [[1, 4], [0, 3]]
     with pytest.raises(InputError, match="event 1 does not occur in recording 0"):
         find_events(signals, [lambda s: s[0] == 2, lambda s: s[0] == 1])
 

@@ -48,6 +48,17 @@ def test_same_seed_gives_the_same_policy_also_when_resumed(trained, tmp_path):
     assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
 
+def test_state_before_the_first_demonstration_is_restored():
+    env = make_environment("NarrowPassage", {"guidance": "kgrl"})
+    before, after = (
+        ChunkLearner(ChunkConfig(**SETTINGS), env, action_repeat=1, seed=0, max_transitions=10) for _ in "ab"
+    )
+    after.restore(*before.state())
+    arrays, values = after.state()
+    assert {name: len(values) for name, values in arrays.items()} == {"observations": 0, "actions": 0, "groups": 0}
+    assert values["episodes"] == 0
+
+
 def test_learner_is_refused_when_the_commands_are_in_another_process():
     env = make_environment("NarrowPassage", {"guidance": "kgrl"})
     with pytest.raises(InputError, match="pipelined"):

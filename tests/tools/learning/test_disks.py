@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
@@ -83,6 +84,16 @@ def test_run_is_unchanged_when_its_checkpoint_does_not_fit(lost, module_config, 
     with refused("belongs to other settings"):
         run_training(folder, module_config, resume=True)
     assert content(folder) == before
+
+
+def test_defect_of_a_learner_is_not_reported_as_other_settings(module_config, tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    run_training(folder, replace(module_config, episodes=3))
+    monkeypatch.setattr(
+        "guiderail.tools.learning.off_policy.OffPolicyLearner.restore", Mock(side_effect=AttributeError)
+    )
+    with pytest.raises(AttributeError):
+        run_training(folder, module_config, resume=True)
 
 
 def test_run_starts_again_when_killed_before_its_configuration(whole, module_config, tmp_path):

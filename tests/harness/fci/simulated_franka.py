@@ -1,4 +1,4 @@
-"""Rehearsal of a Franka through its own protocol: insert, lock, stop, and the loss of the robot.
+"""Run of a simulated Franka through its own protocol: insert, lock, stop, and the loss of the robot.
 
 Run by `make fci`, in an environment with franky and franky-sim. The robot is a process of its own that answers
 libfranka's network protocol; its clock runs at a rate of the wall clock's, because a busy machine does not reach 1 kHz.
@@ -29,7 +29,7 @@ DOWN, TURN = 0.01, 0.25  # speed of the insertion [m/s] and of the turn [rad/s],
 PRESSED = -0.006  # commanded height while the plug is turned [m]
 
 
-class Rehearsal:
+class SimulatedRun:
     """Hardware station on the simulated robot."""
 
     def __init__(self, rate: float):
@@ -71,8 +71,8 @@ class Rehearsal:
         return f"{state.name}, {fault.description}; at {np.round(position, 2)} mm, turned {turn:.1f} degrees"
 
 
-def rehearse(rate: float) -> list[str]:
-    """Run the rehearsal; return the names of failed checks."""
+def run_checks(rate: float) -> list[str]:
+    """Run the sequence of motions; return the names of failed checks."""
     failures = []
 
     def check(name: str, passed: bool, description: str) -> None:
@@ -80,7 +80,7 @@ def rehearse(rate: float) -> list[str]:
         if not passed:
             failures.append(name)
 
-    run = Rehearsal(rate)
+    run = SimulatedRun(rate)
     code = (
         "from guiderail.tools.hardware.sim_driver import run_sim_driver\n"
         f"run_sim_driver({run.host!r}, 1e4, 60.0, rate={rate!r}, driver='fci', log=lambda _: None)"
@@ -111,4 +111,4 @@ def rehearse(rate: float) -> list[str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rate", type=float, default=0.1, help="rate of the robot's clock (default: 0.1)")
-    sys.exit(bool(rehearse(parser.parse_args().rate)))
+    sys.exit(bool(run_checks(parser.parse_args().rate)))
