@@ -25,7 +25,7 @@ class _Page(HTMLParser):
 def broken(folder: Path) -> list[str]:
     """Return a sentence for each link without a target."""
     pages = {path.resolve(): _Page(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html")}
-    found = []
+    result = []
     for path, page in pages.items():
         for link in page.links:
             parts = urlsplit(link)
@@ -33,10 +33,10 @@ def broken(folder: Path) -> list[str]:
                 continue
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             if not target.is_file():
-                found.append(f"{path.relative_to(folder.resolve())}: {link} has no target file")
+                result.append(f"{path.relative_to(folder.resolve())}: {link} has no target file")
             elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
-                found.append(f"{path.relative_to(folder.resolve())}: {link} has no anchor")
-    return found
+                result.append(f"{path.relative_to(folder.resolve())}: {link} has no anchor")
+    return result
 
 
 if __name__ == "__main__":

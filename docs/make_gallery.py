@@ -183,9 +183,14 @@ def _learned(env: Any) -> PolicyFn:
     """Train the policy of the demo."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        given = {"guidance": "skgrl"}
+        arguments = {"guidance": "skgrl"}
         start_or_resume(
-            "NarrowPassage", out, environment=given, preset="tqc_cheap_correlated", episodes=LEARNING_EPISODES, seed=0
+            "NarrowPassage",
+            out,
+            environment=arguments,
+            preset="tqc_cheap_correlated",
+            episodes=LEARNING_EPISODES,
+            seed=0,
         )
         return Policy.load(out)
 
@@ -194,8 +199,8 @@ def _learned_on_arm(env: Any) -> PolicyFn:
     """Train KGRL on the hard connector with an arm, which takes some minutes."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        given = ON_ARM | {"reward": "aligned"}
-        start_or_resume("BncConnector", out, environment=given, settings={"symmetry": "near"}, episodes=60, seed=0)
+        arguments = ON_ARM | {"reward": "aligned"}
+        start_or_resume("BncConnector", out, environment=arguments, settings={"symmetry": "near"}, episodes=60, seed=0)
         return Policy.load(out)
 
 

@@ -65,12 +65,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def sections(doc: str) -> tuple[str, dict[str, list[tuple[str, str]]]]:
     """Split a docstring into its text and its sections, each a list of names and descriptions."""
     text: list[str] = []
-    found: dict[str, list[tuple[str, str]]] = {}
+    result: dict[str, list[tuple[str, str]]] = {}
     current = None
     for line in doc.splitlines():
         head = SECTION.match(line)
         if head:
-            current = found.setdefault(head[1], [])
+            current = result.setdefault(head[1], [])
         elif current is not None and (line.startswith("    ") or not line.strip()):
             if not line.strip():
                 continue
@@ -84,14 +84,14 @@ def sections(doc: str) -> tuple[str, dict[str, list[tuple[str, str]]]]:
         else:
             current = None
             text.append(line)
-    return "\n".join(text).strip(), found
+    return "\n".join(text).strip(), result
 
 
 def documented(thing: Any) -> str:
     """Return a docstring as Markdown: its text, and a table for each section."""
-    text, found = sections(DIAGRAM.sub("", (inspect.getdoc(thing) or "") + "\n"))
+    text, result = sections(DIAGRAM.sub("", (inspect.getdoc(thing) or "") + "\n"))
     page = paragraphs(text) + "\n\n"
-    for name, rows in found.items():
+    for name, rows in result.items():
         if name in WORDS:
             page += table([WORDS[name], "meaning"], [(code(n), cell(words)) for n, words in rows])
         else:
@@ -144,8 +144,8 @@ def field_words(kind: type) -> dict[str, str]:
             if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
                 comment = re.search(r"#\s(.*)$", lines[(node.end_lineno or node.lineno) - 1])
                 words[node.target.id] = comment[1] if comment else ""
-        _, found = sections(inspect.cleandoc(vars(base).get("__doc__") or ""))
-        for names, text in (*found.get("Attributes", ()), *found.get("Args", ())):
+        _, result = sections(inspect.cleandoc(vars(base).get("__doc__") or ""))
+        for names, text in (*result.get("Attributes", ()), *result.get("Args", ())):
             words |= {name.strip(" *"): text for name in re.split("[,/]", names)}
     return words | {name: one.description for name, one in getattr(kind, "model_fields", {}).items() if one.description}
 
@@ -213,7 +213,7 @@ def ports(system: type) -> list[tuple[str, str, str]]:
             name, _, more = line.partition(" (")
             own = vars(system).get(f"get_{name}_{kind}_port") or vars(system).get(f"get_{kind}_port")
             words = inspect.getdoc(own) if own else more.rstrip(")")
-            text, found = sections(words or "")
+            text, result = sections(words or "")
             is_name = name.isidentifier()
             rows.append(
                 (
@@ -221,7 +221,7 @@ def ports(system: type) -> list[tuple[str, str, str]]:
                     code(name) if is_name else cell(name),
                     cell(
                         text.removeprefix("Return the port of the ")
-                        or " ".join(words for rows_of in found.values() for _, words in rows_of)
+                        or " ".join(words for rows_of in result.values() for _, words in rows_of)
                     ),
                 )
             )
@@ -322,9 +322,9 @@ def command() -> str:
             if parameter.name == "help":
                 continue
             words = expand_choices(parameter.help or "")
-            given = parameter.opts + parameter.secondary_opts
-            is_option = given[0].startswith("-")
-            shown = ", ".join(given) if is_option else parameter.metavar or parameter.name.upper()
+            arguments = parameter.opts + parameter.secondary_opts
+            is_option = arguments[0].startswith("-")
+            shown = ", ".join(arguments) if is_option else parameter.metavar or parameter.name.upper()
             is_flag = getattr(parameter, "is_flag", False)
             if is_option and not is_flag:
                 shown += f" {parameter.metavar or kinds[parameter.name]}"
@@ -339,11 +339,11 @@ def command() -> str:
 def _kinds(function: Any) -> dict[str, str]:
     """Return the kind of value of each parameter of a command."""
     words = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH"}
-    found = {}
+    result = {}
     for name, annotation in typing.get_type_hints(function).items():
         kinds = [one for one in typing.get_args(annotation) or (annotation,) if one is not type(None)]
-        found[name] = words.get(kinds[0], "TEXT") if kinds else ""
-    return found
+        result[name] = words.get(kinds[0], "TEXT") if kinds else ""
+    return result
 
 
 def options() -> str:

@@ -140,9 +140,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("file", type=Path, nargs="?", default=SHIPPED, help="YAML file of skills (default: shipped)")
     parser.add_out(None)
     parser.add_json()
-    given = parser.parse_args(arguments)
-    result = certify_skills(given.out, load_declaration(given.file))
-    print_result(result, as_json=given.json)
+    args = parser.parse_args(arguments)
+    result = certify_skills(args.out, load_declaration(args.file))
+    print_result(result, as_json=args.json)
     if "failed" in result:
         raise RunsFailedError(result["failed"], None)
 

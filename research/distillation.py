@@ -45,9 +45,9 @@ def options_of(variant: str, task: str, environment: Mapping[str, Any], student:
         student: Folder of the student's run.
         repeat: Control steps of an action, after which the student predicts again.
     """
-    given = VARIANTS[variant]
-    further = {"base_policy": str(student), "replan_steps": repeat} if given else {}
-    return beyond_defaults(task, environment) | given | further
+    arguments = VARIANTS[variant]
+    further = {"base_policy": str(student), "replan_steps": repeat} if arguments else {}
+    return beyond_defaults(task, environment) | arguments | further
 
 
 def evaluate_variant(teacher: RunFolder, student: Path, variant: str, episodes: int, seed: int) -> pd.DataFrame:

@@ -78,9 +78,9 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[*POLICIES, []], help="Policies; all by default.")
     parser.add_argument("--out", type=Path, default=Path("runs/pretrained"), help="Folder of the runs.")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="Held-out episodes of each policy.")
-    given = parser.parse_args()
-    for name in given.names or POLICIES:
-        print(f"{name}: {make(name, given.out, given.episodes).sentence}", flush=True)
+    args = parser.parse_args()
+    for name in args.names or POLICIES:
+        print(f"{name}: {make(name, args.out, args.episodes).sentence}", flush=True)
 
 
 if __name__ == "__main__":

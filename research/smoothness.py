@@ -336,9 +336,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the actions (default: 0)")
     parser.add_out(None)
     parser.add_json()
-    given = parser.parse_args(arguments)
-    settings = {name: getattr(given, name) for name in ("episodes", "action_scale", "outputs", "seed")}
-    print_result(smoothness(given.out, **settings), as_json=given.json)
+    args = parser.parse_args(arguments)
+    settings = {name: getattr(args, name) for name in ("episodes", "action_scale", "outputs", "seed")}
+    print_result(smoothness(args.out, **settings), as_json=args.json)
 
 
 if __name__ == "__main__":

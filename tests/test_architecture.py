@@ -62,12 +62,12 @@ def test_robot_names_occur_in_their_own_files_only():
 
 def modules():
     """Return the path of every module of the package, by name."""
-    found = {}
+    result = {}
     for folder in MAY_IMPORT:
         for path in (ROOT / folder).rglob("*.py"):
             parts = ["guiderail", *path.relative_to(ROOT).with_suffix("").parts]
-            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return found
+            result[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return result
 
 
 def test_modules_have_no_import_cycle():

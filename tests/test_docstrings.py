@@ -31,18 +31,18 @@ def functions(thing):
     """Return a function itself, or the constructor and the public methods that a class defines."""
     if inspect.isfunction(thing):
         return {thing.__name__: thing}
-    found = {}
+    result = {}
     for name, value in vars(thing).items():
         function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
         function = function.fget if isinstance(function, property) else function
         if dataclasses.is_dataclass(thing) and name in {one.name for one in dataclasses.fields(thing)}:
             continue  # the default value is a function
         if inspect.isfunction(function) and (name == "__init__" or not name.startswith("_")):
-            found[name] = function
+            result[name] = function
     # The constructor of a dataclass takes its fields, which the class documents; a protocol has no constructor.
     if dataclasses.is_dataclass(thing) or getattr(thing, "_is_protocol", False):
-        found.pop("__init__", None)
-    return found
+        result.pop("__init__", None)
+    return result
 
 
 def documented(function, thing):
@@ -53,8 +53,8 @@ def documented(function, thing):
 
 def section(doc, name):
     """Return the text of a section of a docstring."""
-    found = re.search(rf"^{name}:\n((?: .*\n?|\n)+)", doc, re.MULTILINE)
-    return found[1] if found else ""
+    result = re.search(rf"^{name}:\n((?: .*\n?|\n)+)", doc, re.MULTILINE)
+    return result[1] if result else ""
 
 
 def arguments(function):
@@ -70,14 +70,14 @@ def refuses(function):
 
 def entries(described):
     """Return the description of each argument in a section."""
-    found, names = {}, []
+    result, names = {}, []
     for line in described.splitlines():
         entry = re.match(r"^    (\S[\w, /*]*):\s+(.*)$", line)
         if entry:
             names = [name.strip(" *") for name in re.split("[,/]", entry[1])]
         for name in names:
-            found[name] = f"{found.get(name, '')} {entry[2] if entry else line.strip()}"
-    return found
+            result[name] = f"{result.get(name, '')} {entry[2] if entry else line.strip()}"
+    return result
 
 
 # (N,), (n, 6), (H+1, O, O) or (∗, 7), or the word "shape".

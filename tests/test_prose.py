@@ -86,8 +86,8 @@ def test_no_docstring_begins_with_a_fragment():
     violations = []
     for path in tracked(".py"):
         for line, text in docstrings(ast.parse(path.read_text(encoding="utf-8"))):
-            if found := FRAGMENT.match(text):
-                violations.append((path.relative_to(ROOT), line, found[1]))
+            if result := FRAGMENT.match(text):
+                violations.append((path.relative_to(ROOT), line, result[1]))
     assert not violations, report(violations)
 
 

@@ -245,10 +245,10 @@ class Loop:
         duration = task.num_steps * self.station.control_period
         sizes = {signal: port.size() for signal, port in ports.items()}
         waits = self.guidance.HasOutputPort(MOTION_TIME) and len(names) < len(terms)
-        seen = Observation(terms, sizes, duration, task.clip, task.name, waits=waits)
+        observation = Observation(terms, sizes, duration, task.clip, task.name, waits=waits)
         if waits:
             ports[MOTION_TIME] = self.guidance.GetOutputPort(MOTION_TIME)
-        diagram = self.builder.AddNamedSystem(name, seen)
+        diagram = self.builder.AddNamedSystem(name, observation)
         for signal, port in ports.items():
             self.builder.Connect(port, diagram.GetInputPort(signal))
         return diagram.space, diagram.get_observation_output_port()
@@ -387,13 +387,13 @@ def build_skill_diagram(
 
         policy = PolicySystem(policy, seen_as, action.size(), task.config.action_repeat * station.control_period)
     builder.AddNamedSystem("policy", policy)
-    seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
-    if seen.size() != loop.observation.size() or acts.size() != action.size():
+    observation, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
+    if observation.size() != loop.observation.size() or acts.size() != action.size():
         raise InputError(
             f"a policy of {task.name} takes {loop.observation.size()} numbers and returns {action.size()}, "
-            f"this one {seen.size()} and {acts.size()}: it was trained with other options"
+            f"this one {observation.size()} and {acts.size()}: it was trained with other options"
         )
-    builder.Connect(loop.observation, seen)
+    builder.Connect(loop.observation, observation)
     builder.Connect(acts, action)
     for name in ("pose", "wrench", "contact_force"):
         builder.ExportOutput(station.GetOutputPort(name), name)

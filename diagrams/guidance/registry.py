@@ -59,8 +59,8 @@ class GuidanceKind:
 
 
 def _missing_requirements(needs: tuple[tuple[str, ...], ...], known: Collection[str]) -> tuple[str, ...]:
-    lacking = [tuple(one for one in needed if one not in known) for needed in needs]
-    return min(lacking, key=len, default=())
+    missing = [tuple(one for one in needed if one not in known) for needed in needs]
+    return min(missing, key=len, default=())
 
 
 GUIDANCE: Registry[GuidanceKind] = Registry(
@@ -113,11 +113,11 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
         InputError: If there is no such kind, or a requirement is missing, which the message names.
     """
     kind = GUIDANCE.get(name)
-    lacking = kind.missing_requirements(known)
-    if lacking:
-        words = " and ".join(REQUIREMENTS.get(one, one) for one in lacking)
+    missing = kind.missing_requirements(known)
+    if missing:
+        texts = " and ".join(REQUIREMENTS.get(one, one) for one in missing)
         raise InputError(
-            f"guidance '{name}' needs {words}, which {task} doesn't have: use {', '.join(possible_guidance(known))}"
+            f"guidance '{name}' needs {texts}, which {task} doesn't have: use {', '.join(possible_guidance(known))}"
         )
     return kind
 

@@ -189,8 +189,8 @@ class LinearConstraints:
         else:
             flat = np.concatenate([steps[0].reshape(len(steps[0]), -1), steps[1]], axis=1)
             _, first, which = np.unique(flat, axis=0, return_index=True, return_inverse=True)
-            found = {at: _max_margin_point(steps[0][at], steps[1][at]) for at in np.sort(first).tolist()}
-            interior = np.array([found[at] for at in first[which.ravel()].tolist()])
+            points = {at: _max_margin_point(steps[0][at], steps[1][at]) for at in np.sort(first).tolist()}
+            interior = np.array([points[at] for at in first[which.ravel()].tolist()])
         missing = steps[1] - np.einsum("nfo,no->nf", steps[0], interior)
         size = np.abs(steps[1]) + np.einsum("nfo,no->nf", np.abs(steps[0]), np.abs(interior))
         is_contradiction = ~(missing <= _ROUNDING * size).all(axis=1)

@@ -93,11 +93,11 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
             if worst > TOLERANCE:
                 yield Finding(True, f"{name} is not idempotent: projecting twice moves by {worst:.2g} m or rad")
         outside = np.zeros(len(state.active_constraints))
-        again = 0.0
+        repeated = 0.0
         for X, frames in scenes:
             X_WP = template.project(number, X, frames)
             outside += [c.violation(X_WP, frames) > TOLERANCE for c in state.active_constraints]
-            again = max(again, pose_distance(template.project(number, X_WP, frames), X_WP))
+            repeated = max(repeated, pose_distance(template.project(number, X_WP, frames), X_WP))
         for i in np.flatnonzero(outside).tolist():
             kind = type(state.active_constraints[i]).__name__
             if outside[i] == len(scenes):
@@ -108,8 +108,8 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
                     "put it last, or make room for both"
                 )
             yield Finding(True, f"{state.name}: active constraint {i + 1} ({kind}) {why}")
-        if again > TOLERANCE and not outside.any():
-            yield Finding(True, f"{state.name}: the constraints in their order are not idempotent ({again:.2g})")
+        if repeated > TOLERANCE and not outside.any():
+            yield Finding(True, f"{state.name}: the constraints in their order are not idempotent ({repeated:.2g})")
 
 
 def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:

@@ -27,17 +27,17 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_environment()
     parser.add_json()
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     result = fuzz(
-        find_task(given.task, given.imports)[0],
-        episodes=given.episodes,
-        steps=given.steps,
-        seed=given.seed,
-        out=given.out,
-        environment=environment_options(given.env),
+        find_task(args.task, args.imports)[0],
+        episodes=args.episodes,
+        steps=args.steps,
+        seed=args.seed,
+        out=args.out,
+        environment=environment_options(args.env),
         report=lambda line: print(line, file=sys.stderr, flush=True),
     )
-    print(json.dumps(result, indent=None if given.json else 2))
+    print(json.dumps(result, indent=None if args.json else 2))
     return 1 if result["failures"] else 0
 
 

@@ -48,17 +48,17 @@ def run_benchmark(
     """
     if name not in BENCHMARKS:
         raise InputError(f"there is no benchmark {name!r}: {did_you_mean(name, BENCHMARKS)}")
-    given = {option: value for option, value in options.items() if value}
-    if given and name not in WITH_TASK:
-        raise InputError(f"the benchmark {name} has no task: leave {' and '.join(given)} out")
+    arguments = {option: value for option, value in options.items() if value}
+    if arguments and name not in WITH_TASK:
+        raise InputError(f"the benchmark {name} has no task: leave {' and '.join(arguments)} out")
     if picture is not None and name not in WITH_PICTURE:
         raise InputError(f"the benchmark {name} has no picture: leave --picture out")
     if picture is not None:
         check_picture(picture)
     if name not in WITH_IMPORTS:
-        given.pop("imports", None)
+        arguments.pop("imports", None)
     module = import_module(f"research.benchmarks.{name}")
-    results = module.measure(**given)
+    results = module.measure(**arguments)
     if picture is not None:
         module.draw(results, picture)
     return results, module.show

@@ -14,11 +14,11 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--picture", type=Path, help="file of a picture of the results, of time_step and engines")
     parser.add_environment()
     parser.add_json()
-    given = parser.parse_args(arguments)
-    task, modules = (None, ()) if given.task is None else find_task(given.task, given.imports)
-    options = {"task": task, "environment": environment_options(given.env), "imports": modules}
-    results, show = run_benchmark(given.name, picture=given.picture, **options)
-    if given.json:
+    args = parser.parse_args(arguments)
+    task, modules = (None, ()) if args.task is None else find_task(args.task, args.imports)
+    options = {"task": task, "environment": environment_options(args.env), "imports": modules}
+    results, show = run_benchmark(args.name, picture=args.picture, **options)
+    if args.json:
         print_result(results, as_json=True)
     else:
         show(results)

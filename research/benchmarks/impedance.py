@@ -1,9 +1,9 @@
 """Comparison of the gantry's two impedances: `python -m research.benchmarks impedance`.
 
-One consists of springs and dampers of the gantry's joints, which the plant solves with the contact. The other is a
-Cartesian impedance controller as on an arm, whose forces are constant during a plant step. They have the same
-stiffness, damping ratio and limits. A scripted insertion is compared with its finest time step. The demonstration alone
-and the scripted policy act in the same held-out episodes of the connector under both.
+`joint` consists of springs and dampers of the gantry's joints, which the plant solves with the contact. `cartesian` is
+the Cartesian impedance controller of the arm, whose forces are constant during a plant step. They have the same
+stiffness, damping ratio and limits. A scripted insertion at several time steps is compared with the insertion at the
+finest one. The demonstration alone and the scripted policy act in the same held-out episodes with each impedance.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ CONTROLS = ("joint", "cartesian")
 TIME_STEPS = {"joint": (1, 2, 4, 16), "cartesian": (4, 8, 16)}  # plant steps per control period; the last is the finest
 DIFFICULTIES = ("standard", "hard")
 POLICIES = {"demonstration": "zero", "scripted": "scripted"}
-EPISODES = 10  # of each policy
-RESPONSE = 15  # control periods
+EPISODES = 10  # number of held-out episodes of each policy
+RESPONSE = 15  # duration of a step response [control periods]
 STEP = np.array([4.0 * MM, -3.0 * MM, 5.0 * MM, 0.05, -0.04, 0.03])  # step of the desired pose in free space [m, rad]
 STATISTICS = (
     "success_rate",
@@ -99,6 +99,7 @@ def step_response(control: str, time_step: float | None = None) -> dict[str, Any
 
 
 def _difference(poses: np.ndarray, others: np.ndarray, name: str) -> dict[str, float]:
+    """Return the RMS distance [m] and the largest difference of an angle [rad] of two motions, columns `name`_…."""
     away = np.linalg.norm((poses - others)[:, :3], axis=1)
     turned = np.abs((poses - others)[:, 3:])
     return {f"{name}_position_rms": float(np.sqrt((away**2).mean())), f"{name}_angle_most": float(turned.max())}
@@ -112,8 +113,8 @@ def _episodes(difficulty: str, name: str, control: str) -> dict[str, Any]:
     rows = evaluate_policy(env, act, episodes=EPISODES, options={"new_run": True})
     spent = time.process_time() - begin
     env.close()
-    of = {"difficulty": difficulty, "policy": name, "control": control, "episodes": EPISODES}
-    return of | summary(rows, STATISTICS) | {"seconds_per_1000_steps": 1000.0 * spent / float(rows["steps"].sum())}
+    labels = {"difficulty": difficulty, "policy": name, "control": control, "episodes": EPISODES}
+    return labels | summary(rows, STATISTICS) | {"seconds_per_1000_steps": 1000.0 * spent / float(rows["steps"].sum())}
 
 
 def show(results: dict[str, Any]) -> None:

@@ -119,8 +119,8 @@ def timed_parts() -> Iterator[Profiler]:
 
 def _callbacks() -> Iterator[tuple[type, str]]:
     """Yield the methods of every system and of its support classes, which are all that Drake calls."""
-    for found in pkgutil.walk_packages(guiderail.systems.__path__, "guiderail.systems."):
-        module = import_module(found.name)
+    for module_info in pkgutil.walk_packages(guiderail.systems.__path__, "guiderail.systems."):
+        module = import_module(module_info.name)
         for kind in vars(module).values():
             if inspect.isclass(kind) and kind.__module__ == module.__name__:
                 for name, value in vars(kind).items():

@@ -30,14 +30,14 @@ def reproduce(
     """Reproduce one figure or table.
 
     Args:
-        figure: Its number in the thesis, such as "4.2" or "table 3.3".
-        seeds: Runs of each method, for figures that train.
-        episodes: Episodes of each run; the figure's own number by default.
+        figure: Number of the figure or table in the thesis, such as "4.2" or "table 3.3".
+        seeds: Number of training runs of each method; unused if the figure needs no training.
+        episodes: Number of training episodes of each run; each figure has its own default.
         out: Folder of pictures, tables and runs. Finished runs in it are reused, also by other figures.
 
     Returns:
-        `figure`, `picture`, `table`, the figure's own results, and what the thesis shows. The same is written as JSON
-        next to the table, with the command and its duration, for `python -m research.results`.
+        `figure`, `picture`, `table`, the figure's own results, and the result in the thesis. They are also
+        written as JSON next to the table, with the command and the duration, for `python -m research.results`.
 
     Raises:
         InputError: For an unknown figure or a number out of range.

@@ -14,9 +14,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--episodes", type=int, help="episodes of each run (default: the figure's own)")
     parser.add_out("reproductions")
     parser.add_json()
-    given = parser.parse_args(arguments)
-    result = reproduce(given.figure, seeds=given.seeds, episodes=given.episodes, out=given.out)
-    print_result(result, as_json=given.json)
+    args = parser.parse_args(arguments)
+    result = reproduce(args.figure, seeds=args.seeds, episodes=args.episodes, out=args.out)
+    print_result(result, as_json=args.json)
 
 
 if __name__ == "__main__":

@@ -140,7 +140,7 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
         f"{APPROACH:g} per meter gained; {NEAR_BONUS:g} per action within {1e3 * NEAR:g} mm; "
         f"tilting towards the mug {TILT / 4:g} per radian, turning otherwise -0.25; {collision}"
     )
-    found = _pouring(out, "sac", seeds, episodes, ("rl_shaped", "rl_sct_shaped"))
+    result = _pouring(out, "sac", seeds, episodes, ("rl_shaped", "rl_sct_shaped"))
     rows = [
         {
             "state": state.name,
@@ -152,14 +152,14 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
     endings = {
         method: ", ".join(f"{runs[f'{ending}_percent'].mean():.0f} % {ending}" for ending in ENDINGS)
         + f" (runs: {len(runs)})"
-        for method, runs in found.groupby("method")
+        for method, runs in result.groupby("method")
     }
     described = {"reward function": endings["rl_shaped"], "shared control template": endings["rl_sct_shaped"]}
     rows.append({"state": "endings in training (SAC)", **described})
     picture = out / "table_3_3.png"
     draw(template, picture)
     table = write_table(out / "table_3_3", rows)
-    return {"picture": str(picture), "table": str(table), **_run_numbers(found), "condition": POURING}
+    return {"picture": str(picture), "table": str(table), **_run_numbers(result), "condition": POURING}
 
 
 def _pouring(
@@ -167,15 +167,15 @@ def _pouring(
 ) -> pd.DataFrame:
     """Return a row for each run: of all seeds in the folder, and of new ones if those are fewer than `seeds`."""
     study = figure_study(f"pouring_{algorithm}", seeds=seeds, episodes=episodes, methods=methods, evaluate=False)
-    wanted = {}
+    selected = {}
     for method, known in study.methods.items():
         folder = Job(study, method, study.seeds[0], out).folder.path
         done = folder.parent.glob(folder.name.removesuffix(str(study.seeds[0])) + "*/policy.json")
-        found = sorted(int(file.parent.name.split("-")[-1]) for file in done)
-        others = (seed for seed in itertools.count(study.seeds[0]) if seed not in found)
-        seeds_of = sorted(found + list(itertools.islice(others, max(seeds - len(found), 0))))
-        wanted[method] = known.model_copy(update={"seeds": tuple(seeds_of)})
-    rows = run_study(study.model_copy(update={"methods": wanted}), out)
+        result = sorted(int(file.parent.name.split("-")[-1]) for file in done)
+        others = (seed for seed in itertools.count(study.seeds[0]) if seed not in result)
+        seeds_of = sorted(result + list(itertools.islice(others, max(seeds - len(result), 0))))
+        selected[method] = known.model_copy(update={"seeds": tuple(seeds_of)})
+    rows = run_study(study.model_copy(update={"methods": selected}), out)
     percent = {f"{e}_percent": 100.0 * rows[f"training_ended_in_{e}"] / rows["training_episodes"] for e in ENDINGS}
     return rows.assign(**percent)
 

@@ -40,9 +40,9 @@ from research.figures.runs import (
 METHODS = ("kgrl", "skgrl")
 VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ [m²]
 THESIS_VARIANCE = 1e-6  # ρ of the thesis [m²]
-ACTION_REPEATS = (1, 5)  # control steps of an action: in the thesis, and here
-EPISODES = 10  # number of episodes in which figure 5.7 looks for a failure, and for a success
-# Position in y at the push, and displacement in x [m]. The last push of each position leads into the zone.
+ACTION_REPEATS = (1, 5)  # control steps per action, in the thesis and in the studies of this project
+EPISODES = 10  # largest number of episodes searched for a failure, and for a success, in figure 5.7
+# Position in y at which the robot is pushed, and displacement in x [m]. The last two pushes end in the restricted zone.
 PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10), (0.20, 0.15), (0.78, 0.20))
 
 
@@ -54,7 +54,7 @@ def primitive_of(kind: str, variance: float = THESIS_VARIANCE) -> LcNsKmp:
 
 
 def figure_5_2(out: Path) -> dict[str, Any]:
-    """Draw reference windows, modified windows and the executed path of an exploring motion at the same RMS."""
+    """Draw reference windows, modified windows and executed paths of KGRL and sKGRL at the same exploration RMS."""
     figure, (axes,) = new_figure(1, 2, (11, 6))
     rows: list[dict[str, Any]] = []
     for axis, kind in zip(axes, ("kgrl", "skgrl"), strict=True):
@@ -77,7 +77,7 @@ def figure_5_2(out: Path) -> dict[str, Any]:
                 "history_variance": primitive.history_variance if primitive.history else None,
                 "mean_jump_between_windows": float(jumps.mean()),
                 "largest_jump_between_windows": float(jumps.max()),
-                "rms_deviation": float(np.sqrt(((executed - _quiet(primitive)) ** 2).mean())),
+                "rms_deviation": float(np.sqrt(((executed - _zero_action_path(primitive)) ** 2).mean())),
             }
         )
     smaller = rows[0]["mean_jump_between_windows"] / rows[1]["mean_jump_between_windows"]
@@ -102,8 +102,8 @@ def _explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> tuple[range, li
     return steps, windows, np.array(executed)
 
 
-def _quiet(primitive: LcNsKmp) -> np.ndarray:
-    """Return the motion without actions, (N, 2)."""
+def _zero_action_path(primitive: LcNsKmp) -> np.ndarray:
+    """Return the motion of the primitive with zero actions, (N, 2)."""
     return _explore(primitive, np.zeros(primitive.num_outputs), 0)[2]
 
 
@@ -122,12 +122,12 @@ def _draw_spread(axis: Axes, primitive: LcNsKmp) -> None:
 
 
 def figure_5_3(out: Path) -> dict[str, Any]:
-    """Draw the narrow passage, as figure 4.3."""
+    """Draw the narrow passage; the picture is the same as in figure 4.3."""
     return figure_4_3(out, "figure_5_3")
 
 
 def figure_5_4(out: Path) -> dict[str, Any]:
-    """Draw recovery from pushes at points of large and small demonstration variance, also into the restricted zone."""
+    """Draw the recovery from pushes, where the demonstrations vary much and where they vary little."""
     env: Any = make_environment(
         TASK, {"guidance": "skgrl", "action_repeat": 1, "history": 1, "history_source": "measured"}
     )
@@ -166,7 +166,7 @@ def figure_5_4(out: Path) -> dict[str, Any]:
 
 
 def _run(env: Any, push: tuple[int, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Run an episode without actions and with a push; return measured and commanded path and its row."""
+    """Run an episode with zero actions and a push (step, offset) or None; return measured path, commanded path, row."""
 
     def act(observation: np.ndarray) -> np.ndarray:
         if push is not None and len(env.unwrapped.trace) == push[0]:
@@ -209,12 +209,12 @@ def _recovery(
 
 
 def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
-    """Draw a motion of KGRL and five of sKGRL, and the ratio of jerks at the same exploration RMS over ρ.
+    """Draw one motion of KGRL, five of sKGRL, and the ratio of their jerks against ρ at the same exploration RMS.
 
     Args:
-        out: Folder.
+        out: Folder of the picture and the table.
         seeds: Number of seeds of the random actions.
-        episodes: Episodes of each seed.
+        episodes: Number of episodes of each seed.
     """
     figure, (axes,) = new_figure(1, 3, (14, 5.4))
     rows: list[dict[str, Any]] = []
@@ -236,11 +236,11 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
             for column in ("commanded", "measured"):
                 row[f"times_below_kgrl_{column}"] = rough[f"jerk_{column}"] / row[f"jerk_{column}"]
             rows.append(row)
-    for axis, kind, count, words in ((axes[0], "kgrl", 1, "one motion"), (axes[1], "skgrl", 5, "five motions")):
+    for axis, kind, count, caption in ((axes[0], "kgrl", 1, "one motion"), (axes[1], "skgrl", 5, "five motions")):
         draw_passage(axis)
         for row in _explore_in_simulation(kind, THESIS_VARIANCE, ACTION_REPEATS[0], range(1), count):
             axis.plot(*row["commanded"].T, linewidth=1, color=color(kind) if count == 1 else None)
-        axis.set_title(f"{label(kind)}, {words}")
+        axis.set_title(f"{label(kind)}, {caption}")
     for action_repeat, shade in zip(ACTION_REPEATS, ("tab:blue", "tab:orange"), strict=True):
         for column, style in (("commanded", "o-"), ("measured", "x--")):
             times = [
@@ -248,8 +248,8 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
                 for row in rows
                 if row["action_repeat"] == action_repeat and row["method"] != label("kgrl")
             ]
-            words = f"{column}, an action lasts {action_repeat} control step{'s' if action_repeat > 1 else ''}"
-            axes[2].loglog(VARIANCES, times, style, color=shade, label=words)
+            caption = f"{column}, an action lasts {action_repeat} control step{'s' if action_repeat > 1 else ''}"
+            axes[2].loglog(VARIANCES, times, style, color=shade, label=caption)
     axes[2].axhline(1.0, color="0.6", linewidth=0.8)
     axes[2].set(xlabel="history variance ρ [m²]", ylabel="KGRL's mean jerk / sKGRL's, at the same exploration RMS")
     axes[2].legend(frameon=False, fontsize=8)
@@ -270,7 +270,7 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
 def _explore_in_simulation(
     kind: str, variance: float, action_repeat: int, seeds: Sequence[int], episodes: int
 ) -> list[dict[str, Any]]:
-    """Run episodes of random actions, with gains calibrated to an RMS of one standard deviation."""
+    """Return the rows of episodes of random actions, with gains for an RMS of one standard deviation."""
     gains = tuple(rms_gains(primitive_of(kind, variance), action_repeat=action_repeat).tolist())
     arguments = {"guidance": kind, "action_repeat": action_repeat, "history_variance": variance, "gains": gains}
     env = make_environment(TASK, arguments)
@@ -281,7 +281,7 @@ def _explore_in_simulation(
 
 def _smoothness(kind: str, variance: float, action_repeat: int, episode_rows: list[dict[str, Any]]) -> dict[str, Any]:
     primitive, rows = primitive_of(kind, variance), pd.DataFrame(episode_rows)
-    quiet = _quiet(primitive)
+    quiet = _zero_action_path(primitive)
     deviation = np.sqrt((primitive.reference.standard_deviations**2).mean(0))
     moved = [((path - quiet[: len(path)]) / deviation) ** 2 for path in rows["commanded"]]
     return {
@@ -296,13 +296,13 @@ def _smoothness(kind: str, variance: float, action_repeat: int, episode_rows: li
 
 
 def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Draw return, its two costs, and jerk while learning.
+    """Draw the return, its obstacle and action costs, and the commanded jerk over the training episodes.
 
     The runs in the picture repeat one random action in each of the first ten episodes. The table also has runs with
-    a new random action at every step. In those the success of sKGRL depends on the seed.
+    a new random action at every step, where the success of sKGRL depends on the seed.
     """
     groups = {}
-    for words, preset in (
+    for caption, preset in (
         ("first ten episodes constant", "tqc_cheap_correlated"),
         ("a new action at every step", "tqc_fast"),
     ):
@@ -314,7 +314,7 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
             learner=LearnerChoice(preset=preset, episodes=60),
             folder=f"runs/NarrowPassage/{{method}}-state-{preset}-{{episodes}}-{{seed}}",
         )
-        groups[words] = run_study(study, out)
+        groups[caption] = run_study(study, out)
     columns = {
         "return": "return",
         "reward_obstacle_cost": "obstacle cost",
@@ -335,7 +335,7 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         result[f"sKGRL has the higher return, as in the thesis ({exploration})"] = higher
     return {
         **save_results(
-            out, "figure_5_6", figure, pd.concat([t.assign(exploration=words) for words, t in groups.items()])
+            out, "figure_5_6", figure, pd.concat([t.assign(exploration=caption) for caption, t in groups.items()])
         ),
         **result,
         "condition": f"an action lasts {ACTION_REPEAT} control steps; the obstacle's cost is part of the return",
@@ -344,10 +344,10 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 
 def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
     """Render four moments of a failing episode before learning and of a successful one after it (sKGRL, connector)."""
-    found = run_study(
+    runs = run_study(
         figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], evaluate=False), out
     )
-    learned = EpisodeSpec.of_policy(Path(found["folder"].iloc[0]))
+    learned = EpisodeSpec.of_policy(Path(runs["folder"].iloc[0]))
     unlearned = replace(learned, policy=partial(BaselinePolicy, uniform_random), acting="before learning")
     figure, axes = new_figure(2, 4, (13, 6.2))
     rows = []
@@ -364,7 +364,7 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
 
 
 def _first(spec: EpisodeSpec, *, success: bool) -> EpisodeSpec:
-    """Return the first held-out episode that succeeds, or the first that fails; random actions can do both."""
+    """Return the spec of the first held-out episode that ends in success, or in failure if `success` is False."""
     env = make_environment(spec.task, spec.environment)
     env.reset(seed=spec.run_seed)
     try:
@@ -409,7 +409,7 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
 
 
 def figure_5_9(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Draw success and return of KGRL and sKGRL while learning; the numbers have the held-out success."""
+    """Draw success and return of KGRL and sKGRL over training episodes; return the held-out success as well."""
     rows = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes), out)
     columns = {"success": "success", "return": "return", "mean_force": FORCE}
     figure, _ = learning_curves(rows, columns, (1, 3), (13, 4))
@@ -418,14 +418,14 @@ def figure_5_9(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 
 def figure_5_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
     """Draw the mean jerk of the first ten training episodes, linear and angular, commanded and measured."""
-    found = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, evaluate=False), out)
+    runs = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, evaluate=False), out)
     figure, (axes,) = new_figure(1, 2, (10, 4.4))
     rows: list[dict[str, Any]] = []
     for axis, part, unit in zip(axes, ("linear", "angular"), ("m/s³", "rad/s³"), strict=True):
         boxes, labels = [], []
         for kind in METHODS:
             for which in ("commanded", "measured"):
-                values = np.concatenate([run[f"jerk_{which}_{part}"].head(10) for run in episodes_of(found, kind)])
+                values = np.concatenate([run[f"jerk_{which}_{part}"].head(10) for run in episodes_of(runs, kind)])
                 boxes.append(values)
                 labels.append(f"{label(kind)}\n{which}")
                 numbers = {"median": np.median(values), "lowest": np.min(values), "highest": np.max(values)}

@@ -191,40 +191,40 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)
     parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args()
-    if given.task == "table":
-        print_table(given.out)
+    args = parser.parse_args()
+    if args.task == "table":
+        print_table(args.out)
         return
-    if given.task == "nut" and given.method == "rlpd":
+    if args.task == "nut" and args.method == "rlpd":
         parser.error("rlpd needs a scripted policy whose actions can be repeated: choose peg or assembly")
     import torch
 
     torch.set_num_threads(1)
-    given.out.mkdir(parents=True, exist_ok=True)
-    is_baselines = given.method == "baselines"
-    label = f"baselines_{given.guidance}" if is_baselines else given.method
-    paths = {seed: given.out / f"{given.task}_{label}_{seed}.json" for seed in given.seeds}
+    args.out.mkdir(parents=True, exist_ok=True)
+    is_baselines = args.method == "baselines"
+    label = f"baselines_{args.guidance}" if is_baselines else args.method
+    paths = {seed: args.out / f"{args.task}_{label}_{seed}.json" for seed in args.seeds}
     if is_baselines:
-        paths = {0: given.out / f"{given.task}_{label}.json"}
+        paths = {0: args.out / f"{args.task}_{label}.json"}
     paths = {seed: path for seed, path in paths.items() if not path.exists()}
     if not paths:
         return
-    task: OutsideTask = import_module(f"research.outside_envs.{given.task}").TASK
-    guidance: str | Guide = given.guidance if is_baselines else {"tqc": "none", "rlpd": "none"}.get(label, label)
+    task: OutsideTask = import_module(f"research.outside_envs.{args.task}").TASK
+    guidance: str | Guide = args.guidance if is_baselines else {"tqc": "none", "rlpd": "none"}.get(label, label)
     segments = task.make_segments(NUM_DEMONSTRATIONS)
     for seed, path in paths.items():
         begin = time.process_time()
         env = task.make(guidance, seed, segments)
         guidance = getattr(env, "guide", guidance)  # fitted once
-        result: dict[str, Any] = {"task": given.task, "method": label, "seed": seed}
+        result: dict[str, Any] = {"task": args.task, "method": label, "seed": seed}
         if is_baselines:
-            result["held_out"] = evaluate_baselines(task, env, given.held_out)
+            result["held_out"] = evaluate_baselines(task, env, args.held_out)
         else:
             demonstrated = demonstrate_transitions(task, env, NUM_DEMONSTRATIONS) if label == "rlpd" else None
-            model, rows = train(env, given.episodes, seed, demonstrated)
+            model, rows = train(env, args.episodes, seed, demonstrated)
             result |= {"training": summarize(rows), "curve": [int(row["success"]) for row in rows]}
             policy: PolicyFn = lambda o, _, model=model: model.predict(o, deterministic=True)[0]  # noqa: E731
-            result["held_out"] = {"learned": evaluate(env, policy, given.held_out)}
+            result["held_out"] = {"learned": evaluate(env, policy, args.held_out)}
             print(label, seed, result["held_out"]["learned"], flush=True)
         result["cpu_s"] = time.process_time() - begin
         path.write_text(json.dumps(result, indent=1))

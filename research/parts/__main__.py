@@ -37,55 +37,55 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--timeout", type=float, default=900.0, help="wall time of one command [s] (default: 900)")
     parser.add_argument("--processes", type=int, default=1, help="pairs at a time (default: 1)")
     parser.add_json()
-    given = parser.parse_args(arguments)
-    difficulties = given.learn.split(",") if given.learn else []
+    args = parser.parse_args(arguments)
+    difficulties = args.learn.split(",") if args.learn else []
     for name in difficulties:
         if name not in DIFFICULTIES:
             raise InputError(f"--learn takes {', '.join(DIFFICULTIES)}, not {name!r}")
-    pairs = find_pairs(given.meshes, given.unit)
-    if given.pairs:
-        wanted = given.pairs.split(",")
-        missing = sorted(set(wanted) - {pair.name for pair in pairs})
+    pairs = find_pairs(args.meshes, args.unit)
+    if args.pairs:
+        selected = args.pairs.split(",")
+        missing = sorted(set(selected) - {pair.name for pair in pairs})
         if missing:
-            raise InputError(f"{given.meshes} has no pair {missing[0]!r}")
-        pairs = [pair for pair in pairs if pair.name in wanted]
-    out = given.out.resolve()
+            raise InputError(f"{args.meshes} has no pair {missing[0]!r}")
+        pairs = [pair for pair in pairs if pair.name in selected]
+    out = args.out.resolve()
     for folder in ("tasks", "runs", "logs", "steps"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     rows: dict[str, dict[str, Any]] = {}
 
     def prepare_pair(pair: Pair) -> None:
-        rows[pair.name] = finish(out / "steps" / f"{pair.name}.json", lambda: prepare(pair, out, given.cpu))
+        rows[pair.name] = finish(out / "steps" / f"{pair.name}.json", lambda: prepare(pair, out, args.cpu))
         row = rows[pair.name]
         print(f"{pair.name}: {row.get('error') or row['real_time_factor']}", file=sys.stderr, flush=True)
 
     def learn_pair(pair: Pair) -> None:
         shrink = rows[pair.name]["shrink_mm"]
         for difficulty in difficulties:
-            for seed in range(given.seeds):
-                found = finish(
+            for seed in range(args.seeds):
+                result = finish(
                     out / "steps" / f"{pair.name}-{difficulty}-{seed}.json",
                     lambda d=difficulty, s=seed: learn(  # type: ignore[misc]
                         pair,
                         out,
                         d,
                         s,
-                        given.episodes,
-                        given.held_out,
-                        given.timeout,
+                        args.episodes,
+                        args.held_out,
+                        args.timeout,
                         shrink,
                     ),
                 )
-                rows[pair.name] = {**rows[pair.name], f"{difficulty}-{seed}": found}
-                print(f"{pair.name} {difficulty}: {found.get('error') or found['success_rate']}", file=sys.stderr)
+                rows[pair.name] = {**rows[pair.name], f"{difficulty}-{seed}": result}
+                print(f"{pair.name} {difficulty}: {result.get('error') or result['success_rate']}", file=sys.stderr)
         write_tables(out, rows)
 
-    with ThreadPoolExecutor(given.processes) as pool:
+    with ThreadPoolExecutor(args.processes) as pool:
         list(pool.map(prepare_pair, pairs))
         write_tables(out, rows)
-        chosen = [pair for pair in pairs if "error" not in rows[pair.name]][:: given.every]
+        chosen = [pair for pair in pairs if "error" not in rows[pair.name]][:: args.every]
         list(pool.map(learn_pair, chosen if difficulties else []))
-    print_result(summarize(rows), as_json=given.json)
+    print_result(summarize(rows), as_json=args.json)
 
 
 if __name__ == "__main__":

@@ -155,12 +155,12 @@ def learn(
     rows = pd.read_csv(run / "episodes.csv")
     baselines = ("--baselines", "uniform_random,scripted")
     output = run_guiderail(log, timeout, "evaluate", run, "--episodes", held_out, *baselines, "--json")
-    found = dict(json.loads(output.strip().splitlines()[-1]))
+    result = dict(json.loads(output.strip().splitlines()[-1]))
     measured = yaml.safe_load((folder / "task.yaml").read_text(encoding="utf-8"))["measured"]
-    found |= {key: measured[key] for key in ("demonstrations_seated", "total_s")}
+    result |= {key: measured[key] for key in ("demonstrations_seated", "total_s")}
     if difficulty == "hard":
-        found["calibration"] = describe_calibration(measured.get("hard"))
-    return {**found, "training_episodes": len(rows), "training_minutes": rows["wall_time"].sum() / 60}
+        result["calibration"] = describe_calibration(measured.get("hard"))
+    return {**result, "training_episodes": len(rows), "training_minutes": rows["wall_time"].sum() / 60}
 
 
 def describe_calibration(measured: dict[str, Any] | None) -> str:

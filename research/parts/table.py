@@ -45,10 +45,10 @@ def to_table(rows: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     lines = []
     for name, row in sorted(rows.items()):
         line: dict[str, Any] = {"part": name, **{key: row.get(key) for key in MEASURED}}
-        for key, found in row.items():
-            if isinstance(found, dict):
-                line |= {f"{key} {column}": found.get(column) for column in LEARNED}
-                line[f"{key} reason"] = found.get("error")
+        for key, result in row.items():
+            if isinstance(result, dict):
+                line |= {f"{key} {column}": result.get(column) for column in LEARNED}
+                line[f"{key} reason"] = result.get("error")
         lines.append({**line, "reason": row.get("error")})
     return pd.DataFrame(lines)
 

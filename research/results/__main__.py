@@ -27,12 +27,12 @@ def main(arguments: list[str]) -> None:
         help="folder of finished studies or figures; without one the pages are written from what is stored",
     )
     parser.add_argument("--out", type=Path, help="folder of tables and pages instead")
-    given = parser.parse_args(arguments)
-    tables = given.out or TABLES
-    store(given.folders, tables)
-    for page in write_pages(tables, given.out or ROOT / "docs" / "results"):
+    args = parser.parse_args(arguments)
+    tables = args.out or TABLES
+    store(args.folders, tables)
+    for page in write_pages(tables, args.out or ROOT / "docs" / "results"):
         print(page)
-    if given.out is None:
+    if args.out is None:
         readme = ROOT / "README.md"
         write_atomically(readme, update_readme(readme.read_text("utf-8"), readme_table(tables)).encode())
         print(readme)

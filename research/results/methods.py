@@ -291,9 +291,9 @@ def last_rows(tables: Path, row: Row) -> pd.DataFrame:
     path = tables / f"{row.study}.csv"
     if not path.is_file():
         return pd.DataFrame()
-    found = read_table(path)
-    found = found[(found["method"] == row.method) & ((row.eval_set is None) | (found["eval_set"] == row.eval_set))]
-    return found.sort_values(["seed", "after_episodes"], kind="stable").drop_duplicates("seed", keep="last")
+    result = read_table(path)
+    result = result[(result["method"] == row.method) & ((row.eval_set is None) | (result["eval_set"] == row.eval_set))]
+    return result.sort_values(["seed", "after_episodes"], kind="stable").drop_duplicates("seed", keep="last")
 
 
 def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -335,7 +335,7 @@ def _middle(seeds: pd.DataFrame) -> str:
 
 def improvements(section: Section, tables: Path) -> list[str]:
     """Return a sentence for each guided method: the probability that it is better than the best peer."""
-    scores = {row.name: found for row in section.rows if (found := _scores(last_rows(tables, row))) is not None}
+    scores = {row.name: result for row in section.rows if (result := _scores(last_rows(tables, row))) is not None}
     peers = [row.name for row in section.rows if row.name in scores and not is_guided(row)]
     if not peers:
         return []

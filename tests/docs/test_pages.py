@@ -60,9 +60,9 @@ def test_reference_has_every_system_with_its_ports(reference):
         if isinstance(system, type) and issubclass(system, LeafSystem):
             part = reference["systems"].partition(f"\n## {name}\n")[2].partition("\n## ")[0]
             for method, getter in vars(system).items():
-                found = re.fullmatch(r"get_(\w+)_(input|output)_port", method)
-                if found and "name" not in inspect.signature(getter).parameters:
-                    assert f"| {found[2]} | `{found[1]}` |" in part, f"{name} lacks {found[1]}"
+                result = re.fullmatch(r"get_(\w+)_(input|output)_port", method)
+                if result and "name" not in inspect.signature(getter).parameters:
+                    assert f"| {result[2]} | `{result[1]}` |" in part, f"{name} lacks {result[1]}"
 
 
 def test_reference_has_every_command_task_and_template_kind(reference):

@@ -12,7 +12,7 @@ import traceback
 
 
 def main() -> None:
-    files, found = sys.argv[1:], {}
+    files, result = sys.argv[1:], {}
     for file in files:
         sys.argv = [file]
         printed, wrong = io.StringIO(), ""
@@ -21,8 +21,8 @@ def main() -> None:
                 runpy.run_path(file, run_name="__main__")
             except Exception:
                 wrong = traceback.format_exc()
-        found[file] = {"printed": printed.getvalue(), "wrong": wrong}
-    print(json.dumps(found))
+        result[file] = {"printed": printed.getvalue(), "wrong": wrong}
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":  # processes that an example starts import this file

@@ -141,11 +141,11 @@ def main(arguments: list[str] | None = None) -> int:
     comparing = commands.add_parser("compare", help="compare two files of hashes")
     comparing.add_argument("first", type=Path)
     comparing.add_argument("second", type=Path)
-    given = parser.parse_args(arguments)
-    if given.command == "write":
-        write(given.file, {key: getattr(given, key) for key in ("task", "guidance", "station")})
+    args = parser.parse_args(arguments)
+    if args.command == "write":
+        write(args.file, {key: getattr(args, key) for key in ("task", "guidance", "station")})
         return 0
-    first, second = (json.loads(path.read_text()) for path in (given.first, given.second))
+    first, second = (json.loads(path.read_text()) for path in (args.first, args.second))
     lines = differences(first, second)
     print("\n".join([*lines, f"{len(lines)} of {len({*first, *second})} cases differ"]))
     return 1 if lines else 0

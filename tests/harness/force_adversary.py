@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--bounded", choices=("true", "false"), default="true", help="option bounded_force")
     parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
     parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     cases = [
         (task, {"guidance": guidance, "station": station, "difficulty": difficulty} | limits)
         for task in GUIDANCE
@@ -89,14 +89,14 @@ def main(arguments: list[str] | None = None) -> int:
         for station in STATIONS
         for difficulty in ("standard", "hard")
         for limits in ({}, {"force_limit_range": (8.0, 25.0)})
-        if given.task in (None, task) and given.station in (None, station) and not (limits and difficulty == "standard")
+        if args.task in (None, task) and args.station in (None, station) and not (limits and difficulty == "standard")
     ]
     stops = total = 0
     for task, options in cases:
-        found = run_case(task, max(given.steps // len(cases), 1), bounded_force=given.bounded == "true", **options)
-        stops += found["endings"].get("collision", 0)
-        total += found["steps"]
-        print(json.dumps({"task": task, **options, **found}), flush=True)
+        result = run_case(task, max(args.steps // len(cases), 1), bounded_force=args.bounded == "true", **options)
+        stops += result["endings"].get("collision", 0)
+        total += result["steps"]
+        print(json.dumps({"task": task, **options, **result}), flush=True)
     print(json.dumps({"steps": total, "stops": stops}))
     return 1 if stops else 0
 

@@ -146,8 +146,8 @@ class RtdeServer:
             self._end_program()
         twist = np.zeros(6)
         if self.is_running and self.wrench is not None and not self.safety_bits & 2**PROTECTIVE_STOP_BIT:
-            wanted = (self.wrench + self.measured_force()) / DAMPING
-            twist = np.clip(wanted, -self.speed_limits, self.speed_limits)
+            desired_twist = (self.wrench + self.measured_force()) / DAMPING
+            twist = np.clip(desired_twist, -self.speed_limits, self.speed_limits)
         self.velocities = np.linalg.solve(self.jacobian(), twist) if twist.any() else np.zeros(6)
         self.positions = self.positions + CYCLE * self.velocities
 
@@ -385,7 +385,7 @@ def _frames(positions: np.ndarray, tcp: np.ndarray) -> list[np.ndarray]:
 
 
 class RtdeProcess:
-    """`RtdeServer` in a process of its own, because some calls of the client keep Python's lock.
+    """`RtdeServer` in a process of its own, because some calls of the client hold the GIL.
 
     Attributes of the server are read and written by their names, and its methods are called.
     """

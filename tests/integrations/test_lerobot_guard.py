@@ -108,6 +108,6 @@ def test_guard_is_refused_when_start_or_limits_are_missing(guard):
 
 def test_configuration_makes_the_same_step(guard):
     step = make(guard)
-    again = guard.ChunkGuardProcessorStep(**step.get_config())
+    second = guard.ChunkGuardProcessorStep(**step.get_config())
     action = torch.tensor([[0.3, 0.4]])
-    assert (send(step, action) == send(again, action)).all()
+    assert (send(step, action) == send(second, action)).all()

@@ -40,7 +40,7 @@ def template_numbers(text: str) -> dict[tuple[str, ...], float]:
     """Return every number of a template by its path, read with PyYAML and evaluated with Python's `eval`."""
     data = yaml.safe_load(text)
     parameters = {name: float(_value(value, {})) for name, value in (data.get("parameters") or {}).items()}
-    found: dict[tuple[str, ...], float] = {("parameters", name): value for name, value in parameters.items()}
+    result: dict[tuple[str, ...], float] = {("parameters", name): value for name, value in parameters.items()}
 
     def walk(path, entry):
         if isinstance(entry, dict):
@@ -50,13 +50,13 @@ def template_numbers(text: str) -> dict[tuple[str, ...], float]:
             for number, value in enumerate(entry):
                 walk((*path, str(number)), value)
         elif isinstance(entry, int | float) and not isinstance(entry, bool):
-            found[path] = float(entry)
+            result[path] = float(entry)
         elif isinstance(entry, str) and path[-1] not in ("kind", "frame", "to", "name"):
-            found[path] = float(_value(entry, parameters))
+            result[path] = float(_value(entry, parameters))
 
     for key in ("inputs", "max_speed_m_per_s", "max_speed_rad_per_s", "states"):
         walk((key,), data[key])
-    return found
+    return result
 
 
 def _value(entry, parameters):

@@ -20,16 +20,16 @@ def differences(first: Path, second: Path) -> list[str]:
     Tables are compared by cell without wall-clock times, checkpoints by array and value, other files by byte.
     """
     one, two = _files(first), _files(second)
-    found = [f"{name} exists in one of them only" for name in sorted(one.keys() ^ two.keys())]
+    result = [f"{name} exists in one of them only" for name in sorted(one.keys() ^ two.keys())]
     for name in sorted(one.keys() & two.keys()):
         if _content(one[name]) != _content(two[name]):
-            found.append(f"{name} differs")
-    return found
+            result.append(f"{name} differs")
+    return result
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path for name, path in found.items() if not IGNORED & set(Path(name).parts)}
+    result = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path for name, path in result.items() if not IGNORED & set(Path(name).parts)}
 
 
 def _content(path: Path) -> object:

@@ -11,8 +11,8 @@ PERIOD, ONES = 0.5, np.ones(2)
 
 
 def check(commands, **limits):
-    given = {"lower": -ONES, "upper": ONES, "speed": 1e3 * ONES, "jerk": 1e3 * ONES, "period": PERIOD} | limits
-    return guarded.check_commands(np.asarray(commands, float), **given)
+    arguments = {"lower": -ONES, "upper": ONES, "speed": 1e3 * ONES, "jerk": 1e3 * ONES, "period": PERIOD} | limits
+    return guarded.check_commands(np.asarray(commands, float), **arguments)
 
 
 def test_check_counts_commands_beyond_each_limit_only():

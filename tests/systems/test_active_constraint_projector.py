@@ -233,12 +233,12 @@ def test_nan_is_never_commanded_or_stored():
     """A NaN pose of an object that was written without `set` repeats the last command until the pose is finite."""
     rig = Rig()
     before, _ = rig.step(START)
-    sound = rig.context.get_numeric_parameter(0).CopyToVector()
-    rig.context.get_mutable_numeric_parameter(0).SetFromVector([*sound[:2], np.nan, *sound[3:]])
+    valid = rig.context.get_numeric_parameter(0).CopyToVector()
+    rig.context.get_mutable_numeric_parameter(0).SetFromVector([*valid[:2], np.nan, *valid[3:]])
     desired, fallback = rig.step(DOWN)
     np.testing.assert_array_equal(desired, before)
     assert fallback == 1.0
-    rig.context.get_mutable_numeric_parameter(0).SetFromVector(sound)
+    rig.context.get_mutable_numeric_parameter(0).SetFromVector(valid)
     rig.step(DOWN)
     assert rig.step(DOWN)[1] == 0.0
     assert rig.desired()[2] < START[2]

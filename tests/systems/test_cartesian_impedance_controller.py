@@ -296,9 +296,9 @@ def test_damping_gives_every_mode_its_damping_ratio():
     ],
 )
 def test_constructor_refuses_arguments_out_of_range(wrong):
-    sound = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
+    valid = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
     with pytest.raises(InputError):
-        ImpedanceGains(**(sound | wrong))
+        ImpedanceGains(**(valid | wrong))
 
 
 def test_ports_and_feedthrough():

@@ -27,21 +27,21 @@ def two_members(observation):
 
 
 def make(policy=two_members, **arguments):
-    given = {"horizon": HORIZON, "replan_steps": 3, "covariance_floor": 0.5, "period": PERIOD}
-    return ChunkReference(policy, 3, reference(), **(given | arguments))
+    options = {"horizon": HORIZON, "replan_steps": 3, "covariance_floor": 0.5, "period": PERIOD}
+    return ChunkReference(policy, 3, reference(), **(options | arguments))
 
 
 def windows(system, observations):
     """Return means (n, H+1, O) and covariances (n, H+1, O, O) after each control instant."""
     simulator = Simulator(system)
-    context, found = simulator.get_mutable_context(), []
+    context, result = simulator.get_mutable_context(), []
     port = system.get_observation_input_port().FixValue(context, observations[0])
     simulator.Initialize()
     for step, observation in enumerate(observations):
         port.GetMutableData().set_value(observation)
         simulator.AdvanceTo(PERIOD * (step + 0.5))
-        found.append(system.get_reference_window_output_port().Eval(context).copy())
-    split = np.split(np.array(found), [(HORIZON + 1) * 2], axis=1)
+        result.append(system.get_reference_window_output_port().Eval(context).copy())
+    split = np.split(np.array(result), [(HORIZON + 1) * 2], axis=1)
     return split[0].reshape(-1, HORIZON + 1, 2), split[1].reshape(-1, HORIZON + 1, 2, 2)
 
 

@@ -32,13 +32,13 @@ def run(chunks, pose=(0.0, 0.0), mode="projection"):
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     diagram.GetInputPort("pose").FixValue(context, np.asarray(pose))
-    port, found = diagram.GetInputPort("chunk").FixValue(context, np.ravel(chunks[0])), []
+    port, result = diagram.GetInputPort("chunk").FixValue(context, np.ravel(chunks[0])), []
     ports = system.get_desired_pose_output_port(), system.get_rate_output_port(), system.get_fallback_output_port()
     for step, chunk in enumerate(chunks):
         port.GetMutableData().set_value(np.ravel(chunk))
         simulator.AdvanceTo(PERIOD * (step + 0.5))
-        found.append(np.concatenate([one.Eval(system.GetMyContextFromRoot(context)) for one in ports]))
-    return np.array(found)[:, :2], np.array(found)[:, 2], np.array(found)[:, 3]
+        result.append(np.concatenate([one.Eval(system.GetMyContextFromRoot(context)) for one in ports]))
+    return np.array(result)[:, :2], np.array(result)[:, 2], np.array(result)[:, 3]
 
 
 @pytest.mark.parametrize("mode", ["projection", "slowdown"])

@@ -70,9 +70,9 @@ def test_reset_restores_the_initial_opening():
     ],
 )
 def test_constructor_refuses_arguments_out_of_range(wrong):
-    sound = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | wrong
+    valid = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | wrong
     with pytest.raises(InputError):
-        GripperCommand(sound.pop("lower"), sound.pop("upper"), sound.pop("opening"), **sound)
+        GripperCommand(valid.pop("lower"), valid.pop("upper"), valid.pop("opening"), **valid)
 
 
 def test_ports():

@@ -71,15 +71,15 @@ def test_sample_is_skipped_when_it_is_not_finite(arm, port):
     system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.1)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
-    sound = {"positions": READY_POSTURE, "external_torque": np.linspace(-1.0, 1.0, 7)}
-    values = {name: system.GetInputPort(name).FixValue(context, value) for name, value in sound.items()}
+    valid_values = {"positions": READY_POSTURE, "external_torque": np.linspace(-1.0, 1.0, 7)}
+    values = {name: system.GetInputPort(name).FixValue(context, value) for name, value in valid_values.items()}
     simulator.AdvanceTo(0.025)
     before = system.get_wrench_output_port().Eval(context).copy()
     values[port].GetMutableData().set_value(np.full(7, np.nan))
     simulator.AdvanceTo(0.035)
     np.testing.assert_array_equal(system.get_wrench_output_port().Eval(context), before)
-    values[port].GetMutableData().set_value(sound[port])
-    values["external_torque"].GetMutableData().set_value(2.0 * sound["external_torque"])
+    values[port].GetMutableData().set_value(valid_values[port])
+    values["external_torque"].GetMutableData().set_value(2.0 * valid_values["external_torque"])
     simulator.AdvanceTo(1.0)
     assert np.isfinite(system.get_wrench_output_port().Eval(context)).all()
     assert np.linalg.norm(system.get_wrench_output_port().Eval(context) - before) > 0.1

@@ -21,8 +21,8 @@ class Rig:
         self.blend_factor = self.system.get_blend_factor_input_port().FixValue(context, [blend_factor])
         self.simulator.Initialize()
 
-    def go(self, steps=1):
-        """Return the poses just before each of the next instants."""
+    def advance(self, steps=1):
+        """Advance by periods; return the limited pose before the update at the end of each."""
         poses = []
         for _ in range(steps):
             self.simulator.AdvanceTo(self.simulator.get_context().get_time() + PERIOD)
@@ -30,17 +30,17 @@ class Rig:
         return np.array(poses)
 
     def start_blending(self):
-        self.go()
+        self.advance()
         self.blend_factor.GetMutableData().set_value([0.1])
         return self
 
 
 def test_measured_pose_is_output_while_blend_factor_is_zero():
     rig = Rig(np.zeros(6))
-    np.testing.assert_array_equal(rig.go(3), np.tile(MEASURED, (3, 1)))
+    np.testing.assert_array_equal(rig.advance(3), np.tile(MEASURED, (3, 1)))
     pushed = MEASURED + 0.05
     rig.pose.GetMutableData().set_value(pushed)
-    np.testing.assert_array_equal(rig.go()[0], pushed)
+    np.testing.assert_array_equal(rig.advance()[0], pushed)
 
 
 def test_output_starts_at_the_measured_pose_if_blending_at_once():
@@ -48,18 +48,18 @@ def test_output_starts_at_the_measured_pose_if_blending_at_once():
     step = np.array([SPEED * PERIOD, 0.0, 0.0, 0.0, 0.0, 0.0])
     first = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context()).copy()
     np.testing.assert_allclose(first, MEASURED + step, atol=1e-12)
-    np.testing.assert_allclose(np.diff([first, *rig.go(4)], axis=0), np.tile(step, (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.diff([first, *rig.advance(4)], axis=0), np.tile(step, (4, 1)), atol=1e-12)
 
 
 def test_initialization_restarts_at_the_measured_pose():
     rig = Rig(MEASURED).start_blending()
-    rig.go(3)
-    elsewhere = MEASURED + [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+    rig.advance(3)
+    other_pose = MEASURED + [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
     for port in (rig.pose, rig.desired):
-        port.GetMutableData().set_value(elsewhere)
+        port.GetMutableData().set_value(other_pose)
     rig.simulator.get_mutable_context().SetTime(0.0)
     rig.simulator.Initialize()
-    np.testing.assert_array_equal(rig.go(2), [elsewhere, elsewhere])
+    np.testing.assert_array_equal(rig.advance(2), [other_pose, other_pose])
 
 
 def test_output_moves_in_a_straight_line_within_speed_limit():
@@ -68,7 +68,7 @@ def test_output_moves_in_a_straight_line_within_speed_limit():
     first = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
     assert np.linalg.norm((first - MEASURED)[:3]) <= SPEED * PERIOD + 1e-12
     assert np.abs((first - MEASURED)[3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
-    poses = rig.go(30)
+    poses = rig.advance(30)
     steps = np.diff(poses, axis=0)
     assert np.linalg.norm(steps[:, :3], axis=1).max() <= SPEED * PERIOD + 1e-12
     assert np.abs(steps[:, 3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
@@ -80,19 +80,19 @@ def test_output_moves_in_a_straight_line_within_speed_limit():
 def test_angles_turn_in_the_shorter_direction():
     rig = Rig(np.array([*MEASURED[:3], -3.1, 0.0, 0.0]))
     rig.pose.GetMutableData().set_value([*MEASURED[:3], 3.1, 0.0, 0.0])
-    poses = rig.start_blending().go(4)
+    poses = rig.start_blending().advance(4)
     np.testing.assert_array_equal(poses[-1][3:], [-3.1, 0.0, 0.0])
 
 
 def test_pose_within_the_speed_limits_is_output_unchanged():
     rig = Rig(MEASURED).start_blending()
-    rig.go()
+    rig.advance()
     for step in range(5):
         desired = MEASURED + [0.9 * SPEED * PERIOD * step, 0.0, 0.0, 0.9 * ANGULAR_SPEED * PERIOD * step, 0.0, 0.0]
         rig.desired.GetMutableData().set_value(desired)
         now = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
         np.testing.assert_array_equal(now, desired)
-        rig.go()
+        rig.advance()
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"speed": 0.0}, {"angular_speed": np.inf}])
@@ -103,8 +103,8 @@ def test_constructor_refuses_arguments_out_of_range(wrong):
 
 def test_desired_pose_is_ignored_when_it_is_not_finite():
     rig = Rig(MEASURED + 0.01).start_blending()
-    before = rig.go(4)[-1]
+    before = rig.advance(4)[-1]
     rig.desired.GetMutableData().set_value([np.nan, *MEASURED[1:]])
-    np.testing.assert_array_equal(rig.go(2)[-1], before)
+    np.testing.assert_array_equal(rig.advance(2)[-1], before)
     rig.desired.GetMutableData().set_value(MEASURED)
-    np.testing.assert_allclose(rig.go(4)[-1], MEASURED)
+    np.testing.assert_allclose(rig.advance(4)[-1], MEASURED)

@@ -11,11 +11,11 @@ RULE = StateProgress((0.01, 0.1), 4)
 
 
 def steps(rule, poses, command=(0.0, 0.0)):
-    step, found = 0, []
+    step, result = 0, []
     for k, pose in enumerate(poses):
         step = rule.next_step(step, k + 1, np.array(command), np.array(pose))
-        found.append(step)
-    return found
+        result.append(step)
+    return result
 
 
 def test_progress_is_the_clock_while_the_robot_is_near():

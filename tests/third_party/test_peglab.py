@@ -99,9 +99,9 @@ def test_a_wrong_option_gets_a_sentence(lab):
 
 def test_it_is_trained_resumed_and_evaluated(lab, trained):
     guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run", "--no-pictures")
-    found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
-    assert found["episodes"] == 2
-    assert found["max_commanded_violation"] <= 1e-9
+    result = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
+    assert result["episodes"] == 2
+    assert result["max_commanded_violation"] <= 1e-9
 
 
 def test_a_setting_of_its_learner_is_validated(lab):

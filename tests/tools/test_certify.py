@@ -15,13 +15,13 @@ COARSE = {"control_period": 0.05}  # 160 steps instead of 400: a certificate tak
 
 
 def test_certify_skill_writes_an_accepted_certificate(tmp_path):
-    found = certify_skill("NarrowPassage", COARSE | {"guidance": "kgrl"}, out=tmp_path, attack=2000)
-    assert found["checker"] == "yes"
-    assert found["always_upper"][0] <= found["while_free_upper"][0]
-    assert found["steps"] >= found["constrained_steps"]
+    result = certify_skill("NarrowPassage", COARSE | {"guidance": "kgrl"}, out=tmp_path, attack=2000)
+    assert result["checker"] == "yes"
+    assert result["always_upper"][0] <= result["while_free_upper"][0]
+    assert result["steps"] >= result["constrained_steps"]
     assert json.loads((tmp_path / "certificate.json").read_text())["assumes"]
-    rows = found["attack"]
-    assert found["attack_steps"] >= 2000
+    rows = result["attack"]
+    assert result["attack_steps"] >= 2000
     assert {row["quantity"] for row in rows} == {"pose", "speed", "acceleration"}
     assert all(row["violations"] == 0 for row in rows)
     assert all(row["ratio"] < 1.2 for row in rows if row["constraint"] == "never active")
@@ -55,9 +55,9 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
 
 
 def test_certify_skill_accepts_demonstrations_alone(tmp_path):
-    found = certify_skill("NarrowPassage", {"guidance": "kmp"}, out=tmp_path)
-    assert found["checker"] == "yes"
-    assert found["constrained_steps"] == 0
+    result = certify_skill("NarrowPassage", {"guidance": "kmp"}, out=tmp_path)
+    assert result["checker"] == "yes"
+    assert result["constrained_steps"] == 0
 
 
 @pytest.mark.parametrize(
@@ -97,9 +97,9 @@ def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty,
     """Episodes begin next to the demonstrations, and so does the history of sKGRL."""
     monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 10_000)
     environment = COARSE | {"guidance": "skgrl", "difficulty": difficulty}
-    found = certify_skill("NarrowPassage", environment, out=tmp_path)
-    assert found["checker"] == "yes"
-    assert found["start_within"] == pytest.approx([0.04, 0.04] if difficulty == "standard" else [0.12, 0.12])
+    result = certify_skill("NarrowPassage", environment, out=tmp_path)
+    assert result["checker"] == "yes"
+    assert result["start_within"] == pytest.approx([0.04, 0.04] if difficulty == "standard" else [0.12, 0.12])
     claims = json.loads((tmp_path / "certificate.json").read_text())
     env = make_env("NarrowPassage", **environment)
     for seed in (*far, *range(1_000_000, 1_000_004)):

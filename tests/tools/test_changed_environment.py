@@ -63,9 +63,9 @@ def test_policy_is_evaluated_at_another_difficulty(ask, tmp_path, monkeypatch):
     RunFolder(tmp_path).write_episodes([{"episode": 0, "return": 0.0, "success": 0, "termination": "", "steps": 1}])
     policy(3, 2).save(tmp_path)
     monkeypatch.setattr(evaluate, "make_environment", refuse)
-    with pytest.raises(_AskedFor) as found:
+    with pytest.raises(_AskedFor) as result:
         ask(tmp_path)
-    assert found.value.args[0]["force_limit"] == check_environment("GridClamp", HARD)["force_limit"]
+    assert result.value.args[0]["force_limit"] == check_environment("GridClamp", HARD)["force_limit"]
 
 
 def test_a_policy_is_shown_and_certified_at_another_difficulty(tmp_path):
@@ -98,5 +98,5 @@ def test_policy_is_refused_with_the_options_that_differ():
 @pytest.mark.parametrize("chosen", [{"difficulty": "hard"}, {"station": "arm", "action_repeat": 7}])
 def test_command_of_a_run_names_options_beyond_defaults(chosen):
     words = command(configure("BncConnector", {"guidance": "kgrl", **chosen}), "out").split()
-    given = [word for word in words if "=" in word]
-    assert given == [f"{key}={value}" for key, value in chosen.items()]
+    arguments = [word for word in words if "=" in word]
+    assert arguments == [f"{key}={value}" for key, value in chosen.items()]

@@ -55,7 +55,7 @@ def test_seed_is_refused_when_out_of_range(seed, bead_run, tmp_path):
 
 def test_evaluate_checks_the_output_before_it_runs(bead_run, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("it continues"))
+    monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("the policy is loaded before the output is checked"))
     with pytest.raises(InputError, match="cannot be written"):
         evaluate(bead_run, save=tmp_path / "file" / "x.npz")
 
@@ -73,7 +73,7 @@ def test_lock_removes_partial_files_of_ended_processes(ended_process, tmp_path):
     for number in (ended_process, os.getpid(), 10**30):
         (tmp_path / "checkpoint" / f".state.safetensors.{number}.part").touch()
         (tmp_path / f".peg.{number}.part" / "parts").mkdir(parents=True)
-    (tmp_path / "checkpoint" / ".own.part").touch()  # not a name of `write_atomically`
+    (tmp_path / "checkpoint" / ".own.part").touch()  # `write_atomically` gives no such name
     with RunFolder(tmp_path).locked():
         left = {path.name for path in tmp_path.rglob("*")}
     assert left == {"checkpoint", ".own.part", LOCK}

@@ -267,9 +267,9 @@ def test_collisions_are_counted_only_if_declared():
 
 def test_own_task_is_fuzzed_with_every_guidance():
     declare()
-    found = fuzz("lab/Own", episodes=3)
-    assert found["failures"] == []
-    assert found["cases"].keys() <= {
+    result = fuzz("lab/Own", episodes=3)
+    assert result["failures"] == []
+    assert result["cases"].keys() <= {
         "base_policy",
         "kgrl",
         "kgrl_base_policy",
@@ -278,7 +278,7 @@ def test_own_task_is_fuzzed_with_every_guidance():
         "residual_base_policy",
         "skgrl",
     }
-    assert found["all"]["episodes"] == 3
+    assert result["all"]["episodes"] == 3
 
 
 def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
@@ -298,6 +298,6 @@ def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
 
 def test_check_accepts_the_name_of_a_shipped_template(monkeypatch):
     monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    back, none = validate_template(Path("pouring"))["transitions"]
-    assert back == "translational → tilt below 0.25 m, back above 0.27 m"
+    loaded, none = validate_template(Path("pouring"))["transitions"]
+    assert loaded == "translational → tilt below 0.25 m, back above 0.27 m"
     assert none == "tilt → pour below 0.075 m, no way back"

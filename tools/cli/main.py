@@ -1,4 +1,4 @@
-"""Entry point of the `guiderail` command: it turns errors into one sentence and an exit code."""
+"""Entry point of the `guiderail` command: reports errors as one sentence and an exit code."""
 
 import logging
 import os
@@ -101,7 +101,7 @@ def _show_messages() -> None:
 
 
 def _resume_hint(arguments: list[str]) -> str:
-    """Return how an interrupted command is resumed; empty where it cannot, as for a run without a checkpoint."""
+    """Return a hint how to resume an interrupted command; empty if it cannot be resumed."""
     name, *words = map(str, [*arguments, ""])
     if name == "study":
         return "; the same command resumes it"

@@ -365,10 +365,10 @@ def _store(
 
 def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any]:
     """Return the statistics of the policy, of the demonstration and of each baseline policy."""
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, table in ({POLICY: pd.DataFrame(), "demonstration": pd.DataFrame()} | dict(rows)).items():
-        found |= statistics(table, "" if name == POLICY else f"{name}_")
-    return {key: value if counts or not key.endswith(COLLISIONS) else None for key, value in found.items()}
+        result |= statistics(table, "" if name == POLICY else f"{name}_")
+    return {key: value if counts or not key.endswith(COLLISIONS) else None for key, value in result.items()}
 
 
 def _training(folder: RunFolder | None) -> dict[str, Any]:

@@ -134,10 +134,10 @@ def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
     """Return the statistics `COMPARED` of episodes; None for a statistic whose column the rows lack."""
     if not len(rows):
         return summary(rows, COMPARED, prefix)
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name in COMPARED:
         try:
-            found[prefix + name] = STATISTICS[name].compute(rows)
+            result[prefix + name] = STATISTICS[name].compute(rows)
         except KeyError:
-            found[prefix + name] = None
-    return found
+            result[prefix + name] = None
+    return result

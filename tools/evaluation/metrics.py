@@ -132,11 +132,11 @@ class Episode:
     @cached_property
     def statistics(self) -> dict[str, float]:
         """Statistics of the trace; violations are those of the start if the simulation failed at the first step."""
-        found = self.trace.statistics()
+        statistics = self.trace.statistics()
         if not len(self.trace):
-            found["max_commanded_violation"] = self.info["constraint_violation"]
-            found["max_measured_violation"] = self.info["measured_violation"]
-        return found
+            statistics["max_commanded_violation"] = self.info["constraint_violation"]
+            statistics["max_measured_violation"] = self.info["measured_violation"]
+        return statistics
 
     @property
     def termination(self) -> str:
@@ -395,14 +395,14 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
         InputError: If a statistic is unknown, or the episodes lack a column that one is computed from.
     """
     known = statistics_of(task) if task else STATISTICS
-    found: dict[str, Any] = {}
+    statistics: dict[str, Any] = {}
     for name in names:
         if name not in known:
             raise InputError(f"there is no statistic {name!r}: {did_you_mean(name, known)}")
         try:
-            found[prefix + name] = known[name].compute(rows) if len(rows) else None
+            statistics[prefix + name] = known[name].compute(rows) if len(rows) else None
         except KeyError as error:
             raise InputError(
                 f"these episodes are of another version: they have no {error.args[0]}; train again"
             ) from error
-    return found
+    return statistics

@@ -207,8 +207,8 @@ def _load_function(module: str, name: str) -> PolicyFn:
     if not hasattr(loaded, name):
         names = [one for one in vars(loaded or object) if not one.startswith("_")]
         raise InputError(f"{module} has no {brief(name)}: {did_you_mean(name, names)}")
-    found = getattr(loaded, name)
-    return as_policy(found() if inspect.isclass(found) else found)
+    result = getattr(loaded, name)
+    return as_policy(result() if inspect.isclass(result) else result)
 
 
 def _load_sb3(path: Path) -> PolicyFn:
@@ -321,13 +321,13 @@ def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None
     if isinstance(policy, Policy):
         return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
     sees, moves = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
-    seen = sees or env.observation_space.shape or ()
+    observation_shape = sees or env.observation_space.shape or ()
     if moves is None:
         try:
-            moves = np.shape(policy(np.zeros(seen, np.float32)))
+            moves = np.shape(policy(np.zeros(observation_shape, np.float32)))
         except (IndexError, ValueError):
             return sees, None
-    return seen, moves
+    return observation_shape, moves
 
 
 def _task_options(env: gymnasium.Env) -> tuple[str, dict[str, Any]]:
@@ -363,11 +363,11 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
         {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
         for combination in product(*values.values())
     ]
-    found: list[str] = []
+    result: list[str] = []
     for changes in sorted(candidates, key=len):
-        if changes and len(found) < _MAX_FITTING and _fits(policy, task, options, changes):
-            found.append(" --env ".join(f"{name}={value}" for name, value in changes.items()))
-    return found
+        if changes and len(result) < _MAX_FITTING and _fits(policy, task, options, changes):
+            result.append(" --env ".join(f"{name}={value}" for name, value in changes.items()))
+    return result
 
 
 def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:

@@ -160,7 +160,7 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
         InputError: If the environment itself is invalid.
     """
     resolved = check_environment(task, environment)
-    found, left_out = [], []
+    result, left_out = [], []
     for axis in axes:
         trained = axis.default if _is_default(axis, resolved) else None
         for value in axis.values:
@@ -171,10 +171,10 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
                 check_environment(task, {**resolved, **changes})
                 changed = {**environment, **changes}
                 options = {"new_run": True} if axis.resamples and hides(task, {**resolved, **changed}) else {}
-                found.append(Point(axis, value, changed, trained, options))
+                result.append(Point(axis, value, changed, trained, options))
             except InputError as error:
                 left_out.append(f"{axis.name} {value:g} is left out: {error}")
-    return found, left_out
+    return result, left_out
 
 
 def _is_default(axis: Axis, resolved: Environment) -> bool:
@@ -383,8 +383,8 @@ def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], say: Callable[[str], N
     sentences: dict[str, None] = {}
     pairs: list[tuple[_Actor, Point]] = []
     for actor in actors:
-        found, left_out = points(actor.config.task, actor.environment, axes)
-        pairs += [(actor, point) for point in found]
+        result, left_out = points(actor.config.task, actor.environment, axes)
+        pairs += [(actor, point) for point in result]
         sentences |= dict.fromkeys(left_out)
     for sentence in sentences:
         say(sentence)
@@ -425,8 +425,8 @@ def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
 
 def values_below(rows: Sequence[Mapping[str, Any]], policy: str, rate: float = 0.9) -> dict[str, list[float]]:
     """Return the values of each axis at which a policy's success rate is below `rate`."""
-    found: dict[str, list[float]] = {}
+    result: dict[str, list[float]] = {}
     for row in rows:
         if row["policy"] == policy:
-            found.setdefault(row["axis"], []).extend([row["value"]] if row["success_rate"] < rate else [])
-    return found
+            result.setdefault(row["axis"], []).extend([row["value"]] if row["success_rate"] < rate else [])
+    return result

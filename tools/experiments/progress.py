@@ -67,8 +67,8 @@ class StudyProgress:
         text = f": failed: {outcome.failure}" if outcome.failure else ""
         if outcome.rows and (last := outcome.rows[-1])["eval_set"]:
             text = f": {last['eval_set']} {last['success_rate']:.0%}"
-        again = f" (by worker {attempts}, those before it were lost)" if attempts > 1 else ""
-        self._print(f"{self._num_ended}/{self._total} {job.method}, seed {job.seed}{text}{again}")
+        retry = f" (by worker {attempts}, those before it were lost)" if attempts > 1 else ""
+        self._print(f"{self._num_ended}/{self._total} {job.method}, seed {job.seed}{text}{retry}")
 
     def _print(self, text: str) -> None:
         self._console.print(text, soft_wrap=True, highlight=False, markup=False)
@@ -91,8 +91,8 @@ class StudyProgress:
             with suppress(OSError):
                 done = table.read_bytes().count(b"\n") - 1
             state = f"{done}/{episodes} episodes" if done < episodes else "evaluated"
-            again = f", by worker {attempts}" if attempts > 1 else ""
-            running.append((f"{job.method}, seed {job.seed}", state + again))
+            retry = f", by worker {attempts}" if attempts > 1 else ""
+            running.append((f"{job.method}, seed {job.seed}", state + retry))
         return running
 
     def _counts(self) -> str:

@@ -212,7 +212,7 @@ def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np
     Raises:
         InputError: If an event does not occur in a recording.
     """
-    found = []
+    event_lists = []
     for m, signal in enumerate(signals):
         at, events = -1, []
         for number, condition in enumerate(conditions):
@@ -220,5 +220,5 @@ def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np
             if at < 0:
                 raise InputError(f"event {number} does not occur in recording {m}")
             events.append(at)
-        found.append(events)
-    return found
+        event_lists.append(events)
+    return event_lists

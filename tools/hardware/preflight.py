@@ -186,14 +186,14 @@ def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assum
     Raises:
         InputError: If a check fails, before or after the question, or the operator does not confirm.
     """
-    shown = checks.run()
-    for check in shown:
+    results = checks.run()
+    for check in results:
         log(f"{'ok ' if check.passed else 'NOT'}  {check.name:<12}{check.description}")
-    _refuse_failed(shown)
+    _refuse_failed(results)
     if not assume_yes:
         confirm("Is all of this so, and is the workspace clear?")
         _refuse_failed(checks.repeat())
-    return shown
+    return results
 
 
 def _refuse_failed(checks: Sequence[Check]) -> None:

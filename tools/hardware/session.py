@@ -44,10 +44,10 @@ class RobotSession:
 def robot_session(
     config: RunConfig, connection: RobotConnection, *, assume_yes: bool, log: Log
 ) -> Iterator[RobotSession]:
-    """Wait for the robot, and have the pre-flight checks confirmed.
+    """Wait for the robot, ask for confirmation of the pre-flight checks, and yield the session.
 
-    In front of a simulated driver a reset samples the offsets of the parts as in simulation. With `assume_yes` the
-    checks need no confirmation; in front of a simulated driver, resuming after a stop needs none either.
+    With a simulated driver, a reset samples the offsets of the parts as in simulation. With `assume_yes`, the checks
+    need no confirmation; with a simulated driver as well, resuming after a stop needs none.
 
     Raises:
         InputError: If the task cannot be done on hardware, or a check fails or is not confirmed.

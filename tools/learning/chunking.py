@@ -92,7 +92,10 @@ class ChunkLearner(BcLearner):
     def _train(self) -> None:
         observations, chunks = np.array(self._observations), np.array(self._actions)
         self._center, self._scale = chunks.mean(axis=0), np.maximum(chunks.std(axis=0), MIN_SCALE)
-        seen, targets = torch.from_numpy(observations), torch.from_numpy((chunks - self._center) / self._scale).float()
+        inputs, targets = (
+            torch.from_numpy(observations),
+            torch.from_numpy((chunks - self._center) / self._scale).float(),
+        )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
             sizes = [observations.shape[1], *self.config.net_arch, chunks.shape[1]]
@@ -106,8 +109,8 @@ class ChunkLearner(BcLearner):
             for _ in range(self.config.gradient_steps):
                 batch = rows[random.integers(len(rows), size=self.config.batch_size)]
                 # Without noise the network copies an observed command, and errors accumulate (Ke et al., 2021).
-                noise = torch.randn(seen[batch].shape, generator=generator)
-                noisy = seen[batch] + self.config.observation_noise * noise
+                noise = torch.randn(inputs[batch].shape, generator=generator)
+                noisy = inputs[batch] + self.config.observation_noise * noise
                 loss = torch.nn.functional.mse_loss(network(noisy), targets[batch])
                 optimizer.zero_grad()
                 loss.backward()

@@ -305,24 +305,24 @@ class FastTrainingStep(_Algorithm):
     def _train_batches(self, data: ReplayBufferSamples, steps: int, batch_size: int) -> None:
         """Take `steps` gradient steps on consecutive batches of `data`."""
         critic, features = self.policy.critic, self._features
-        now = critic.extract_features(data.observations, critic.features_extractor)
-        following = critic.extract_features(data.next_observations, critic.features_extractor)
-        taken = torch.cat([now, data.actions], dim=1).view(steps, batch_size, -1)
-        states = torch.empty(steps, 2 * batch_size, taken.shape[-1])
-        states[:, :batch_size, :features] = now.view(steps, batch_size, -1)
-        states[:, batch_size:, :features] = following.view(steps, batch_size, -1)
+        current_features = critic.extract_features(data.observations, critic.features_extractor)
+        next_features = critic.extract_features(data.next_observations, critic.features_extractor)
+        transitions = torch.cat([current_features, data.actions], dim=1).view(steps, batch_size, -1)
+        states = torch.empty(steps, 2 * batch_size, transitions.shape[-1])
+        states[:, :batch_size, :features] = current_features.view(steps, batch_size, -1)
+        states[:, batch_size:, :features] = next_features.view(steps, batch_size, -1)
         rewards = data.rewards.view(steps, batch_size, 1)
         gamma = self.gamma if data.discounts is None else data.discounts
         discounts = ((1 - data.dones) * gamma).view(steps, batch_size, 1)
         noise = torch.randn(steps, 2 * batch_size, self._actions)
         log_density = -(0.5 * noise.square() + 0.5 * math.log(2 * math.pi)).sum(dim=2, keepdim=True)
-        for step in zip(states, taken, rewards, discounts, noise, log_density, strict=True):
+        for step in zip(states, transitions, rewards, discounts, noise, log_density, strict=True):
             self._gradient_step(*step)
 
     def _gradient_step(
         self,
         states: torch.Tensor,
-        taken: torch.Tensor,
+        transitions: torch.Tensor,
         rewards: torch.Tensor,
         discounts: torch.Tensor,
         noise: torch.Tensor,
@@ -332,13 +332,13 @@ class FastTrainingStep(_Algorithm):
 
         Args:
             states: (2B, features + actions): rows of features, then of next features; the actions are overwritten.
-            taken: (B, features + actions): features and actions of the transitions.
+            transitions: (B, features + actions): features and actions of the transitions.
             rewards: Rewards (B, 1).
             discounts: Discount factors (B, 1), 0 for a terminal transition.
             noise: Standard normal noise (2B, actions).
             log_density: Logarithm of the density of the noise, (2B, 1).
         """
-        batch = len(taken)
+        batch = len(transitions)
         (mean, log_std), actor_cache = self._actor.forward(states[None, :, : self._actor_features])
         clamped = log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
         deviation = clamped.exp().mul_(noise)
@@ -350,7 +350,7 @@ class FastTrainingStep(_Algorithm):
 
         next_values, _ = self._target.forward(states[None, batch:])
         target = rewards + discounts * (self._target_value(next_values) - ent_coef * log_prob[batch:])
-        values, critic_cache = self._critic.forward(taken[None])
+        values, critic_cache = self._critic.forward(transitions[None])
         if self.records_metrics:
             self._record("critic_loss", self._critic_loss(values, target))
             self._record("q_value", values.mean())

@@ -146,13 +146,13 @@ class ViaPointCorrections:
         if not offsets:
             return self.points
         steps, last = sorted(offsets), self._reference.num_steps - 1
-        wanted = {min(step, last): offsets[step] for step in steps}
+        points = {min(step, last): offsets[step] for step in steps}
         if is_held:
-            wanted |= dict.fromkeys([*range(steps[-1], last, VIA_POINT_SPACING), last], offsets[steps[-1]])
+            points |= dict.fromkeys([*range(steps[-1], last, VIA_POINT_SPACING), last], offsets[steps[-1]])
         new: dict[int, np.ndarray] = {}
-        for step in sorted(wanted):
-            if not new or step - max(new) >= VIA_POINT_SPACING or step == max(wanted):
-                new[step] = self._displaced(step, wanted[step])
+        for step in sorted(points):
+            if not new or step - max(new) >= VIA_POINT_SPACING or step == max(points):
+                new[step] = self._displaced(step, points[step])
         size = 1 + self._reference.num_outputs
         old = {int(row[0]): row[1:] for row in np.reshape(self.points, (-1, size))}
         first, end = min(new) - VIA_POINT_SPACING, max(new) + VIA_POINT_SPACING

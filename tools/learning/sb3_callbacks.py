@@ -35,11 +35,11 @@ class Sb3Callbacks(Callback):
             raise InputError(
                 f"callbacks of Stable-Baselines3 need one of its models, and {type(learner).__name__} has none"
             )
-        found = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
-        for one in found:
+        callback_list = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
+        for one in callback_list:
             if not isinstance(one, BaseCallback):
                 raise InputError(f"{brief(one)} is no callback: give those of Stable-Baselines3 (BaseCallback)")
-        self._model, self._callback, self._is_started = model, CallbackList(found), False
+        self._model, self._callback, self._is_started = model, CallbackList(callback_list), False
         self.is_stopped = False
 
     def on_episode_start(self) -> None:

@@ -264,8 +264,8 @@ def _resumed_config(
     if environment:
         resolved = check_environment(config.task, environment)
         environment = {key: resolved.get(key, value) for key, value in environment.items()}
-    wanted = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
-    for key, value in wanted.items():
+    arguments = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
+    for key, value in arguments.items():
         if key == "episodes" and value < config.episodes:
             raise InputError(f"the run in {folder.path} has {config.episodes} episodes: it can only be given more")
         if key != "episodes" and stored.get(key) != value:

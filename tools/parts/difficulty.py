@@ -131,10 +131,10 @@ def choose_setting(
     tried: dict[int, Score] = {}
     number = first
     while 0 <= number < len(settings) and number not in tried:
-        found = tried[number] = score(settings[number])
-        if found.is_too_easy == found.is_too_hard:
+        result = tried[number] = score(settings[number])
+        if result.is_too_easy == result.is_too_hard:
             break
-        number += 1 if found.is_too_easy else -1
+        number += 1 if result.is_too_easy else -1
     best = max(tried, key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin))
     return settings[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
 
@@ -256,7 +256,7 @@ def calibrate(
     seconds = float(np.mean([times[-1] - times[0] for times in demonstrations.times]))
     options = setting.options(force_limit, turn)
     nearest, farthest = options["offset_range"]
-    found = {
+    result = {
         "offset_mm": [round(nearest / MM, 3), round(farthest / MM, 3)],
         "turn_degrees": turn,
         "force_limit": force_limit,
@@ -270,7 +270,7 @@ def calibrate(
         f"limit {force_limit:g} N, {seconds:.1f} s: {score}"
         + ("" if is_hard else f"; no setting has at most {MAX_RANDOM:.0%} and at least {MIN_SCRIPTED:.0%}")
     )
-    return file.model_copy(update={"hard": options, "measured": {**file.measured, "hard": found}})
+    return file.model_copy(update={"hard": options, "measured": {**file.measured, "hard": result}})
 
 
 def _choose_for(folder: Path, force_limit: float, turn: float, episodes: int) -> tuple[Setting, Score, bool]:

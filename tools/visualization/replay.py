@@ -268,8 +268,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
 def find_report(html: Path, run: Path | None) -> str | None:
     """Return the relative path from the page to the report of its run, or of the run's study; None without a report."""
     folders = [html.parent, *([] if run is None else [run, run.parent])]
-    found = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)
-    return None if found is None else Path(os.path.relpath(found, html.parent)).as_posix()
+    report = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)
+    return None if report is None else Path(os.path.relpath(report, html.parent)).as_posix()
 
 
 def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:

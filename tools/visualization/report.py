@@ -24,7 +24,7 @@ from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
 from guiderail.tools.visualization import report_figures as figures
-from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run, command, flat, gather, is_finite
+from guiderail.tools.visualization.report_data import LEARNED, ReportData, Run, command, flat, gather, is_finite
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
@@ -79,24 +79,24 @@ def write_report(
     if episodes < 0:
         raise InputError(f"the number of episodes of an evaluation must be 0 or more, not {episodes}")
     check_page(out)
-    gathered = gather(paths, episodes)
-    write_atomically(out, render(gathered, describe_differences).encode())
+    data = gather(paths, episodes)
+    write_atomically(out, render(data, describe_differences).encode())
     return out
 
 
-def render(gathered: Gathered, describe_differences: DescribeDifferences | None = None) -> str:
+def render(data: ReportData, describe_differences: DescribeDifferences | None = None) -> str:
     """Return the text of the page."""
-    runs, tasks = gathered.runs, gathered.tasks
+    runs, tasks = data.runs, data.tasks
     seeds = len({run.config.seed for run in runs})
     episodes = _count(sum(len(run.episodes) for run in runs), "training episode")
     lead = f"{_count(len(runs), 'run')}, {_count(seeds, 'seed')}, {episodes}"
-    commands, commands_of_runs = _commands(gathered)
-    has_held_out = len(gathered.held_out) > 0
+    commands, commands_of_runs = _commands(data)
+    has_held_out = len(data.held_out) > 0
     return PAGE.render(
-        title=gathered.name,
-        lead=f"{', '.join(tasks)}: {lead}." if runs else _lead(gathered),
-        held_out={"table": _held_out(gathered), "figure": figures.held_out(gathered)} if has_held_out else None,
-        tasks=[_task(gathered, task, describe_differences) for task in tasks],
+        title=data.name,
+        lead=f"{', '.join(tasks)}: {lead}." if runs else _lead(data),
+        held_out={"table": _held_out(data), "figure": figures.held_out(data)} if has_held_out else None,
+        tasks=[_task(data, task, describe_differences) for task in tasks],
         tolerance=f"{TOLERANCE:g}",
         commands=commands,
         runs=commands_of_runs,
@@ -104,17 +104,17 @@ def render(gathered: Gathered, describe_differences: DescribeDifferences | None 
     )
 
 
-def _task(gathered: Gathered, task: str, describe_differences: DescribeDifferences | None) -> dict[str, Any]:
-    methods = gathered.methods(task)
+def _task(data: ReportData, task: str, describe_differences: DescribeDifferences | None) -> dict[str, Any]:
+    methods = data.methods(task)
     curves = {"success": "success rate", "return": "return"}
     if any((run.episodes["peak_force"] > 0).any() for runs in methods.values() for run in runs):
         curves["mean_squared_force"] = "mean squared force [N²]"
     drawn = [
-        figures.curve(gathered, task, name, label)
+        figures.curve(data, task, name, label)
         for name, label in curves.items()
-        if all(name in run.episodes for run in gathered.runs)
+        if all(name in run.episodes for run in data.runs)
     ]
-    drawn.insert(2, figures.survival_curve(gathered, task))
+    drawn.insert(2, figures.survival_curve(data, task))
     safety = {name: [run.safety for run in runs] for name, runs in methods.items()}
     differing, common = _configuration(methods)
     return {
@@ -130,8 +130,8 @@ def _task(gathered: Gathered, task: str, describe_differences: DescribeDifferenc
     }
 
 
-def _held_out(gathered: Gathered) -> Table:
-    rows, counts = [], gathered.held_out
+def _held_out(data: ReportData) -> Table:
+    rows, counts = [], data.held_out
     has_studies = counts["study"].nunique() > 1
     for (study, method, policy, after_episodes, eval_set), group in counts.groupby(
         ["study", "method", "policy", "after_episodes", "eval_set"], sort=False
@@ -263,12 +263,10 @@ def _versions(runs: Sequence[Run]) -> Table | None:
     return Table(["", ""], [Row([Cell(name), Cell(version)]) for name, version in versions.items()])
 
 
-def _commands(gathered: Gathered) -> tuple[list[str], list[str]]:
+def _commands(data: ReportData) -> tuple[list[str], list[str]]:
     """Return the commands that reproduce the report and, for a study, also those of its individual runs."""
-    of_runs = [
-        command(run.config, f"runs/{name}") for run, name in zip(gathered.runs, gathered.folder_names, strict=True)
-    ]
-    return (_study_commands(gathered.held_out), of_runs) if gathered.is_study else (of_runs, [])
+    of_runs = [command(run.config, f"runs/{name}") for run, name in zip(data.runs, data.folder_names, strict=True)]
+    return (_study_commands(data.held_out), of_runs) if data.is_study else (of_runs, [])
 
 
 def _study_commands(counts: pd.DataFrame) -> list[str]:
@@ -289,9 +287,9 @@ def _study_commands(counts: pd.DataFrame) -> list[str]:
     return commands
 
 
-def _lead(gathered: Gathered) -> str:
+def _lead(data: ReportData) -> str:
     """Return the first sentence of a report without runs."""
-    has_learned = len(gathered.held_out) > 0 and (gathered.held_out["policy"] == LEARNED).any()
+    has_learned = len(data.held_out) > 0 and (data.held_out["policy"] == LEARNED).any()
     return "Tables of studies, without their runs." if has_learned else "Baseline policies."
 
 

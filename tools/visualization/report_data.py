@@ -102,14 +102,14 @@ class Run:
 
 
 @dataclass
-class Gathered:
+class ReportData:
     """Contents of a report.
 
     Attributes:
         name: Title.
         runs: Runs with at least one episode.
         held_out: Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
-        is_study: Whether a folder is that of a study.
+        is_study: True if one of the folders is that of a study.
         folder_names: Unique name of each run's folder.
     """
 
@@ -126,11 +126,11 @@ class Gathered:
 
     def methods(self, task: str) -> dict[str, list[Run]]:
         """Return the runs of a task by method."""
-        found: dict[str, list[Run]] = {}
+        groups: dict[str, list[Run]] = {}
         for run in self.runs:
             if run.config.task == task:
-                found.setdefault(run.method, []).append(run)
-        return found
+                groups.setdefault(run.method, []).append(run)
+        return groups
 
     def colors(self, task: str) -> dict[str, str]:
         """Return a color for each method: that of its guidance, or of a palette if two methods share a guidance."""
@@ -140,7 +140,7 @@ class Gathered:
         return {name: PALETTE[index % len(PALETTE)] for index, name in enumerate(kinds)}
 
 
-def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
+def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     """Read runs and studies from their folders.
 
     Args:
@@ -152,32 +152,32 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
         InputError: If a folder contains no run, or a file is damaged.
     """
     folders: list[Path] = []
-    alone: list[Path] = []  # runs that are not part of a study
+    single_runs: list[Path] = []  # runs that are not part of a study
     held_out, has_tables = [], False
     for path in paths:
         if (path / "config.yaml").is_file():
             folders.append(path)
-            alone.append(path.resolve())
+            single_runs.append(path.resolve())
             continue
-        inside = sorted(file.parent for file in path.rglob("config.yaml")) if path.is_dir() else []
-        studied = _study_tables(path) if path.is_dir() else []
-        if not inside and not studied:
+        run_paths = sorted(file.parent for file in path.rglob("config.yaml")) if path.is_dir() else []
+        study_tables = _study_tables(path) if path.is_dir() else []
+        if not run_paths and not study_tables:
             raise InputError(f"{path} holds no run: give folders that guiderail train or guiderail study made")
-        folders += inside
-        alone += [] if studied else [folder.resolve() for folder in inside]
-        held_out += studied
-        has_tables = has_tables or bool(studied)
-    read = {folder.resolve(): RunFolder(folder) for folder in folders}
-    runs = [Run(one.path, one.config(), _episodes(one)) for one in read.values()]
+        folders += run_paths
+        single_runs += [] if study_tables else [folder.resolve() for folder in run_paths]
+        held_out += study_tables
+        has_tables = has_tables or bool(study_tables)
+    run_folders = {folder.resolve(): RunFolder(folder) for folder in folders}
+    runs = [Run(one.path, one.config(), _episodes(one)) for one in run_folders.values()]
     runs = [run for run in runs if len(run.episodes)]
     if not runs and not held_out:
         raise InputError(f"{paths[0]} has no finished episode yet: let it train, then report on it")
     _name_methods(runs)
-    held_out += [_evaluated(run, episodes) for run in runs if run.path.resolve() in alone]
+    held_out += [_evaluated(run, episodes) for run in runs if run.path.resolve() in single_runs]
     name = paths[0].resolve().name if len(paths) == 1 else ", ".join(dict.fromkeys(run.config.task for run in runs))
     tables = [table for table in held_out if len(table)]
     counts = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-    return Gathered(name, runs, counts, is_study=has_tables, folder_names=_folder_names(runs))
+    return ReportData(name, runs, counts, is_study=has_tables, folder_names=_folder_names(runs))
 
 
 def _folder_names(runs: Sequence[Run]) -> list[str]:
@@ -198,18 +198,18 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
 
     Rows of a partial table that are in the whole table too are left out.
     """
-    found: dict[str, pd.DataFrame] = {}
+    tables: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
         table = read_table(file)
         if not set(table.columns) >= STUDY_COLUMNS:
             continue
         rows = _success_counts(table[(table["eval_set"] != "") & table["success_rate"].notna()].assign(study=file.stem))
-        for name, whole in found.items():
+        for name, whole in tables.items():
             if file.stem.startswith(f"{name}-"):
                 same = list(whole.columns.drop("study"))
                 rows = rows[~rows[same].apply(tuple, axis=1).isin(set(whole[same].apply(tuple, axis=1)))]
-        found[file.stem] = rows
-    return [rows for rows in found.values() if len(rows)]
+        tables[file.stem] = rows
+    return [rows for rows in tables.values() if len(rows)]
 
 
 def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
@@ -235,24 +235,30 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
 
 def _evaluate(run: Run, episodes: int) -> None:
     """Evaluate a run's policy and baseline policies on held-out episodes, unless they are stored in its folder."""
-    folder, where = RunFolder(run.path), run.config.environment
+    folder, environment = RunFolder(run.path), run.config.environment
     policy = Policy.load(run.path)
-    how: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
+    evaluation: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
     evaluate_once(
-        run.path / POLICY_FOLDER, POLICY, run.config, lambda env: policy, where, about=policy_digest(folder), **how
+        run.path / POLICY_FOLDER,
+        POLICY,
+        run.config,
+        lambda env: policy,
+        environment,
+        about=policy_digest(folder),
+        **evaluation,
     )
-    is_demonstration = is_demonstrated(where.get("guidance"))
+    is_demonstration = is_demonstrated(environment.get("guidance"))
     for name in BASELINES:
         stored_name = "demonstration" if name == "zero" and is_demonstration else name
         make_policy = make_baseline(run.config.task, name, run.config.seed)
-        evaluate_once(run.path / BASELINES_FOLDER, stored_name, run.config, make_policy, where, **how)
+        evaluate_once(run.path / BASELINES_FOLDER, stored_name, run.config, make_policy, environment, **evaluation)
 
 
 def _name_methods(runs: list[Run]) -> None:
     """Name each run's method after the settings in which it differs from the other runs of its task."""
     for task in {run.config.task for run in runs}:
-        own = [run for run in runs if run.config.task == task]
-        settings = [flat(run.config) for run in own]
+        task_runs = [run for run in runs if run.config.task == task]
+        settings = [flat(run.config) for run in task_runs]
         keys = list(dict.fromkeys(key for one in settings for key in one))
         differing = [key for key in keys if len({repr(one.get(key)) for one in settings}) > 1]
         # Options that come with a guidance or an algorithm are implied by its name.
@@ -260,7 +266,7 @@ def _name_methods(runs: list[Run]) -> None:
         names = {tuple(one.get(key) for key in by_name) for one in settings}
         methods = {tuple(repr(one.get(key)) for key in differing) for one in settings}
         chosen = by_name if len(names) == len(methods) else differing
-        for run, one in zip(own, settings, strict=True):
+        for run, one in zip(task_runs, settings, strict=True):
             kind = str(one.get("guidance", ""))
             words = [label(kind) if key == "guidance" else _format_setting(key, one.get(key)) for key in chosen]
             run.method = ", ".join(words) or (label(kind) if kind else run.config.task)

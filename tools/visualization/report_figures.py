@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 
 from guiderail.tools.evaluation.metrics import bootstrap_band, episodes_to_convergence, survival, wilson
-from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run
+from guiderail.tools.visualization.report_data import LEARNED, ReportData, Run
 from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above, new_figure
 
 SIZE = (4.6, 3.0)  # size of a figure [in]; two fit side by side on a wide screen
@@ -18,13 +18,13 @@ STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 
 DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that coinciding curves can be distinguished
 
 
-def curve(gathered: Gathered, task: str, column: str, label: str) -> str:
+def curve(data: ReportData, task: str, column: str, label: str) -> str:
     """Return the curve of a column over the training episodes: the mean over seeds and its bootstrap band."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
-        colors = gathered.colors(task)
-        for (name, runs), dash in zip(gathered.methods(task).items(), cycle(DASHES), strict=False):
+        colors = data.colors(task)
+        for (name, runs), dash in zip(data.methods(task).items(), cycle(DASHES), strict=False):
             values = [run.episodes[column].to_numpy(float) for run in runs]
             shade, text = colors[name], _label(name, runs)
             draw_runs(axis, values, color=shade, label=text, band=bootstrap_band, linestyle=dash)
@@ -35,13 +35,13 @@ def curve(gathered: Gathered, task: str, column: str, label: str) -> str:
         return _svg(figure, f"{label} over the training episodes of {task}")
 
 
-def survival_curve(gathered: Gathered, task: str) -> str:
+def survival_curve(data: ReportData, task: str) -> str:
     """Return the fraction of runs that have not converged over the training episodes (Kaplan and Meier)."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
-        colors = gathered.colors(task)
-        for (name, runs), dash in zip(gathered.methods(task).items(), cycle(DASHES), strict=False):
+        colors = data.colors(task)
+        for (name, runs), dash in zip(data.methods(task).items(), cycle(DASHES), strict=False):
             after, lengths = (
                 [episodes_to_convergence(run.episodes) for run in runs],
                 [len(run.episodes) for run in runs],
@@ -57,9 +57,9 @@ def survival_curve(gathered: Gathered, task: str) -> str:
         return _svg(figure, f"fraction of the runs of {task} that have not converged, over the training episodes")
 
 
-def held_out(gathered: Gathered) -> str:
+def held_out(data: ReportData) -> str:
     """Return the held-out success of each seed with its Wilson interval; baseline policies are gray."""
-    rows, keys = gathered.held_out, ["study", "method", "policy", "seed", "eval_set"]
+    rows, keys = data.held_out, ["study", "method", "policy", "seed", "eval_set"]
     rows = rows[rows["after_episodes"] == rows.groupby(keys)["after_episodes"].transform("max")]
     groups = list(rows.groupby(["study", "method", "policy", "eval_set"], sort=False))
     has_studies, has_eval_sets = rows["study"].nunique() > 1, rows["eval_set"].nunique() > 1

@@ -1,8 +1,8 @@
 """Driver for the Franka Control Interface: sends desired poses to a compiled Cartesian impedance loop at 1 kHz.
 
-The client is franky 2 (MIT license). It runs libfranka's loop in a thread without Python's lock, has a Cartesian
-impedance that follows references of any rate with bounded errors, forces and torque rates, and ends a torque motion by
-damping. With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
+The client is franky 2 (MIT license). It runs libfranka's loop in a thread without the GIL, has a Cartesian impedance
+that follows references of any rate with bounded errors, forces and torque rates, and ends a torque motion by damping.
+With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ logger = logging.getLogger(__name__)
 
 DYNAMICS_SHARE = 0.2  # share of the robot's motion limits that commands may use
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
-POSTURE_STIFFNESS = 5.0  # stiffness of the nullspace's posture [Nm/rad]
+POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold relative to the largest wrench of the impedance
 MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
 REALTIME_FILE = Path("/sys/kernel/realtime")  # contains 1 on a kernel with real-time priorities
-TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # of external torque [Nm], as in libfranka's examples
+TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # collision thresholds [Nm] of libfranka's examples
 
 
 @register_driver("fci")

@@ -252,7 +252,7 @@ class Pouring(Task):
             p_MP = p_MP if options.start is None else np.array(options.start)
             p_TMug = p_TMug if options.mug_position is None else np.array(options.mug_position)
             if np.abs(p_TMug).max() > MAX_MUG_OFFSET:
-                raise InputError(f"the mug can be moved by {MAX_MUG_OFFSET} m along x and y: not more")
+                raise InputError(f"the mug can be moved by at most {MAX_MUG_OFFSET} m along x and y")
             error = sample_mug_error(episode, self.options, options)
             # The error moves the actual mug, so that the estimated mug position stays within reach.
             estimated, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error

@@ -77,6 +77,6 @@ def test_guard_of_a_stored_policy_is_applied_after_loading(tmp_path):
     _, after = make_pre_post_processors(policy.config, pretrained_path=str(tmp_path / "out"))
     sent = [after(torch.full((1, 3), 0.4)) for _ in range(20)]
     check(torch.cat(sent).numpy().astype(float))
-    again = torch.cat(sent)[0]
+    second = torch.cat(sent)[0]
     after.reset()
-    assert (after(torch.full((1, 3), 0.4))[0] == again).all()
+    assert (after(torch.full((1, 3), 0.4))[0] == second).all()

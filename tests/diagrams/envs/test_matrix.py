@@ -72,6 +72,6 @@ def test_every_task_can_be_held_out(task):
     for options in ({}, {"held_out": True}, {"held_out": True}):
         _, info = env.reset(seed=3, options=options)
         drawn.append({key: np.array(value) for key, value in info.items() if isinstance(value, np.ndarray)})
-    usual, held_out, again = drawn
+    usual, held_out, second = drawn
     assert any((usual[key] != held_out[key]).any() for key in usual)
-    assert all((held_out[key] == again[key]).all() for key in usual)
+    assert all((held_out[key] == second[key]).all() for key in usual)

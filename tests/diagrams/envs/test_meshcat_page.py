@@ -1,4 +1,4 @@
-"""A page acts only for those who have its token and origin, and survives any message."""
+"""Access to a page needs its token and an allowed origin; malformed messages do not end it."""
 
 import gc
 import os
@@ -36,9 +36,9 @@ def opened():
 
 @pytest.fixture
 def page(opened):
-    """Return the page with its slider at zero and its clicks taken."""
+    """Return the page with its slider at zero, and count clicks from now on."""
     opened.SetSliderValue("x", 0.0)
-    opened.taken = opened.GetButtonClicks("keep")
+    opened.clicks_before = opened.GetButtonClicks("keep")
     return opened
 
 
@@ -59,14 +59,14 @@ def wait_until(condition):
 
 
 def inputs(page):
-    return page.GetSliderValue("x"), page.GetButtonClicks("keep") - page.taken, list(page.GetGamepad().axes)
+    return page.GetSliderValue("x"), page.GetButtonClicks("keep") - page.clicks_before, list(page.GetGamepad().axes)
 
 
 def test_browser_with_token_and_origin_moves_the_controls(page):
     for host in ("localhost", "127.0.0.1"):
         with browser(page, origin=origin(page, host)) as one:
             clicks = inputs(page)[1]
-            one.send(msgpack.packb({"type": "slider", "name": "x", "value": 7}))  # beyond the slider's limit
+            one.send(msgpack.packb({"type": "slider", "name": "x", "value": 7}))  # above the slider's maximum of 2
             one.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": GAMEPAD}))
             one.send(msgpack.packb({"type": "button", "name": "keep"}))
             wait_until(lambda clicks=clicks: inputs(page)[1] == clicks + 1)
@@ -128,7 +128,7 @@ def test_tokens_differ(page):
 
 
 def test_meshcat_itself_accepts_no_connection():
-    """Only the gateway listens: the server inside Meshcat, which a byte can end, is out of reach."""
+    """Only the gateway listens, because one malformed byte can end the server inside Meshcat."""
     PAGES.append(page := MeshcatPage(is_served=False))
     port = super(MeshcatPage, page).port()
     with pytest.raises(ConnectionRefusedError):
@@ -157,7 +157,7 @@ def test_long_message_ends_its_connection_only(page):
         wait_until(lambda: inputs(page)[1] == 1)
 
 
-def test_bytes_that_are_no_websocket_are_survived(page):
+def test_page_ignores_bytes_that_are_not_websocket_frames(page):
     for data in (b"\xc1", b"GET / HTTP/1.1\r\n" + b"a" * 100_000, b"POST / HTTP/1.1\r\n\r\n", b"\0" * 1000):
         with socket.create_connection(("127.0.0.1", page.port()), 5.0) as one:
             one.sendall(data)
@@ -185,7 +185,7 @@ def test_new_browser_receives_the_present_scene(page):
     page.DeleteButton("end")
     page.SetSliderValue("x", 1.5)
     with browser(page) as first:
-        received(first)  # the gateway has everything
+        received(first)  # afterwards the gateway has received every frame
     with browser(page) as one, browser(page) as other:
         messages = received(one)
         assert {m["path"] for m in messages if m["type"] == "set_object"} == {"/kept"}
@@ -223,9 +223,9 @@ def test_deletion_removes_what_is_below_it_only():
         cache.add(frame("set_property", path, property="color", value=[1, 0, 0]))
         cache.add(frame("set_property", path, property="visible", value=True))
     cache.add(frame("delete", "/a"))
-    left = [msgpack.unpackb(one) for one in cache.frames()]
-    assert {one["path"] for one in left if one["type"] != "delete"} == {"/ab", "/c"}
-    assert len(left) == 7
+    remaining = [msgpack.unpackb(one) for one in cache.frames()]
+    assert {one["path"] for one in remaining if one["type"] != "delete"} == {"/ab", "/c"}
+    assert len(remaining) == 7
     cache.add(frame("set_object", "/a", object={}))
     order = [(one["type"], one["path"]) for one in map(msgpack.unpackb, cache.frames())]
     assert order.index(("delete", "/a")) < order.index(("set_object", "/a"))

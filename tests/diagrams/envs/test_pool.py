@@ -54,10 +54,10 @@ def test_two_environments_never_share_a_diagram():
     assert len({id(one.task.diagram) for one in (env, other, different)}) == 3
     env.close()
     env.close()  # gives back once
-    again, more = make_env("NarrowPassage"), make_env("NarrowPassage")
-    assert again.task.diagram is not more.task.diagram
-    assert {id(again.task.diagram), id(more.task.diagram)}.isdisjoint({id(other.task.diagram)})
-    for one in (other, different, again, more):
+    second, more = make_env("NarrowPassage"), make_env("NarrowPassage")
+    assert second.task.diagram is not more.task.diagram
+    assert {id(second.task.diagram), id(more.task.diagram)}.isdisjoint({id(other.task.diagram)})
+    for one in (other, different, second, more):
         one.close()
 
 
@@ -69,9 +69,9 @@ def test_diagram_is_given_back_when_its_view_cannot_open(monkeypatch):
         patch.setattr("guiderail.diagrams.envs.env.View", lambda query: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             make_env("NarrowPassage", render_mode="human")
-    again = make_env("NarrowPassage")
-    assert again.task.diagram is diagram
-    again.close()
+    second = make_env("NarrowPassage")
+    assert second.task.diagram is diagram
+    second.close()
 
 
 def test_a_closed_environment_stays_closed():

@@ -20,15 +20,15 @@ def trace_of(steps):
 def test_statistics_are_those_of_all_control_steps():
     rng = np.random.default_rng(0)
     forces, violations = rng.uniform(0, 9, 50), rng.normal(size=50)
-    found = trace_of(
+    result = trace_of(
         {"force": force, "commanded_violation": violation, "measured_violation": 2 * violation}
         for force, violation in zip(forces, violations, strict=True)
     ).statistics()
-    assert found["steps"] == 50
-    assert found["peak_force"] == forces.max()
-    assert found["mean_force"] == pytest.approx(forces.mean(), rel=1e-12)
-    assert found["max_commanded_violation"] == violations.max()
-    assert found["max_measured_violation"] == 2 * violations.max()
+    assert result["steps"] == 50
+    assert result["peak_force"] == forces.max()
+    assert result["mean_force"] == pytest.approx(forces.mean(), rel=1e-12)
+    assert result["max_commanded_violation"] == violations.max()
+    assert result["max_measured_violation"] == 2 * violations.max()
 
 
 def test_statistics_have_the_largest_violation_when_it_is_the_last():
@@ -36,17 +36,17 @@ def test_statistics_have_the_largest_violation_when_it_is_the_last():
 
 
 def test_collision_lasts_as_long_as_the_contact():
-    found = trace_of({"collision": touching} for touching in (0, 1, 1, 1, 0, 0, 1, 0, 1)).statistics()
-    assert (found["collisions"], found["collision_steps"]) == (3, 5)
+    result = trace_of({"collision": touching} for touching in (0, 1, 1, 1, 0, 0, 1, 0, 1)).statistics()
+    assert (result["collisions"], result["collision_steps"]) == (3, 5)
     assert trace_of([{"collision": 1.0}]).statistics()["collisions"] == 1
 
 
 def test_statistics_count_saturation_of_any_actuator_and_fallbacks():
     steps = (([0, 0], 1), ([0, -3], 0), ([1, 0], 1))
-    found = trace_of(
+    result = trace_of(
         {"saturation": np.array(saturation, float), "fallback": fallback} for saturation, fallback in steps
     ).statistics()
-    assert (found["saturated_steps"], found["fallback_steps"]) == (2, 2)
+    assert (result["saturated_steps"], result["fallback_steps"]) == (2, 2)
 
 
 @pytest.mark.parametrize("last", [np.nan, 9.0])

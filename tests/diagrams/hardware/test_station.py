@@ -188,21 +188,21 @@ def test_station_stops_and_is_silent_when_statuses_stop():
     assert np.abs(moving).max() > 0.05
     both.torques.clear()
     both.go(goal, 0.5, robot=False)
-    found = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
-    assert found * PERIOD <= 0.05
+    result = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
+    assert result * PERIOD <= 0.05
     assert (both.arm_state, both.fault) == (ArmState.OFF, Fault.STALE)
     sent = len(both.commands)
     assert both.commands[-1].joint_torque == (0.0,) * 7
     both.go(goal, 1.0, robot=False)
     assert len(both.commands) == sent
     # After the robot is back nothing is sent until the settling time is over, and then zero torque.
-    back = len(both.torques)
+    num_torques = len(both.torques)
     both.robot_simulator.AdvanceTo(both.robot_simulator.get_context().get_time() + PERIOD)
     both.go(goal, 0.2)
     assert len(both.commands) == sent
     both.go(goal, 0.2)
     assert len(both.commands) > sent
-    np.testing.assert_array_equal(both.torques[back:], 0.0)
+    np.testing.assert_array_equal(both.torques[num_torques:], 0.0)
     both.station.resume(both.context)
     both.go(goal, 1.0)
     assert both.arm_state == ArmState.RUNNING

@@ -41,8 +41,8 @@ def test_station_is_undisturbed_by_default(plain):
 def test_disturbances_depend_on_the_seed(plain):
     options = {"wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.02), "wrench_noise": (0.2, 0.01), "pose_bias": 1e-3}
     _, first, info = descended(**options)
-    _, again, _ = descended(**options)
-    np.testing.assert_array_equal(again, first)
+    _, second, _ = descended(**options)
+    np.testing.assert_array_equal(second, first)
     _, other, changed = descended(seed=2, **options)
     assert not np.array_equal(other, first)
     assert 0.5 <= info["wrench_scale"] <= 2.0
@@ -60,11 +60,11 @@ def test_contact_factors_last_until_the_next_reset():
         query = station.scene_graph.get_query_output_port().Eval(
             station.scene_graph.GetMyContextFromRoot(env.simulator.get_context())
         )
-        inspector, found = query.inspector(), {}
+        inspector, result = query.inspector(), {}
         for body in ("clamp", "table"):
             for one in station.plant.GetCollisionGeometriesForBody(station.plant.GetBodyByName(body)):
-                found[inspector.GetName(one).split("::")[-1]] = inspector.GetProximityProperties(one)
-        return found
+                result[inspector.GetName(one).split("::")[-1]] = inspector.GetProximityProperties(one)
+        return result
 
     pad = surfaces()["pad"]
     assert pad.GetProperty("material", "coulomb_friction").static_friction() == pytest.approx(0.1)

@@ -103,11 +103,11 @@ def test_clamp_inserts_at_offsets_set_in_the_context(moved):
     offset = np.array([1.8, -1.2])
     _, blocked = descend([0, 0.88, 1.2], [16, -6, -6], **{moved: offset})
     assert blocked["pose"][-1, 2] > SURFACE - 0.2 * MM
-    _, found = descend(
+    _, result = descend(
         [0, 0.88, 1.2], [16, -6, -6], **{moved: offset}, xy_mm=-offset if moved == "grasp_mm" else offset
     )
-    assert abs(found["pose"][-1, 2]) < 0.1 * MM
-    assert found["contact_force"].max() <= 10.0
+    assert abs(result["pose"][-1, 2]) < 0.1 * MM
+    assert result["contact_force"].max() <= 10.0
 
 
 def test_sticking_contact_does_not_creep():

@@ -203,7 +203,7 @@ def test_divergence_ends_only_the_present_episode(tmp_path, monkeypatch):
     env = generate_assets()
     episode(env, 4)
     env.reset(seed=3)
-    sound, *_ = env.step(np.zeros(2))
+    valid, *_ = env.step(np.zeros(2))
     for displacement in (1e11, 1e300):
         env.reset(seed=3)
         env.step(np.zeros(2))
@@ -212,7 +212,7 @@ def test_divergence_ends_only_the_present_episode(tmp_path, monkeypatch):
         assert (terminated, truncated) == (False, True)
         assert "the simulation failed in MuJoCo" in info["simulation_failure"]
         assert not info["is_success"]
-        np.testing.assert_array_equal(observation, sound)
+        np.testing.assert_array_equal(observation, valid)
     assert not list(tmp_path.iterdir())
     np.testing.assert_array_equal(episode(env, 5), episode(generate_assets(), 5))
 

@@ -32,8 +32,8 @@ def free_motion(env, steps=45, seed=3):
 def test_setting_is_tared_and_seeded_on_every_station(station, sensing):
     env = make_env("BncConnector", station=station, sensing=sensing, **HARD)
     measured, exact, info = free_motion(env)
-    again, _, drawn = free_motion(env)
-    np.testing.assert_array_equal(again, measured)
+    second, _, drawn = free_motion(env)
+    np.testing.assert_array_equal(second, measured)
     other, _, changed = free_motion(env, seed=4)
     assert not np.array_equal(other, measured)
     delay = info["wrench_delay"]

@@ -133,9 +133,9 @@ def test_the_same_seed_is_the_same_episode(kgrl):
     actions = rng.uniform(-1, 1, (12, 2))
     runs = []
     for _ in range(2):
-        observation, drawn = kgrl.reset(seed=11)
+        observation, info = kgrl.reset(seed=11)
         steps = [observation] + [kgrl.step(action)[0] for action in actions]
-        runs.append((np.array(steps), drawn["jack_offset"]))
+        runs.append((np.array(steps), info["jack_offset"]))
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
     np.testing.assert_array_equal(runs[0][1], runs[1][1])
 

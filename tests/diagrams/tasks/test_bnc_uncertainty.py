@@ -27,8 +27,8 @@ def test_tilt_is_sampled_within_bounds_without_side_effects(kind):
 
 
 def test_a_given_offset_is_without_a_tilt():
-    given = InsertionReset(offset=(0.0, 1e-3))
-    _, plug = BncUncertainty("per_episode", grasp_angle=1.0).draw(np.random.default_rng(0), given)
+    reset = InsertionReset(offset=(0.0, 1e-3))
+    _, plug = BncUncertainty("per_episode", grasp_angle=1.0).draw(np.random.default_rng(0), reset)
     np.testing.assert_array_equal(plug, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Connector and clamp as hard as their options make them."""
+"""Difficulty of the connector and the clamp: `difficulty` and the options that it sets."""
 
 import numpy as np
 import pytest
@@ -38,15 +38,15 @@ def test_hard_equals_its_options_given_one_by_one(task):
     assert {name for name in hard if hard[name] != standard[name]} == {"difficulty", *HARD[task]}
     assert {name: hard[name] for name in HARD[task]} == HARD[task]
     assert EnvConfig.resolve(task, HARD[task]).options == hard | {"difficulty": "standard"}
-    given = {"difficulty": "hard", "force_limit": 30.0}
-    assert EnvConfig.resolve(task, given).options == hard | {"force_limit": 30.0}
+    arguments = {"difficulty": "hard", "force_limit": 30.0}
+    assert EnvConfig.resolve(task, arguments).options == hard | {"force_limit": 30.0}
 
 
 @pytest.mark.parametrize("task", HARD)
 def test_standard_is_unchanged(task):
     declared = EnvConfig.resolve(task, {}).make_task()
-    drawn = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
-    assert declared.workcell() == type(declared.workcell())(drawn)
+    dimensions = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
+    assert declared.workcell() == type(declared.workcell())(dimensions)
     assert declared.collision.above == 35.0
     assert declared.num_steps == {"BncConnector": 400, "GridClamp": 500}[task]
     assert declared.config.observation == "state"
@@ -59,7 +59,7 @@ JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.
 
 
 def test_samples_of_a_seed_at_standard_are_unchanged():
-    """Samples of a generator are the same on every machine."""
+    """The samples of a random generator do not depend on the machine."""
     fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(3)
     jack, plug = fixture_offset.draw(rng, InsertionReset())
     np.testing.assert_allclose(1e3 * jack, JACK, atol=1e-12)
@@ -112,7 +112,7 @@ def test_hard_demonstrations_search_the_offset_range(connector):
     assert connector.unwrapped.task.symmetry.observations.shape == (1, 17, 17)
 
 
-def test_a_turned_jack_is_turned():
+def test_jack_turns_within_its_range():
     env = make_env("BncConnector", jack_turn=5.0, fixture_offset="per_episode")
     _, info = env.reset(seed=1)
     plant = env.task.diagram.GetSubsystemByName("station").plant
@@ -123,13 +123,15 @@ def test_a_turned_jack_is_turned():
 
 
 def test_center_of_pressure_points_to_the_jack(connector):
-    """Standing on the rim, the lever and the command lead to the jack."""
+    """On the rim the observed center of pressure and the commanded position point to the jack."""
     observation, info = connector.reset(seed=4)
     while observation[9] < 0.15:
         observation, _, _, _, _ = connector.step(np.zeros(2))
-    lever, commanded = observation[13:15] * 3.0 * MM, observation[15:17] * 2.0 * MM
+    center_of_pressure, commanded = observation[13:15] * 3.0 * MM, observation[15:17] * 2.0 * MM
     np.testing.assert_allclose(commanded, connector.unwrapped.trace.commanded[-1, :2], atol=1e-6)
-    assert lever @ info["jack_offset"] > 0.3 * np.linalg.norm(lever) * np.linalg.norm(info["jack_offset"])
+    assert center_of_pressure @ info["jack_offset"] > 0.3 * np.linalg.norm(center_of_pressure) * np.linalg.norm(
+        info["jack_offset"]
+    )
 
 
 def test_scripted_policy_locks_at_hard_and_demonstrations_fail(connector):
@@ -144,7 +146,7 @@ def test_gentle_search_succeeds_at_hard_and_descent_fails(clamp):
     assert not evaluate_policy(clamp, straight_descent, episodes=1, **FRESH)["success"].any()
 
 
-def test_a_clamp_has_the_time_and_the_height_that_it_is_given():
+def test_clamp_has_the_given_time_limit_and_start_height():
     env = make_env("GridClamp", start_height=(0.04, 0.05), seconds=2.0)
     env.reset(seed=0)
     info, truncated = {}, False

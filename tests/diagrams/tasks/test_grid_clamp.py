@@ -157,9 +157,9 @@ def test_the_same_seed_is_the_same_episode_bit_for_bit(env):
     actions = np.random.default_rng(0).uniform(-1, 1, (12, 3)) - [0, 0, 0.3]
     runs = []
     for _ in range(2):
-        observation, drawn = env.reset(seed=12, options={"new_run": True})
+        observation, info = env.reset(seed=12, options={"new_run": True})
         steps = [observation] + [env.step(action)[0] for action in actions]
-        runs.append((np.array(steps), drawn["grasp_offset"], drawn["table_offset"]))
+        runs.append((np.array(steps), info["grasp_offset"], info["table_offset"]))
     for first, second in zip(*runs, strict=True):
         np.testing.assert_array_equal(first, second)
 

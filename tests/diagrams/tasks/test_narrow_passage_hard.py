@@ -41,22 +41,22 @@ def test_sides_alternate_are_drawn_and_are_seen(env):
     usual, sides = NarrowPassageOptions(**HARD).workcell().obstacles, []
     starts = []
     for seed in range(8):
-        observation, drawn = env.reset(seed=seed)
-        beside = (drawn["obstacles"] - usual) / HARD["obstacle_beside"]
+        observation, info = env.reset(seed=seed)
+        beside = (info["obstacles"] - usual) / HARD["obstacle_beside"]
         np.testing.assert_allclose(observation[1:], beside.ravel(), atol=1e-6)
         np.testing.assert_allclose(np.abs(beside), [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
         assert beside[0, 0] == pytest.approx(-beside[1, 0])
         sides.append(np.sign(beside[0, 0]))
-        starts.append(drawn["start"])
+        starts.append(info["start"])
     assert set(sides) == {-1.0, 1.0}
     assert 0.01 < np.std(starts, axis=0).min() < 0.1
 
 
 def test_the_obstacles_are_drawn_where_they_are(env):
-    _, drawn = env.reset(seed=2)
+    _, info = env.reset(seed=2)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
-    for number, obstacle in enumerate(drawn["obstacles"]):
+    for number, obstacle in enumerate(info["obstacles"]):
         X_WO = plant.GetBodyByName(f"obstacle_{number}").EvalPoseInWorld(context)
         np.testing.assert_allclose(X_WO.translation()[:2], obstacle, atol=1e-12)
 
@@ -65,8 +65,8 @@ def test_standard_geometry_is_unchanged():
     assert NarrowPassageOptions().workcell() == PassageGeometry()
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
-    _, drawn = standard.reset(seed=3)
-    np.testing.assert_array_equal(drawn["start"], standard.task.declaration.reference().means[0])
+    _, info = standard.reset(seed=3)
+    np.testing.assert_array_equal(info["start"], standard.task.declaration.reference().means[0])
 
 
 @pytest.mark.parametrize(

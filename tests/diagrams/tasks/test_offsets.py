@@ -13,8 +13,8 @@ def test_held_out_starts_differ_from_training_and_repeat():
         for held_out in (False, True)
     }
     assert not np.isin(drawn[True], drawn[False]).any()
-    again = episode_stream(np.random.default_rng(7), True).uniform(size=3)
-    np.testing.assert_array_equal(again, drawn[True][7])
+    second = episode_stream(np.random.default_rng(7), True).uniform(size=3)
+    np.testing.assert_array_equal(second, drawn[True][7])
 
 
 def test_the_next_episode_is_the_same_whichever_this_one_was():

@@ -59,8 +59,8 @@ def test_scripted_policy_pours_because_of_the_constraints(env, unconstrained, st
     assert env.trace.statistics()["collisions"] == 0.0
     # The same inputs, or the same scripted policy, which reacts: the result does not depend on it.
     replay = iter([*actions, *[actions[-1]] * 150])
-    again = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(replay)
-    info, _, _ = run(unconstrained, again, seed=1, options={"start": start})
+    second = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(replay)
+    info, _, _ = run(unconstrained, second, seed=1, options={"start": start})
     assert info["termination"] in ("collision", "spill")
 
 

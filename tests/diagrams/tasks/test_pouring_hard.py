@@ -78,8 +78,8 @@ def test_recomputed_commands_are_inside_the_constraints(env):
     corners.on_episode_start()
     task = stepwise.task.declaration
     template = make_aimed_template(task.workcell(), 1.0, 1.0, 0.3)
-    _, drawn = stepwise.reset(seed=3)
-    frames = frames_of(template, RigidTransform([*(drawn["mug_position"] + drawn["mug_error"]), 0.0]))
+    _, info = stepwise.reset(seed=3)
+    frames = frames_of(template, RigidTransform([*(info["mug_position"] + info["mug_error"]), 0.0]))
     for _ in range(60):
         stepwise.step(corners(None))
         state = int(diagram.GetOutputPort("state").Eval(context)[0])
@@ -90,9 +90,9 @@ def test_recomputed_commands_are_inside_the_constraints(env):
 def test_mug_error_is_resampled_in_its_ring_and_observed(env):
     errors = []
     for held_out in (False, True) * 4:
-        observation, drawn = env.reset(options={"held_out": held_out})
-        errors.append(drawn["mug_error"])
-        np.testing.assert_allclose(observation[6:8] * MAX_MUG_ERROR, drawn["mug_error"], atol=1e-8)
+        observation, info = env.reset(options={"held_out": held_out})
+        errors.append(info["mug_error"])
+        np.testing.assert_allclose(observation[6:8] * MAX_MUG_ERROR, info["mug_error"], atol=1e-8)
         assert observation[8] == -1.0  # not pouring yet
     lengths = np.linalg.norm(errors, axis=1)
     np.testing.assert_array_equal(np.clip(lengths, HARD["mug_error_least"], HARD["mug_error_most"]), lengths)
@@ -103,9 +103,9 @@ def test_observation_and_samples_at_standard_are_unchanged():
     standard = make_env("Pouring")
     assert standard.observation_space.shape == (6,)
     assert standard.task.num_steps == 1500
-    _, drawn = standard.reset(seed=3)
-    assert "mug_error" not in drawn
-    np.testing.assert_array_equal(drawn["start"], START_OF_SEED_3)
+    _, info = standard.reset(seed=3)
+    assert "mug_error" not in info
+    np.testing.assert_array_equal(info["start"], START_OF_SEED_3)
 
 
 @pytest.mark.parametrize(

@@ -70,19 +70,19 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=1000, help="maximum number of inputs of each test")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--add", type=Path, metavar="FILE", help="JSON file of counts, to which new ones are added")
-    given = parser.parse_args()
-    if unknown := set(given.kinds) - set(files):
+    args = parser.parse_args()
+    if unknown := set(args.kinds) - set(files):
         parser.error(f"there is no {', '.join(sorted(unknown))}: choose among {', '.join(files)}")
     os.chdir(FOLDER.parents[2])
     counts: Counter[tuple[str, str]] = Counter()
-    if given.add and given.add.exists():
-        counts.update({(target, outcome): n for target, outcome, n in json.loads(given.add.read_text())})
-    for kind in given.kinds or files:
+    if args.add and args.add.exists():
+        counts.update({(target, outcome): n for target, outcome, n in json.loads(args.add.read_text())})
+    for kind in args.kinds or files:
         with tempfile.NamedTemporaryFile() as file:
             child = os.fork()
             if child == 0:
                 try:
-                    count(files[kind], given.inputs, given.seed, Path(file.name))
+                    count(files[kind], args.inputs, args.seed, Path(file.name))
                 finally:
                     sys.stdout.flush()
                     os._exit(0)
@@ -92,8 +92,8 @@ def main() -> int:
             counts.update({(target, outcome): n for target, outcome, n in json.loads(written)})
         else:
             counts[kind, "hangs"] += 1  # the process hung or crashed
-    if given.add:
-        given.add.write_text(json.dumps([[*key, n] for key, n in counts.items()], indent=1))
+    if args.add:
+        args.add.write_text(json.dumps([[*key, n] for key, n in counts.items()], indent=1))
     targets = list(dict.fromkeys(target for target, _ in counts))
     width = max(map(len, targets))
     print("\n" + "  ".join([" " * width, *(f"{outcome:>13}" for outcome in OUTCOMES)]))

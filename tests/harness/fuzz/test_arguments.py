@@ -72,24 +72,24 @@ SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "al
 @example("tqc_contact", [("batch_size", "1e20")])
 @example("tqc_contact", [("layer_norm", "7")])
 def test_configure_accepts_or_refuses_any_learner_setting(preset, pairs):
-    given = dict(pairs)
-    config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=given))
+    arguments = dict(pairs)
+    config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=arguments))
     if config is None:
         return
-    for name, text in given.items():
-        found = getattr(config.learner, name)
-        if isinstance(found, bool):
+    for name, text in arguments.items():
+        result = getattr(config.learner, name)
+        if isinstance(result, bool):
             assert str(text).lower() in (
-                ("1", "true", "yes", "on", "t", "y") if found else ("0", "false", "no", "off", "f", "n")
+                ("1", "true", "yes", "on", "t", "y") if result else ("0", "false", "no", "off", "f", "n")
             )
-        elif isinstance(found, str):
-            assert found == text
-        elif isinstance(found, tuple):
-            assert found == tuple(int(float(one)) for one in text.split(","))
+        elif isinstance(result, str):
+            assert result == text
+        elif isinstance(result, tuple):
+            assert result == tuple(int(float(one)) for one in text.split(","))
         else:
-            assert found == float(text)
+            assert result == float(text)
     for name, other in PRESETS[preset].__dict__.items():
-        assert name in given or name == "algorithm" or getattr(config.learner, name) == other
+        assert name in arguments or name == "algorithm" or getattr(config.learner, name) == other
 
 
 def options_of(task):
@@ -107,8 +107,8 @@ def environments(draw):
     task, typed = draw(st.sampled_from(TASK_NAMES)), {}
     for _ in range(draw(st.integers(1, 3))):
         name = draw(st.sampled_from([*OPTIONS[task]] * 3 + ["guidance", "fixture_offset", "x", "", "render_mode"]))
-        sound = st.just(OPTIONS[task].get(name) or "kmp") | st.floats(0, 1).map(repr) | st.integers(1, 50).map(str)
-        typed[name] = draw(sound | sound | TYPED)
+        valid = st.just(OPTIONS[task].get(name) or "kmp") | st.floats(0, 1).map(repr) | st.integers(1, 50).map(str)
+        typed[name] = draw(valid | valid | TYPED)
     return task, typed
 
 
@@ -117,11 +117,11 @@ def environments(draw):
 @example(("NarrowPassage", {"action_repeat": "2001-99-99"}))
 def test_check_environment_accepts_or_refuses_any_option(chosen):
     task, typed = chosen
-    found = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in typed.items()}))
-    if found is None:
+    result = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in typed.items()}))
+    if result is None:
         return
     for name, text in typed.items():
-        value, read = found[name], yaml.safe_load(text) if text.strip() else None
+        value, read = result[name], yaml.safe_load(text) if text.strip() else None
         if isinstance(value, bool):
             assert text.strip().lower() in (
                 ("1", "true", "yes", "on", "1.0") if value else ("0", "false", "no", "off", "0.0", "-0")

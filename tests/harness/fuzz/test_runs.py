@@ -69,19 +69,19 @@ def try_config(target, folder, text):
         assert getattr(config, name) == expected[name]
         assert type(getattr(config, name)) is type(expected[name])
     for name, value in expected["environment"].items():
-        found = config.environment[name]
-        assert (list(found) if isinstance(found, tuple) else found) == value or value != value
+        result = config.environment[name]
+        assert (list(result) if isinstance(result, tuple) else result) == value or value != value
     for name, value in expected["learner"].items():
-        found = getattr(config.learner, name)
-        if isinstance(found, bool) or isinstance(value, bool):
-            assert found in (0, 1)
-            assert isinstance(found, bool)
-        elif isinstance(found, str):
-            assert found == str(value)
-        elif isinstance(found, tuple):
-            assert list(found) == [int(n) for n in (value.split(",") if isinstance(value, str) else value)]
+        result = getattr(config.learner, name)
+        if isinstance(result, bool) or isinstance(value, bool):
+            assert result in (0, 1)
+            assert isinstance(result, bool)
+        elif isinstance(result, str):
+            assert result == str(value)
+        elif isinstance(result, tuple):
+            assert list(result) == [int(n) for n in (value.split(",") if isinstance(value, str) else value)]
         else:
-            assert found == float(value)
+            assert result == float(value)
 
 
 @given(st.data())
@@ -117,8 +117,8 @@ def try_table(target, folder, content):
     header, *rows = csv.reader(io.StringIO(content.decode(), newline=""))
     assert list(table.columns) == header
     assert len(table) == len([row for row in rows if row])
-    for row, (_, found) in zip([row for row in rows if row], table.iterrows(), strict=True):
-        for text, value in zip(row, found, strict=True):
+    for row, (_, result) in zip([row for row in rows if row], table.iterrows(), strict=True):
+        for text, value in zip(row, result, strict=True):
             if isinstance(value, str):
                 assert value == text
             elif text == "":
@@ -257,9 +257,9 @@ def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable
     if resumed is not None:
         rows, _ = resumed
         assert rows == tree["rows"]
-        found, known = learner.state()
+        result, known = learner.state()
         assert json.loads(json.dumps(known)) == tree["learner"]
-        assert found.keys() == changed.keys()
+        assert result.keys() == changed.keys()
         for name, array in changed.items():
-            np.testing.assert_array_equal(found[name], array, strict=True)
+            np.testing.assert_array_equal(result[name], array, strict=True)
         assert env.np_random.bit_generator.state == tree["environment"]

@@ -61,32 +61,32 @@ TREES = [yaml.safe_load(text) for text in TEXTS]
 
 def check_numbers(template, text):
     """Check that every number equals that of an independent reader at the same place in the file."""
-    found = template_numbers(text)
+    result = template_numbers(text)
     data = parse_yaml(text)
     for name, value in template.parameters.items():
-        assert value == found["parameters", name]
-    assert template.inputs == found["inputs",]
-    assert template.max_speed_m_per_s == found["max_speed_m_per_s",]
-    assert template.max_speed_rad_per_s == found["max_speed_rad_per_s",]
+        assert value == result["parameters", name]
+    assert template.inputs == result["inputs",]
+    assert template.max_speed_m_per_s == result["max_speed_m_per_s",]
+    assert template.max_speed_rad_per_s == result["max_speed_rad_per_s",]
     assert [state.name for state in template.states] == list(data["states"])
     for state, entry in zip(template.states, data["states"].values(), strict=True):
         place = ("states", state.name)
         unit = state.transition_distance.unit
         si = math.pi / 180 if unit == "deg" else 1.0
-        assert state.starts_at == si * found[*place, f"starts_at_{unit}"]
+        assert state.starts_at == si * result[*place, f"starts_at_{unit}"]
         if f"ends_at_{unit}" in entry:
-            assert state.ends_at == si * found[*place, f"ends_at_{unit}"]
-        assert state.weight == found.get((*place, f"weight_per_{unit}"), 1.0 * si) / si
+            assert state.ends_at == si * result[*place, f"ends_at_{unit}"]
+        assert state.weight == result.get((*place, f"weight_per_{unit}"), 1.0 * si) / si
         for number, transition in enumerate(state.transitions):
             transition_place = (*place, "transitions", str(number))
-            assert transition.below == si * found[*transition_place, f"below_{unit}"]
-            assert transition.hysteresis == _scaled(si, found.get((*transition_place, f"hysteresis_{unit}")))
+            assert transition.below == si * result[*transition_place, f"below_{unit}"]
+            assert transition.hysteresis == _scaled(si, result.get((*transition_place, f"hysteresis_{unit}")))
         for field in ("input_mapping", "active_constraints"):
             parts = getattr(state, field)
             assert len(parts) == len(entry[field])
             for number, part in enumerate(parts):
-                check_fields(part, entry[field][number], (*place, field, str(number)), found)
-        check_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), found)
+                check_fields(part, entry[field][number], (*place, field, str(number)), result)
+        check_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), result)
 
 
 def _scaled(si, value):

@@ -181,12 +181,12 @@ def table(results: dict[str, list[Result]]) -> int:
     print(f"{'kind':<32}{'bound':>6}{'median':>7}{'worst':>6} [ms]  {'missed':>6}{'speed':>7}{'growth':>7}{'wrong':>6}")
     for name, rows in results.items():
         times = 1000.0 * np.array([row.detected for row in rows])
-        found = times[np.isfinite(times)]
-        middle, worst = (np.median(found), found.max()) if len(found) else (np.nan, np.nan)
+        result = times[np.isfinite(times)]
+        middle, worst = (np.median(result), result.max()) if len(result) else (np.nan, np.nan)
         causes = ", ".join(sorted({row.cause for row in rows if row.cause}))
         late, growth = max(row.late_speed for row in rows), max(row.growth for row in rows)
         wrong = sum(bool(row.wrong) for row in rows)
-        missed = len(times) - len(found)
+        missed = len(times) - len(result)
         print(
             f"{name:<32}{1000.0 * bounds.get(name, np.nan):>6.0f}{middle:>7.0f}{worst:>6.0f}       {missed:>6}"
             f"{late:>7.2f}{growth:>7.2f}{wrong:>6}  {causes}"

@@ -25,19 +25,19 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="round to begin with")
     arguments = parser.parse_args()
     bus = Bus()
-    found: dict[str, list[tuple[Injection, Observation]]] = defaultdict(list)
+    result: dict[str, list[tuple[Injection, Observation]]] = defaultdict(list)
     started, total, number = time.monotonic(), 0, arguments.first
     while total < arguments.injections:
         num_wrong = 0
         for injection in all_kinds(np.random.default_rng([arguments.seed, number])):
             observation = injection.inject(bus)
-            found[injection.kind].append((injection, observation))
+            result[injection.kind].append((injection, observation))
             total, num_wrong = total + 1, num_wrong + bool(observation.wrong)
             for wrong in observation.wrong:
                 print(f"WRONG  {injection.kind}, {injection.description}: {wrong}", flush=True)
         print(f"round {number}: {num_wrong} wrong; {total} injections until now", flush=True)
         number += 1
-    wrong = table(found)
+    wrong = table(result)
     print(f"in {time.monotonic() - started:.0f} s")
     return 1 if wrong else 0
 

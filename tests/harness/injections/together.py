@@ -7,12 +7,12 @@ from guiderail.diagrams.hardware.monitor import SafetyMonitor
 
 
 class Together:
-    """Clock that steps a simulated robot and a station in turn.
+    """Clock of a hardware station that steps the simulated robot before each step of the station.
 
     Attributes:
-        happens: Functions to call by the step.
+        happens: Injected faults: function to call at each step, by the step's number.
         is_silent: True while the robot is not stepped.
-        clock: Wall clock time [s] of the station; None to leave it without one.
+        clock: Time [s] passed to the station as its wall clock; None if it gets none.
     """
 
     clock: float | None = None
@@ -50,7 +50,7 @@ class Together:
 
 
 def advance(simulator, station, time, clock=None):
-    """Advance a hardware station to `time` [s] with the newest status, as a clock does."""
+    """Advance a hardware station to `time` [s] with the newest status."""
     simulator.AdvancePendingEvents()
     station.receive(simulator.get_mutable_context(), clock)
     simulator.AdvanceTo(time)

@@ -152,12 +152,12 @@ def alive(process: int) -> bool:
 
 def workers(out: Path) -> dict[str, int]:
     """Return the process of each unfinished job of a study."""
-    found = {}
+    result = {}
     for log in (out / "logs").glob("*.txt"):
         lines = log.read_text().splitlines()
         if lines and " begins on " in lines[-1]:
-            found[log.stem] = int(lines[-1].rpartition(" ")[2])
-    return found
+            result[log.stem] = int(lines[-1].rpartition(" ")[2])
+    return result
 
 
 def kill_study(folder: Path, kills: int, rng: random.Random) -> dict:
@@ -167,7 +167,7 @@ def kill_study(folder: Path, kills: int, rng: random.Random) -> dict:
     started = time.perf_counter()
     finished(guiderail("study", file, "--out", whole))
     seconds = time.perf_counter() - started
-    found: dict = {"parents": 0, "workers": 0, "left_over_processes": 0}
+    result: dict = {"parents": 0, "workers": 0, "left_over_processes": 0}
     for _ in range(kills):
         process = guiderail("study", file, "--out", torn)
         previous = set(workers(torn).values())  # workers of the previous process
@@ -182,15 +182,15 @@ def kill_study(folder: Path, kills: int, rng: random.Random) -> dict:
         end = time.monotonic() + 10.0
         while any(map(alive, own)) and time.monotonic() < end:
             time.sleep(0.05)
-        found["parents"] += 1
-        found["left_over_processes"] += sum(map(alive, own))
+        result["parents"] += 1
+        result["left_over_processes"] += sum(map(alive, own))
     process = guiderail("study", file, "--out", torn)
     previous = set(workers(torn).values())
     if until(lambda: any(alive(one) for one in set(workers(torn).values()) - previous), process):
         os.kill(next(one for one in set(workers(torn).values()) - previous if alive(one)), signal.SIGKILL)
-        found["workers"] += 1
+        result["workers"] += 1
     finished(process)
-    return found | {"differences": [line for line in differences(whole, torn) if ".part" not in line]}
+    return result | {"differences": [line for line in differences(whole, torn) if ".part" not in line]}
 
 
 def main() -> None:
@@ -202,26 +202,26 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=list(RUNS), default=list(RUNS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder in which the runs are kept")
-    given = parser.parse_args()
-    rng = random.Random(given.seed)
+    args = parser.parse_args()
+    rng = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as temporary:
-        folder = (given.out or Path(temporary)).absolute()
+        folder = (args.out or Path(temporary)).absolute()
         folder.mkdir(parents=True, exist_ok=True)
-        found: dict = {}
-        left = {task: len(range(i, given.kills, len(given.tasks))) for i, task in enumerate(given.tasks)}
+        result: dict = {}
+        left = {task: len(range(i, args.kills, len(args.tasks))) for i, task in enumerate(args.tasks)}
         for task, kills in left.items():
             undisturbed(task, RUNS[task], folder / task)
             for number in range(-(-kills // KILLS_OF_A_RUN)):
                 count, run = min(KILLS_OF_A_RUN, kills - number * KILLS_OF_A_RUN), folder / f"{task}-{number}"
-                found[run.name] = kill_run(task, RUNS[task], folder / task, run, count, rng)
-                print(f"{run.name}: {json.dumps(found[run.name])}", file=sys.stderr, flush=True)
-        found["study"] = kill_study(folder, max(2, given.kills // 10), rng)
-    runs = [one for name, one in found.items() if name != "study"]
+                result[run.name] = kill_run(task, RUNS[task], folder / task, run, count, rng)
+                print(f"{run.name}: {json.dumps(result[run.name])}", file=sys.stderr, flush=True)
+        result["study"] = kill_study(folder, max(2, args.kills // 10), rng)
+    runs = [one for name, one in result.items() if name != "study"]
     late, early = sum(one["late"] for one in runs), sum(one["early"] for one in runs)
-    wrong = [f"{name}: {line}" for name, one in found.items() for line in one["differences"]]
-    totals = {"kills": late + early, "in_the_second_half": late, "differences": wrong, "study": found["study"]}
+    wrong = [f"{name}: {line}" for name, one in result.items() for line in one["differences"]]
+    totals = {"kills": late + early, "in_the_second_half": late, "differences": wrong, "study": result["study"]}
     print(json.dumps(totals | {"left_over_parts": [part for one in runs for part in one["left_over_parts"]]}, indent=2))
-    sys.exit(bool(wrong or found["study"]["left_over_processes"]))
+    sys.exit(bool(wrong or result["study"]["left_over_processes"]))
 
 
 if __name__ == "__main__":

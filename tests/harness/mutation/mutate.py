@@ -103,8 +103,10 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str) -> N
         if isinstance(value, FunctionType) and isinstance(before, FunctionType) and value.__module__ == module:
             before.__code__ = value.__code__
             before.__defaults__ = _grafted(before.__defaults__, value.__defaults__)
-            kept, given = before.__kwdefaults__ or {}, value.__kwdefaults__ or {}
-            before.__kwdefaults__ = {k: v if isinstance(v, int | float) else kept.get(k, v) for k, v in given.items()}
+            kept, defaults = before.__kwdefaults__ or {}, value.__kwdefaults__ or {}
+            before.__kwdefaults__ = {
+                k: v if isinstance(v, int | float) else kept.get(k, v) for k, v in defaults.items()
+            }
         elif isinstance(value, type) and isinstance(before, type) and value.__module__ == module:
             if not issubclass(value, Enum):
                 _graft_all(vars(before), vars(value), module)
@@ -308,26 +310,26 @@ def _reasons(file: str) -> dict[str, str]:
 def try_file(file: str, every: int, kept: Path, again: bool) -> tuple[int, int, int]:
     """Return the numbers of unexplained survivors and stale explanations, of mutants, and of killed mutants."""
     everything, reasons = mutants(file), _reasons(file)
-    found = [mutant for mutant in everything if mutant.is_in_sample(every)]
+    result = [mutant for mutant in everything if mutant.is_in_sample(every)]
     child = os.fork()
     if child == 0:
         status = 1
         try:
-            try_mutants(file, found, kept, again)
+            try_mutants(file, result, kept, again)
             status = 0
         finally:
             os._exit(status)
     if os.waitpid(child, 0)[1]:
         raise SystemExit(f"{file}: the mutants could not be tried")
     results = json.loads(kept.read_text())[file] if kept.exists() else {}
-    survivors = {mutant.name for mutant in found if results[mutant.name] == "survived"}
-    killed = {mutant.name for mutant in found} - survivors
+    survivors = {mutant.name for mutant in result if results[mutant.name] == "survived"}
+    killed = {mutant.name for mutant in result} - survivors
     stale = (set(reasons) - {mutant.name for mutant in everything}) | (killed & set(reasons))
     for name in sorted(stale):
         print(f"{file}: explained, but not a survivor: {name}", flush=True)
     known = len(survivors & set(reasons))
-    print(f"{file}: {len(killed)} of {len(found)} killed, {known} explained, {len(survivors) - known} not", flush=True)
-    return len(survivors) - known + len(stale), len(found), len(killed)
+    print(f"{file}: {len(killed)} of {len(result)} killed, {known} explained, {len(survivors) - known} not", flush=True)
+    return len(survivors) - known + len(stale), len(result), len(killed)
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ class Mutant:
 def mutants(file: str) -> list[Mutant]:
     """Return the mutants of a file in the order of its lines."""
     tree = ast.parse((ROOT / file).read_text())
-    found, seen = [], Counter()
+    result, seen = [], Counter()
     for path in list(_places(tree)):
         for i, _ in enumerate(changes(_at(tree, path))):
             depth = _depth_of_statement(tree, path)
@@ -169,8 +169,8 @@ def mutants(file: str) -> list[Mutant]:
             seen[name] += 1
             if seen[name] > 1:
                 name += f" ({seen[name]})"
-            found.append(Mutant(file, name, before.lineno, before.end_lineno or before.lineno, path, i))
-    return found
+            result.append(Mutant(file, name, before.lineno, before.end_lineno or before.lineno, path, i))
+    return result
 
 
 def _places(node: ast.AST, path: Place = ()) -> Iterator[Place]:

@@ -70,16 +70,16 @@ def certified(made):
 @cache
 def constrained():
     """Return the constrained loop with a history, which takes longest, and its bounds."""
-    made = skill(*CASES["sKGRL, constrained"], tied=0.5)
-    return made, certified(made)
+    loop = skill(*CASES["sKGRL, constrained"], tied=0.5)
+    return loop, certified(loop)
 
 
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
     if request.param == "sKGRL, constrained":
         return constrained()
-    made = skill(*CASES[request.param], tied=0.5)
-    return made, certified(made)
+    loop = skill(*CASES[request.param], tied=0.5)
+    return loop, certified(loop)
 
 
 def executed(made, actions, start):
@@ -102,12 +102,12 @@ def adversaries(rng, number):
 
 
 def test_random_sequences_stay_in_the_bounds_and_reach_them(case):
-    made, found = case
-    rng, always = np.random.default_rng(0), found.always
+    loop, result = case
+    rng, always = np.random.default_rng(0), result.always
     reached = {"position": 0.0, "speed": 0.0, "acceleration": 0.0}
-    middle = executed(made, np.zeros(STEPS), made.start)[:, 0]
+    middle = executed(loop, np.zeros(STEPS), loop.start)[:, 0]
     for actions in adversaries(rng, 40):
-        y = executed(made, actions, made.start + rng.uniform(-1.0, 1.0, 2) * made.start_within)
+        y = executed(loop, actions, loop.start + rng.uniform(-1.0, 1.0, 2) * loop.start_within)
         speed, acceleration = (np.abs(np.diff(y, order, axis=0)) / PERIOD**order for order in (1, 2))
         assert (y >= always.lower - 1e-7).all()
         assert (y <= always.upper + 1e-7).all()
@@ -117,20 +117,20 @@ def test_random_sequences_stay_in_the_bounds_and_reach_them(case):
         reached["position"] = max(reached["position"], np.max(np.abs(y[:, 0] - middle) / room))
         reached["speed"] = max(reached["speed"], speed[:, 0].max() / always.speed[:, 0].max())
     assert reached["position"] > 0.9
-    if not found.can_be_active.any():
+    if not result.can_be_active.any():
         assert reached["speed"] > 0.6
 
 
 def test_free_bound_is_reached_by_its_worst_actions():
     """The signs of the impulse responses reach the support of the zonotope."""
-    made = skill(4)
-    found = certify(made)
+    loop = skill(4)
+    result = certify(loop)
     n = STEPS - 1
-    still = executed(made, np.zeros(STEPS), made.start + made.start_within)
-    impulses = [executed(made, np.eye(STEPS)[m], made.start + made.start_within)[n, 0] for m in range(STEPS)]
-    worst = executed(made, np.sign(np.array(impulses) - still[n, 0]), made.start + made.start_within)
-    below = executed(made, np.sign(np.array(impulses) - still[n, 0]), made.start - made.start_within)
-    assert max(worst[n, 0], below[n, 0]) == pytest.approx(found.free.upper[n, 0], rel=1e-6)
+    still = executed(loop, np.zeros(STEPS), loop.start + loop.start_within)
+    impulses = [executed(loop, np.eye(STEPS)[m], loop.start + loop.start_within)[n, 0] for m in range(STEPS)]
+    worst = executed(loop, np.sign(np.array(impulses) - still[n, 0]), loop.start + loop.start_within)
+    below = executed(loop, np.sign(np.array(impulses) - still[n, 0]), loop.start - loop.start_within)
+    assert max(worst[n, 0], below[n, 0]) == pytest.approx(result.free.upper[n, 0], rel=1e-6)
 
 
 def test_output_coupled_through_a_history_has_no_bound():
@@ -142,9 +142,9 @@ def test_output_coupled_through_a_history_has_no_bound():
 
 def test_adversary_stays_in_the_bounds_within_the_budget():
     """With a history and constraints, all bounds exist and are at most twice what an adversary reaches."""
-    made, found = constrained()
-    budget, bounds = found.budgeted.budget, found.budgeted.bounds
-    seen = Adversary(made, np.ones(STEPS, bool), seed=1).attack(80 * STEPS)
+    loop, result = constrained()
+    budget, bounds = result.budgeted.budget, result.budgeted.bounds
+    seen = Adversary(loop, np.ones(STEPS, bool), seed=1).attack(80 * STEPS)
     assert seen.corrected > 100
     assert (seen.excess <= budget.excess).all()
     assert (seen.residue <= budget.residue).all()
@@ -153,7 +153,7 @@ def test_adversary_stays_in_the_bounds_within_the_budget():
     for quantity, claimed in (("speed", bounds.speed), ("acceleration", bounds.acceleration)):
         assert (seen.largest[quantity] <= claimed * (1.0 + 1e-6)).all()
         assert (claimed.max(axis=0) <= 2.0 * seen.largest[quantity].max(axis=0)).all()
-    assert np.isinf(found.always.upper[:, 1]).any()
+    assert np.isinf(result.always.upper[:, 1]).any()
 
 
 def test_budget_is_not_used_without_constraints():
@@ -164,34 +164,34 @@ def test_budget_is_not_used_without_constraints():
 
 
 def test_attack_samples_starts_in_corners_and_between():
-    made = skill(4)
-    adversary = Adversary(made, np.zeros(STEPS, bool))
-    places = (np.array([adversary._sample_start() for _ in range(200)]) - made.start)[:, 0] / made.start_within[0]
+    loop = skill(4)
+    adversary = Adversary(loop, np.zeros(STEPS, bool))
+    places = (np.array([adversary._sample_start() for _ in range(200)]) - loop.start)[:, 0] / loop.start_within[0]
     assert np.abs(places).max() == pytest.approx(1.0)
     assert {-1.0, 1.0} <= set(np.round(places, 9))
     assert 50 < (np.abs(places) < 0.999).sum() < 150
 
 
 def test_attack_detects_a_start_that_was_not_certified():
-    made = skill(4)
-    kept = certify(replace(made, start_within=np.zeros(2))).free
-    seen = Adversary(made, np.zeros(STEPS, bool)).attack(20 * STEPS)
+    loop = skill(4)
+    kept = certify(replace(loop, start_within=np.zeros(2))).free
+    seen = Adversary(loop, np.zeros(STEPS, bool)).attack(20 * STEPS)
     assert (seen.upper[:2, 0] > kept.upper[:2, 0] + 1e-3).all()
-    assert (seen.upper <= certify(made).free.upper + 1e-9).all()
+    assert (seen.upper <= certify(loop).free.upper + 1e-9).all()
 
 
 @pytest.mark.parametrize("change", [0.0, 0.3, -2.0])
 def test_any_multiplier_proves_a_bound(change):
     """Bad multipliers only make a bound wider."""
-    made, found = constrained()
+    loop, result = constrained()
     worse = replace(
-        found.budgeted, multipliers=found.budgeted.multipliers + change * (found.budgeted.multipliers != 0.0)
+        result.budgeted, multipliers=result.budgeted.multipliers + change * (result.budgeted.multipliers != 0.0)
     )
-    middle, generators = reach(made)
-    first = int(np.argmax(found.can_be_active))
-    seen = Adversary(made, np.ones(STEPS, bool), seed=2).attack(40 * STEPS)
-    generators = np.concatenate([generators, residue_generators(made, first)], axis=2)
-    search = MultiplierSearch(made, middle, generators, first, worse.budget)
+    middle, generators = reach(loop)
+    first = int(np.argmax(result.can_be_active))
+    seen = Adversary(loop, np.ones(STEPS, bool), seed=2).attack(40 * STEPS)
+    generators = np.concatenate([generators, residue_generators(loop, first)], axis=2)
+    search = MultiplierSearch(loop, middle, generators, first, worse.budget)
     for n in range(first, STEPS):
         steps, outputs, multipliers = (a[0, 0, n] for a in (worse.steps, worse.outputs, worse.multipliers))
         highest = middle[4 + n] + search.bound(generators[4 + n], steps, outputs, multipliers)
@@ -396,17 +396,17 @@ TAMPERED = {
 
 
 def test_certificate_refuses_a_kernel_without_a_checker():
-    made = skill(0)
-    primitive = LcNsKmp(made.primitive.reference, kernel=Matern52(0.5), horizon=10)
-    made = replace(made, primitive=primitive)
+    loop = skill(0)
+    primitive = LcNsKmp(loop.primitive.reference, kernel=Matern52(0.5), horizon=10)
+    loop = replace(loop, primitive=primitive)
     with pytest.raises(InputError, match="squared_exponential"):
-        files(made, certify(made))
+        files(loop, certify(loop))
 
 
 @pytest.fixture(scope="module")
 def honest():
-    made = skill(0, 0.25, tied=0.5)
-    return files(made, certify(made))
+    loop = skill(0, 0.25, tied=0.5)
+    return files(loop, certify(loop))
 
 
 @pytest.fixture(scope="module")
@@ -430,9 +430,9 @@ SUBJECT = {
 
 @pytest.mark.parametrize("what", SUBJECT)
 def test_comparison_with_the_skill_detects_what_a_checker_takes_as_given(honest, tmp_path, what):
-    made, contents = skill(0, 0.25, tied=0.5), honest
-    assert compare_subject(contents, made, *IMPEDANCE, ABOUT) is None
-    assert compare_subject(SUBJECT[what](contents), made, *IMPEDANCE, ABOUT) == what
+    loop, contents = skill(0, 0.25, tied=0.5), honest
+    assert compare_subject(contents, loop, *IMPEDANCE, ABOUT) is None
+    assert compare_subject(SUBJECT[what](contents), loop, *IMPEDANCE, ABOUT) == what
 
 
 @pytest.mark.parametrize(
@@ -528,8 +528,8 @@ def test_checker_bounds_the_length_of_the_window(tmp_path, monkeypatch):
 
 
 def test_signature_needs_the_key(tmp_path):
-    made = skill(0)
-    contents = files(made, certify(made), KEY)
+    loop = skill(0)
+    contents = files(loop, certify(loop), KEY)
     checker.check(write(tmp_path, contents))
     checker.check(tmp_path, KEY)
     with pytest.raises(checker.Rejected, match="not of this key"):
@@ -548,8 +548,8 @@ def test_signature_needs_the_key(tmp_path):
 
 
 def test_certificate_states_a_period_unlike_the_clock(tmp_path):
-    made = replace(skill(4, 0.25), period=1.5 * PERIOD)
-    contents = files(made, certify(made))
+    loop = replace(skill(4, 0.25), period=1.5 * PERIOD)
+    contents = files(loop, certify(loop))
     assert OTHER_CLOCK in json.loads(contents[CERTIFICATE])["assumes"]
     checker.check(write(tmp_path, contents))
     with pytest.raises(checker.Rejected, match="does not state"):
@@ -628,10 +628,10 @@ def small(history, lower=(-0.21, -np.inf), upper=(0.21, np.inf)):
     reference = ReferenceTrajectory(PERIOD * np.arange(14), means, covariances)
     primitive = LcNsKmp(reference, horizon=4, history=history, constraints=constraints)
     gains = authority_gains(primitive, outputs=np.array([0]))
-    made = CertifiedLoop(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
-    found = certify(made, Budget(np.array([[0.2], [0.5]]), np.array([[0.0, 0.01], [0.0, 0.05]])))
-    assert found.can_be_active.any()
-    return made, found, files(made, found)
+    loop = CertifiedLoop(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
+    result = certify(loop, Budget(np.array([[0.2], [0.5]]), np.array([[0.0, 0.01], [0.0, 0.05]])))
+    assert result.can_be_active.any()
+    return loop, result, files(loop, result)
 
 
 def leaves(value, path=()):
@@ -733,9 +733,9 @@ def holds(found, contents, other):
 
 @pytest.mark.parametrize("history", [0, 3])
 def test_no_alteration_of_a_field_is_accepted_unless_its_claims_hold(history, tmp_path):
-    made, found, contents = small(history)
+    loop, result, contents = small(history)
     checker.check(write(tmp_path, contents))
-    assert compare_subject(contents, made, *IMPEDANCE, ABOUT) is None
+    assert compare_subject(contents, loop, *IMPEDANCE, ABOUT) is None
     tried = accepted = 0
     for name, other in itertools.islice((*altered_claims(contents), *altered_arrays(contents)), 0, None, 5):
         tried += 1
@@ -745,9 +745,9 @@ def test_no_alteration_of_a_field_is_accepted_unless_its_claims_hold(history, tm
                 checker.check(write(tmp_path, other))
         except (checker.Rejected, ValueError):  # a refusal, or one of NumPy's reader
             continue
-        if compare_subject(other, made, *IMPEDANCE, ABOUT) is not None:
+        if compare_subject(other, loop, *IMPEDANCE, ABOUT) is not None:
             continue
         accepted += 1
-        assert holds(found, contents, other), name
+        assert holds(result, contents, other), name
     assert tried >= 100
     assert accepted <= 0.1 * tried

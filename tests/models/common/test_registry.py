@@ -39,12 +39,12 @@ def _from(file):
 def test_register_accepts_reimport_and_refuses_another_file(tmp_path):
     shapes = Registry("shape")
     shapes.register("sphere", _Kind(_from(tmp_path / "one.py")))
-    again = _Kind(_from(tmp_path / "one.py"))
-    shapes.register("sphere", again)
-    assert shapes.get("sphere") is again
+    second = _Kind(_from(tmp_path / "one.py"))
+    shapes.register("sphere", second)
+    assert shapes.get("sphere") is second
     with pytest.raises(InputError, match=r"there is a shape 'sphere' already, from \S*one\.py: choose another name"):
         shapes.register("sphere", _Kind(_from(tmp_path / "two.py")))
-    assert shapes.get("sphere") is again
+    assert shapes.get("sphere") is second
 
 
 def test_declared_reads_literals_without_importing(tmp_path, monkeypatch):

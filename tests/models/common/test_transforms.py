@@ -23,7 +23,7 @@ same = np.testing.assert_array_equal
 
 
 def pairs():
-    """Yield the angles of two rotations, far from each other and near."""
+    """Yield roll, pitch and yaw of two rotations: far apart, close together, equal, half a turn apart, singular."""
     rng = np.random.default_rng(0)
     for k in range(200):
         a = rng.uniform(-3.0, 3.0, 3)

@@ -14,7 +14,7 @@ def keep_out():
 
 
 def clearance(point):
-    """Return the distance of a point from the closer wall, along its largest axis; negative inside."""
+    """Return the Chebyshev distance from a point to the nearest wall [m], negative inside it."""
     lower, upper = PassageGeometry().walls
     return np.maximum(lower - point, point - upper).max(axis=1).min()
 
@@ -72,8 +72,8 @@ def test_robot_in_a_wall_leaves_on_its_side(keep_out, start):
     safe, blocked = keep_out.project(start, through)
     assert blocked
     np.testing.assert_allclose(safe, start, atol=2e-6)
-    back = np.array([0.2, 0.3 if start[1] < 0.55 else 0.8])
-    np.testing.assert_array_equal(keep_out.project(start, back)[0], back)
+    retreat = np.array([0.2, 0.3 if start[1] < 0.55 else 0.8])
+    np.testing.assert_array_equal(keep_out.project(start, retreat)[0], retreat)
 
 
 def test_random_commands_keep_the_margin(keep_out):
@@ -82,7 +82,7 @@ def test_random_commands_keep_the_margin(keep_out):
     for _ in range(3000):
         desired = position + rng.normal(scale=0.2, size=2) if rng.random() < 0.7 else rng.uniform(-1, 2, 2)
         safe, _ = keep_out.project(position, desired)
-        # Every point of the way, not only its end.
+        # The margin must hold on the whole path to the command, not only at its end.
         for point in np.linspace(position, safe, 20):
             assert clearance(point) >= MARGIN - 1e-9
             assert point[0] <= 0.58 + 1e-9

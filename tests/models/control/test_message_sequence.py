@@ -70,8 +70,8 @@ def test_positions_are_compared_again_after_a_gap(between):
     before, peak = status(1.0, 0.0), status(1.0 + PERIOD, 0.5)
     assert conflicts(before, peak, status(1.0 + 2 * PERIOD, 0.0)) == 1
     assert conflicts(before, peak, between, status(1.0 + 2 * PERIOD, 0.0)) == 0
-    again = (status(1.0 + n * PERIOD, 0.5 * (n % 2)) for n in range(2, 5))
-    assert conflicts(before, peak, between, *again) == 1
+    second = (status(1.0 + n * PERIOD, 0.5 * (n % 2)) for n in range(2, 5))
+    assert conflicts(before, peak, between, *second) == 1
 
 
 @pytest.mark.parametrize(("interval", "is_conflict"), [(0.5, False), (0.499, True), (0.01, True), (0.0, False)])
@@ -167,12 +167,12 @@ def test_rate_conflicts_above_its_limit():
     """Two programs with the same clock: 2 commands per period, of which 1.2 are expected."""
     times = PERIOD * (0.5 * np.arange(60))
     sequence = CommandSequence(PERIOD)
-    found = None
+    result = None
     for n, time in enumerate(times):
         sequence.add(TORQUE + n, time, time)
-        found = n if found is None and sequence.num_conflicts else found
+        result = n if result is None and sequence.num_conflicts else result
     # The level rises by 1 − 0.6 with each command after the first, up to 8.
-    assert found == int((module.MAX_LEVEL - 1.0) / 0.4) + 1
+    assert result == int((module.MAX_LEVEL - 1.0) / 0.4) + 1
     assert count(PERIOD / 1.19 * np.arange(1000)) == 0
     assert count(PERIOD / 1.25 * np.arange(1000)) > 0
     assert (module.LEAK, module.MAX_LEVEL) == (1.2, 8)

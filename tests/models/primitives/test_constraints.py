@@ -87,9 +87,9 @@ def test_rows_are_normalized(seed, exponent):
     scaled = LinearConstraints(factor[..., None] * G, factor * c)
     np.testing.assert_allclose(scaled.G, G / size[..., None], rtol=0, atol=1e-15)
     np.testing.assert_allclose(scaled.c, c / size, rtol=1e-14)
-    again = LinearConstraints(scaled.G, scaled.c)
-    np.testing.assert_array_equal(again.G, scaled.G)
-    np.testing.assert_array_equal(again.c, scaled.c)
+    second = LinearConstraints(scaled.G, scaled.c)
+    np.testing.assert_array_equal(second.G, scaled.G)
+    np.testing.assert_array_equal(second.c, scaled.c)
 
 
 def test_normalizing_keeps_rows_of_unit_norm_and_of_zeros():
@@ -150,13 +150,13 @@ def test_nearest_is_allowed_if_the_solver_fails(seed):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("guiderail.models.primitives.constraints.solve_least_norm", unsolvable)
         for far in (1e-6, 1.0, 1e9):
-            wanted = inside + far * rng.standard_normal(len(inside))
+            desired = inside + far * rng.standard_normal(len(inside))
             for step in (0, 2, 7):
-                found = constraints.nearest(wanted, step)
+                result = constraints.nearest(desired, step)
                 n = min(step, 2)
                 size = np.linalg.norm(G[n], axis=1)
-                assert ((c[n] - G[n] @ found) / np.where(size > 0, size, 1)).max() <= 1e-9
-                assert len(found) == 1 or found[-1] == wanted[-1]
+                assert ((c[n] - G[n] @ result) / np.where(size > 0, size, 1)).max() <= 1e-9
+                assert len(result) == 1 or result[-1] == desired[-1]
         on_line = LinearConstraints.box([0.0, -1.0], [2.0, 1.0]).nearest(np.array([3.0, 2.0]))
         np.testing.assert_allclose(on_line, [2.0, 1.0])
         on_line = LinearConstraints.box([0.0, -1.0], [2.0, 1.0]).nearest(np.array([5.0, 1.0]))
@@ -178,17 +178,17 @@ def test_scaled_constraints_hold_against_an_adversary():
 def test_nearest_is_allowed_and_no_allowed_point_is_nearer(seed):
     rng, G, c, inside = polytope(seed)
     constraints = LinearConstraints(G, c)
-    wanted = inside + 3 * rng.standard_normal(len(inside))
-    found = constraints.nearest(wanted)
+    desired = inside + 3 * rng.standard_normal(len(inside))
+    result = constraints.nearest(desired)
     size = np.linalg.norm(G, axis=1)
-    assert ((c - G @ found) / size).max() <= 1e-9
+    assert ((c - G @ result) / size).max() <= 1e-9
     # A projection's angle to every allowed point is obtuse.
     for allowed in inside + rng.uniform(0, 1, (50, 1)) * rng.standard_normal((50, len(inside))):
         if (G @ allowed >= c).all():
-            assert (wanted - found) @ (allowed - found) <= 1e-7
-    if (G @ wanted >= c).all():
-        np.testing.assert_array_equal(found, wanted)
-        assert found is not wanted
+            assert (desired - result) @ (allowed - result) <= 1e-7
+    if (G @ desired >= c).all():
+        np.testing.assert_array_equal(result, desired)
+        assert result is not desired
 
 
 @given(SEEDS)

@@ -50,7 +50,7 @@ def test_constructor_drops_repeated_samples():
 
 
 @pytest.mark.parametrize(
-    ("times", "outputs", "names"),
+    ("times", "outputs", "message"),
     [
         ([], [], "at least one"),
         ([[0.0]], [[[1.0]]], "1 point"),
@@ -73,8 +73,8 @@ def test_constructor_drops_repeated_samples():
         ([[0.0, 1.0]] * 2, [[[1.0], [2.0]]], "2 time vectors"),
     ],
 )
-def test_constructor_refuses_invalid_demonstrations(times, outputs, names):
-    with pytest.raises(InputError, match=names):
+def test_constructor_refuses_invalid_demonstrations(times, outputs, message):
+    with pytest.raises(InputError, match=message):
         Demonstrations(times, outputs)
 
 
@@ -97,10 +97,10 @@ def test_load_refuses_damaged_and_dangerous_files(tmp_path):
     np.savez(pickled, times=np.array([0.0, 1.0]), outputs=np.array([[[object()]] * 2], dtype=object))
     with pytest.raises(InputError, match="damaged"):
         Demonstrations.load(pickled)
-    lying = tmp_path / "lying.npz"
-    np.savez(lying, lengths=[5], times=np.arange(4.0), outputs=np.ones((4, 1)))
+    inconsistent = tmp_path / "inconsistent.npz"
+    np.savez(inconsistent, lengths=[5], times=np.arange(4.0), outputs=np.ones((4, 1)))
     with pytest.raises(InputError, match="add up"):
-        Demonstrations.load(lying)
+        Demonstrations.load(inconsistent)
     ragged = tmp_path / "ragged.csv"
     ragged.write_text("demonstration,time,x\n0,0,1\n0,1\n")
     with pytest.raises(InputError, match="line 3"):

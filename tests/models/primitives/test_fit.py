@@ -146,9 +146,9 @@ def test_information_criteria_stop_when_not_improving():
     t = np.linspace(0, 1, 100)
     rng = np.random.default_rng(0)
     outputs = np.stack([t[:, None] + 0.05 * rng.standard_normal((100, 1)) for _ in range(4)])
-    found = information_criteria(t, outputs, [1, 2, 3, 4, 8, 16], 0)
-    assert min(found, key=lambda count: found[count]) <= 2
-    assert not {8, 16} & set(found)
+    result = information_criteria(t, outputs, [1, 2, 3, 4, 8, 16], 0)
+    assert min(result, key=lambda count: result[count]) <= 2
+    assert not {8, 16} & set(result)
 
 
 def test_fit_refuses_too_few_demonstrations():

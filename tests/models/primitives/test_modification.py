@@ -63,9 +63,9 @@ def test_modified_window_matches_equation_4_18(seed):
     p, rng = problem.primitive, np.random.default_rng(seed)
     at = spread(rng, problem.step, p.horizon)
     actions = np.outer(rng.standard_normal(len(at)), problem.action)
-    found = p.modified_window(problem.step, at, actions, problem.history)
-    np.testing.assert_array_equal(found.steps, problem.step + np.arange(p.horizon + 1))
-    check(problem, found, dense(problem, problem.step, p.horizon, at, actions), problem.constraints())
+    result = p.modified_window(problem.step, at, actions, problem.history)
+    np.testing.assert_array_equal(result.steps, problem.step + np.arange(p.horizon + 1))
+    check(problem, result, dense(problem, problem.step, p.horizon, at, actions), problem.constraints())
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -76,10 +76,10 @@ def test_modified_trajectory_is_one_problem_over_all_steps(seed):
     last = p.num_steps - 1
     at = spread(rng, 0, last)
     actions = np.outer(rng.standard_normal(len(at)), problem.action)
-    found = p.modified_trajectory(at, actions, problem.history)
-    np.testing.assert_array_equal(found.steps, np.arange(p.num_steps))
+    result = p.modified_trajectory(at, actions, problem.history)
+    np.testing.assert_array_equal(result.steps, np.arange(p.num_steps))
     constraints = p.constraints.window(np.arange(p.num_steps))
-    check(problem, found, dense(problem, 0, last, at, actions), constraints)
+    check(problem, result, dense(problem, 0, last, at, actions), constraints)
 
 
 @given(SEEDS)
@@ -121,19 +121,19 @@ def test_actions_at_every_point_are_not_interpolated():
     rng = np.random.default_rng(0)
     order = rng.permutation(40)
     actions = rng.standard_normal((40, 2))
-    found = p.modified_trajectory(order, actions[order]).trajectory - p.modified_trajectory([], []).trajectory
+    result = p.modified_trajectory(order, actions[order]).trajectory - p.modified_trajectory([], []).trajectory
     t = p.reference.times
     K, hbar, sigma = p.kernel(t, t), p.lambda_ + p.beta, 0.1**2
     expected = p.beta * sigma * np.linalg.solve(K + hbar * sigma * np.eye(40), actions)
-    np.testing.assert_allclose(found, expected, atol=1e-10)
+    np.testing.assert_allclose(result, expected, atol=1e-10)
 
 
 def test_motion_follows_actions_where_covariance_is_large():
     """The displacement approaches β/ħ of the action as the covariance grows."""
     p = plain(deviation=1e4, lambda_=0.06, beta=5.94)
     at, actions = [5, 18, 33], np.array([[1.0, 2.0], [-1.0, 0.5], [0.0, -2.0]])
-    found = p.modified_trajectory(at, actions).trajectory[at]
-    np.testing.assert_allclose(found, 0.99 * actions, atol=1e-3)
+    result = p.modified_trajectory(at, actions).trajectory[at]
+    np.testing.assert_allclose(result, 0.99 * actions, atol=1e-3)
     narrow = plain(deviation=1e-3)
     moved = narrow.modified_trajectory(at, actions).trajectory - narrow.modified_trajectory([], []).trajectory
     assert np.abs(moved).max() < 1e-3
@@ -150,8 +150,8 @@ def test_modified_trajectory_satisfies_all_constraints(seed):
     box = LinearConstraints.box(means - width, means + width)
     p = plain(constraints=box, solver="daqp")
     at = rng.permutation(np.arange(0, 40, 10))[: rng.integers(1, 5)]
-    found = p.modified_trajectory(at, 10 ** rng.uniform(0, 4) * rng.standard_normal((len(at), 2)))
-    assert (np.abs(found.trajectory - means) <= width + 1e-9).all()
+    result = p.modified_trajectory(at, 10 ** rng.uniform(0, 4) * rng.standard_normal((len(at), 2)))
+    assert (np.abs(result.trajectory - means) <= width + 1e-9).all()
 
 
 def test_trajectory_outside_the_constraints_is_refused():
@@ -170,9 +170,9 @@ def test_trajectory_outside_the_constraints_is_refused():
 def test_window_past_the_end_is_the_last_one():
     p = plain()
     for step in (39, 45):
-        found = p.modified_window(step, [39, 50], np.ones((2, 2)))
-        assert found.steps.tolist() == list(range(39, 55))
-        np.testing.assert_array_equal(found.trajectory, p.modified_window(39, [50, 39], np.ones((2, 2))).trajectory)
+        result = p.modified_window(step, [39, 50], np.ones((2, 2)))
+        assert result.steps.tolist() == list(range(39, 55))
+        np.testing.assert_array_equal(result.trajectory, p.modified_window(39, [50, 39], np.ones((2, 2))).trajectory)
 
 
 @pytest.mark.parametrize(

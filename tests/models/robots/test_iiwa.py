@@ -18,7 +18,7 @@ def arm():
 
 
 def test_iiwa_reflected_rotor_inertia_dominates(arm):
-    """The squared gear ratio of 160 makes the rotor inertia dominant, without which no explicit impedance is stable."""
+    """The rotor inertia, times the squared gear ratio, dominates; an explicit impedance is unstable without it."""
     context = arm.CreateDefaultContext()
     arm.SetPositions(context, IIWA14.home)
     reflected = [arm.get_joint_actuator(index).default_reflected_inertia() for index in arm.GetJointActuatorIndices()]

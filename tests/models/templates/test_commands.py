@@ -49,8 +49,8 @@ def test_command_reaches_the_speed_limit_without_constraints(seed, spread):
     last, request = pose(rng, 0.3), pose(rng, spread)
     request = RigidTransform(request.rotation() @ last.rotation(), last.translation() + request.translation())
     command = s.command(0, last, request, F, PERIOD)
-    wanted = load(s, last, request)
-    most = min(1.0, 1.0 / wanted)
+    target = load(s, last, request)
+    most = min(1.0, 1.0 / target)
     assert 0.979 * most <= command.fraction <= most * (1 + 1e-12)  # or one step shorter, where rounding exceeds a speed
     expected = between(last, request, command.fraction)
     np.testing.assert_allclose(command.X_WE.GetAsMatrix34(), expected.GetAsMatrix34(), atol=1e-7)

@@ -36,8 +36,8 @@ def projected(constraint, X_WE, frames, frame):
     assert angle_between(X_WP.rotation(), X_WE.rotation()) == 0.0
     p, q = position_in(frame, X_WE, frames), position_in(frame, X_WP, frames)
     assert constraint.violation(X_WE, frames) == pytest.approx(np.linalg.norm(q - p), abs=EXACT)
-    again = constraint.project(X_WP, frames)
-    assert np.abs(again.translation() - X_WP.translation()).max() < EXACT
+    second = constraint.project(X_WP, frames)
+    assert np.abs(second.translation() - X_WP.translation()).max() < EXACT
     assert constraint.violation(X_WP, frames) < EXACT
     if X_WP is X_WE:
         assert constraint.violation(X_WE, frames) == 0.0
@@ -178,9 +178,9 @@ def test_tilt_limits(seed, turns_along):
     towards = -p_FE[:2] / np.linalg.norm(p_FE[:2])
     axis = np.array([-towards[1], towards[0], 0.0])
     base = Rotation.from_rotvec(-tilt * axis) * Rotation.from_matrix(R_FP.matrix())
-    wanted = np.linalg.norm(R_FP.matrix() - R_FE.matrix())
+    expected = np.linalg.norm(R_FP.matrix() - R_FE.matrix())
     for other in np.radians(np.linspace(least, most, 60)):
-        assert np.linalg.norm((Rotation.from_rotvec(other * axis) * base).as_matrix() - R_FE.matrix()) > wanted - 1e-6
+        assert np.linalg.norm((Rotation.from_rotvec(other * axis) * base).as_matrix() - R_FE.matrix()) > expected - 1e-6
 
 
 @given(SEEDS)

@@ -48,8 +48,8 @@ def test_constraint_projects_into_its_set(constraint):
     for X_WE, frames in scenes():
         X_WP = constraint.project(X_WE, frames)
         assert constraint.violation(X_WP, frames) < 1e-12
-        again = constraint.project(X_WP, frames)
-        assert np.abs(again.GetAsMatrix34() - X_WP.GetAsMatrix34()).max() < 1e-12
+        second = constraint.project(X_WP, frames)
+        assert np.abs(second.GetAsMatrix34() - X_WP.GetAsMatrix34()).max() < 1e-12
         moved += constraint.violation(X_WE, frames) > 1e-3
     assert moved > 10  # or the test would show nothing
 

@@ -66,8 +66,8 @@ def test_angle_between_is_accurate_from_tiny_to_half_a_turn(seed, angle):
     R = Rotation.random(rng=rng)
     axis = rng.standard_normal(3)
     other = R * Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
-    found = g.angle_between(RotationMatrix(R.as_matrix()), RotationMatrix(other.as_matrix()))
-    assert found == pytest.approx(angle, rel=1e-6, abs=1e-15 if angle < 3 else 1e-6)
+    result = g.angle_between(RotationMatrix(R.as_matrix()), RotationMatrix(other.as_matrix()))
+    assert result == pytest.approx(angle, rel=1e-6, abs=1e-15 if angle < 3 else 1e-6)
 
 
 @given(SEEDS, st.floats(0, 1))

@@ -82,7 +82,7 @@ def test_campaign_is_resumed_from_its_table(tmp_path):
         run_campaign(BEAD, at_least(6), seed=4, out=table)
     with pytest.raises(InputError, match="another campaign"):
         run_campaign(BEAD, at_least(8), seed=3, out=table, environment={"wall": -0.5})
-    run_campaign(BEAD, at_least(7), seed=3, out=table, environment={"wall": 1.0})  # as it is anyway
+    run_campaign(BEAD, at_least(7), seed=3, out=table, environment={"wall": 1.0})  # 1.0 is the default
 
 
 def test_callback_receives_every_transition():
@@ -92,7 +92,7 @@ def test_callback_receives_every_transition():
 
 
 def _tilted_env(*steps, state=0):
-    """Return an environment after twenty control steps, in some of which the command is tilted."""
+    """Return an environment with a trace of twenty commands, which are tilted at `steps`."""
     trace = EpisodeTrace(20, 6, 0.01, {"state": 1})
     for step in range(20):
         pose = transform_to_pose(RigidTransform(RollPitchYaw(0.3 * (step in steps), 0.0, 0.5), [0.1, 0.0, 0.2]))
@@ -142,7 +142,7 @@ EPISODE = {
 
 
 @pytest.mark.parametrize(
-    ("wrong", "words"),
+    ("wrong", "failures"),
     [
         ({}, []),
         ({"termination": "simulation_failure"}, ["the simulation failed"]),
@@ -157,8 +157,8 @@ EPISODE = {
         ({"depth": 0.3}, ["depth beyond 0.2"]),
     ],
 )
-def test_find_failures_has_a_sentence_per_failed_check(wrong, words):
-    assert find_failures(outcome([EPISODE, EPISODE | wrong]), {"depth": 0.2}) == words
+def test_find_failures_has_a_sentence_per_failed_check(wrong, failures):
+    assert find_failures(outcome([EPISODE, EPISODE | wrong]), {"depth": 0.2}) == failures
 
 
 def test_connector_passes_with_uniform_actions():
@@ -167,7 +167,7 @@ def test_connector_passes_with_uniform_actions():
     one = Campaign(campaign.task, [case], campaign.limits, make_callback=campaign.make_callback)
     (row,) = run_campaign(one, at_least(1))
     assert find_failures(outcome([row]), campaign.limits) == []
-    # There was contact: the surfaces are compliant.
+    # Compliant surfaces penetrate each other only in contact.
     assert max(row["lug_impact_mm"], row["barrel_impact_mm"]) > 0.05
     assert row["peak_force"] > 5.0
 

@@ -22,7 +22,7 @@ def test_benchmark_measures_each_number_of_actors(bead_config, monkeypatch):
         return replace(bead_config, learner=learner, episodes=episodes)
 
     monkeypatch.setattr(actors, "configure", configured)
-    found = actors.measure("Bead", {})
-    assert found["simulation"] > 0
-    assert found["learning"] > 0
-    assert [row["measured"] is None for row in found["rows"]] == [False, False, False, True, True]
+    result = actors.measure("Bead", {})
+    assert result["simulation"] > 0
+    assert result["learning"] > 0
+    assert [row["measured"] is None for row in result["rows"]] == [False, False, False, True, True]

@@ -7,10 +7,10 @@ from research.benchmarks.saving import saving_share, timed
 def test_saving_share_counts_saving_only(monkeypatch, bead_config):
     monkeypatch.setattr(saving, "configure", lambda *_, **__: bead_config)
     monkeypatch.setattr(saving, "with_defaults", lambda task, given: given)
-    found = saving_share("Bead", bead_config.episodes)
-    assert 1 <= found["checkpoints"] <= bead_config.episodes
-    assert 0 < found["step_log_share"] < 1
-    assert 0 < found["step_log_ms_per_episode"] < 1e3 * found["seconds"]
+    result = saving_share("Bead", bead_config.episodes)
+    assert 1 <= result["checkpoints"] <= bead_config.episodes
+    assert 0 < result["step_log_share"] < 1
+    assert 0 < result["step_log_ms_per_episode"] < 1e3 * result["seconds"]
 
 
 def test_timed_restores_the_function():

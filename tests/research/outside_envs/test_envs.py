@@ -34,8 +34,8 @@ def test_scene_is_the_same_when_the_seed_is(name):
     env = load(name).make_env(0)
     first, _ = env.reset(seed=3)
     env.reset()
-    again, _ = env.reset(seed=3)
-    assert np.array_equal(first, again)
+    second, _ = env.reset(seed=3)
+    assert np.array_equal(first, second)
     assert not np.array_equal(first, env.reset(seed=4)[0])
 
 

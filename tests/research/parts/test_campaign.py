@@ -52,9 +52,9 @@ def test_tables_hold_measurements_and_reasons(tmp_path):
 
 
 def test_calibration_is_described_with_its_verdict():
-    found = {"offset_mm": [2.55, 3.0], "turn_degrees": 3.0, "force_limit": 15.0, "calibrated": True}
-    found |= {"uniform_random": "0 of 10", "scripted": "10 of 10"}
-    text = describe_calibration(found)
+    result = {"offset_mm": [2.55, 3.0], "turn_degrees": 3.0, "force_limit": 15.0, "calibrated": True}
+    result |= {"uniform_random": "0 of 10", "scripted": "10 of 10"}
+    text = describe_calibration(result)
     assert text == "2.55 to 3 mm, 3°, 15 N: random 0 of 10, scripted 10 of 10"
-    assert describe_calibration(found | {"calibrated": False}) == f"{text} (not as hard as required)"
+    assert describe_calibration(result | {"calibrated": False}) == f"{text} (not as hard as required)"
     assert describe_calibration(None) == "not calibrated"

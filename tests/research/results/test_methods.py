@@ -1,4 +1,4 @@
-"""The tables of all methods: on the pages of results and in the README."""
+"""Tables of all methods, on the pages of results and in the README."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ TABLES, PAGES_FOLDER = ROOT / "research" / "results", ROOT / "docs" / "results"
 
 
 def rows(text):
-    """Split the lines of Markdown tables into cells, without heads, rulers and titles."""
+    """Return the cells of the body rows of all Markdown tables in a text."""
     lines = [line for line in text.splitlines() if line.startswith("| ") and not line.startswith("| ---")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [row for row in cells if row[0] not in ("method", "task")]
@@ -40,7 +40,7 @@ def test_readme_table_has_at_most_ten_rows_with_hard_ones_first():
     assert hard == sorted(hard, reverse=True)
 
 
-def test_pages_are_those_of_the_stored_results(tmp_path):
+def test_pages_have_the_stored_results(tmp_path):
     for page in write_pages(TABLES, tmp_path):
         stored = PAGES_FOLDER / page.name
         assert page.read_text() == stored.read_text(), f"{stored} is stale: python -m research.results"

@@ -179,12 +179,12 @@ def test_per_episode_policies_succeed_in_mujoco():
 
 
 def test_finer_contact_transfers_to_mujoco():
-    found = {
+    result = {
         (method, where): (100 * rows_of("connector_hard_fine", method, where)["success_rate"]).round().tolist()
         for method in ("kgrl", "kgrl_randomized", "skgrl_adaptive", "residual", "scripted", "uniform_random")
         for where in ("fresh", "MuJoCo")
     }
-    assert found == {
+    assert result == {
         ("kgrl", "fresh"): [82, 100, 100, 100, 100],
         ("kgrl", "MuJoCo"): [74, 96, 97, 98, 97],
         ("kgrl_randomized", "fresh"): [98, 99, 97],
@@ -205,7 +205,7 @@ def test_finer_contact_transfers_to_mujoco():
 
 
 def test_finer_contact_transfers_to_other_frictions():
-    found = {
+    result = {
         (method, friction): (
             100 * rows_of("connector_hard_fine_transfer", method, f"MuJoCo, friction × {friction}")["success_rate"]
         )
@@ -214,7 +214,7 @@ def test_finer_contact_transfers_to_other_frictions():
         for method in ("kgrl", "skgrl_adaptive", "scripted", "uniform_random", "demonstration")
         for friction in (0.5, 1.5)
     }
-    assert found == {
+    assert result == {
         ("kgrl", 0.5): [79, 91, 95, 93, 93],
         ("kgrl", 1.5): [77, 98, 98, 98, 96],
         ("skgrl_adaptive", 0.5): [83, 97, 98, 91, 90],
@@ -259,14 +259,14 @@ def test_grid_clamp_sweep_breaking_points():
 
 
 def test_pouring_sweep_breaking_points():
-    found = {
+    result = {
         method: [sweep_success("pouring_sweep", method, "mug offset [mm]", at) for at in (0, 15, 25, 35, 45, 60)]
         for method in ("rl_sct", "scripted", "scripted_blind", "uniform_random", "zero", "best_constant")
     }
-    assert found["rl_sct"] == [100, 100, 93, 97, 97, 87]
-    assert found["scripted"] == [100] * 6
-    assert found["scripted_blind"] == [100, 100, 80, 33, 10, 0]
-    assert found["uniform_random"] == found["zero"] == found["best_constant"] == [0] * 6
+    assert result["rl_sct"] == [100, 100, 93, 97, 97, 87]
+    assert result["scripted"] == [100] * 6
+    assert result["scripted_blind"] == [100, 100, 80, 33, 10, 0]
+    assert result["uniform_random"] == result["zero"] == result["best_constant"] == [0] * 6
 
 
 def test_narrow_passage_sweep_breaking_points():

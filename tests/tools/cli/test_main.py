@@ -181,9 +181,9 @@ def test_evaluate_prints_one_json_object(capsys, trained):
 
 
 def test_evaluate_is_reproducible_and_depends_on_seed(capsys, trained):
-    first, again = (call(capsys, "evaluate", trained, "--episodes", 3, "--json")[1] for _ in range(2))
+    first, second = (call(capsys, "evaluate", trained, "--episodes", 3, "--json")[1] for _ in range(2))
     other = call(capsys, "evaluate", trained, "--episodes", 3, "--json", "--seed", 9)[1]
-    assert first == again
+    assert first == second
     assert json.loads(first)["mean_return"] != json.loads(other)["mean_return"]
 
 

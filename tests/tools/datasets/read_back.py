@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 LIBRARIES = ("lerobot[dataset]", "mcap", "mcap-ros2-support")
-ROUNDING = {"lerobot": 2.0**-24, "mcap": 0.0}  # of a number: 32 bits, or all of it
+ROUNDING = {"lerobot": 2.0**-24, "mcap": 0.0}  # largest relative rounding error of the format
 NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 
 
@@ -62,23 +62,23 @@ def differences(python: Path) -> dict[str, float]:
     rng = np.random.default_rng(0)
     times = [0.02 * np.arange(40 + number) for number in range(3)]
     outputs = [0.2 * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / len(t) for t in times]
-    found = {}
+    result = {}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "shown.npz")
         Demonstrations(times, outputs, NAMES).save(file)
         for kind in READERS:
             export_demonstrations(file, Path(folder, kind), kind)
             offline = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": folder}
-            asked = [python, __file__, "--read", kind, "--folder", Path(folder, kind)]
-            said = subprocess.run(asked, env=offline, stdout=subprocess.PIPE, text=True, check=True).stdout
-            back = json.loads(said.splitlines()[-1])
-            if [len(rows) for rows in back] != [len(rows) for rows in outputs]:
-                raise SystemExit(f"{kind}: other demonstrations, or of other lengths, came back")
-            found[kind] = max(
+            command = [python, __file__, "--read", kind, "--folder", Path(folder, kind)]
+            printed = subprocess.run(command, env=offline, stdout=subprocess.PIPE, text=True, check=True).stdout
+            loaded = json.loads(printed.splitlines()[-1])
+            if [len(rows) for rows in loaded] != [len(rows) for rows in outputs]:
+                raise SystemExit(f"{kind}: the number or the lengths of the demonstrations changed")
+            result[kind] = max(
                 float(np.max(np.abs(np.array(one) - other) / np.abs(other)))
-                for one, other in zip(back, outputs, strict=True)
+                for one, other in zip(loaded, outputs, strict=True)
             )
-    return found
+    return result
 
 
 def main() -> int:
@@ -87,18 +87,16 @@ def main() -> int:
     parser.add_argument("--interpreter", default=sys.executable, help="interpreter of a new environment")
     parser.add_argument("--read", choices=READERS, help="print the contents of a folder (internal)")
     parser.add_argument("--folder", type=Path)
-    given = parser.parse_args()
-    if given.read:
-        print(json.dumps(READERS[given.read](given.folder)))
+    arguments = parser.parse_args()
+    if arguments.read:
+        print(json.dumps(READERS[arguments.read](arguments.folder)))
         return 0
-    if given.environment is None:
+    if arguments.environment is None:
         parser.error("name a folder for the libraries' environment with --environment")
-    found = differences(environment(given.environment, given.interpreter))
-    for kind, difference in found.items():
-        print(
-            f"{kind}: read by its own library, {difference:.1e} of a number apart at most (rounds {ROUNDING[kind]:.1e})"
-        )
-    return int(any(difference > ROUNDING[kind] for kind, difference in found.items()))
+    result = differences(environment(arguments.environment, arguments.interpreter))
+    for kind, difference in result.items():
+        print(f"{kind}: largest relative difference {difference:.1e}, of which rounding explains {ROUNDING[kind]:.1e}")
+    return int(any(difference > ROUNDING[kind] for kind, difference in result.items()))
 
 
 if __name__ == "__main__":

@@ -32,11 +32,11 @@ def test_export_and_import_return_the_demonstrations(kind, tolerance, library, f
     pytest.importorskip(library)
     export_demonstrations(file, tmp_path / kind, kind)
     signal = "action" if kind == "lerobot" else None
-    found = import_recording(tmp_path / kind, tmp_path / "back.npz", signal=signal)
-    back, there = Demonstrations.load(tmp_path / "back.npz"), shown()
-    assert found["demonstrations"] == 3
-    assert back.names == there.names
-    for one, other in zip((*back.outputs, *back.times), (*there.outputs, *there.times), strict=True):
+    result = import_recording(tmp_path / kind, tmp_path / "back.npz", signal=signal)
+    loaded, there = Demonstrations.load(tmp_path / "back.npz"), shown()
+    assert result["demonstrations"] == 3
+    assert loaded.names == there.names
+    for one, other in zip((*loaded.outputs, *loaded.times), (*there.outputs, *there.times), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=max(tolerance, 1e-9 if one.ndim == 1 else 0))
 
 
@@ -57,8 +57,8 @@ def test_lerobot_dataset_has_the_layout_of_version_3(file, tmp_path):
 
 def test_import_prefers_the_commanded_feature(file, tmp_path):
     export_demonstrations(file, tmp_path / "set", "lerobot")
-    found = import_recording(tmp_path / "set", tmp_path / "back.csv")
-    assert "action is the commanded motion" in found["assumed"]
+    result = import_recording(tmp_path / "set", tmp_path / "back.csv")
+    assert "action is the commanded motion" in result["assumed"]
 
 
 def test_lerobot_export_refuses_several_rates(tmp_path):
@@ -101,8 +101,8 @@ def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, 
 def test_import_reads_the_bag_of_an_arm(topic, frame, tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {topic: frame})
-    found = import_recording(tmp_path / "bag", tmp_path / "kept.npz")
-    assert frame in found["assumed"]
+    result = import_recording(tmp_path / "bag", tmp_path / "kept.npz")
+    assert frame in result["assumed"]
     kept = Demonstrations.load(tmp_path / "kept.npz")
     np.testing.assert_allclose(kept.times[0], 0.01 * np.arange(5), atol=1e-9)
     np.testing.assert_allclose(kept.outputs[0][3], [0.53, 0.1, 0.3, np.deg2rad(30), 0, 0], atol=1e-12)
@@ -135,9 +135,9 @@ def test_csv_import_needs_no_option_when_columns_are_named(tmp_path):
     rows = [(n * 10, 1 + n, 2, 3, 0, 0, np.sin(0.1 * n), np.cos(0.1 * n)) for n in range(4)]
     write_table(tmp_path / "a.csv", "time_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw", rows)
     import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
-    back = Demonstrations.load(tmp_path / "a.npz")
-    np.testing.assert_allclose(back.times[0], 0.01 * np.arange(4))
-    np.testing.assert_allclose(back.outputs[0][3], [0.004, 0.002, 0.003, 0.6, 0, 0], atol=1e-12)
+    loaded = Demonstrations.load(tmp_path / "a.npz")
+    np.testing.assert_allclose(loaded.times[0], 0.01 * np.arange(4))
+    np.testing.assert_allclose(loaded.outputs[0][3], [0.004, 0.002, 0.003, 0.6, 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -243,8 +243,8 @@ def test_export_checks_its_folder_before_it_reads(kind, file, tmp_path):
 def test_export_states_a_shifted_start_when_resampled(tmp_path):
     t = 0.1 * np.arange(5)
     Demonstrations([t - 0.2], [t[:, None]]).save(tmp_path / "early.npz")
-    found = export_demonstrations(tmp_path / "early.npz", tmp_path / "set", "lerobot", rate=20)
-    assert found["note"].count("where it was -0.2") == 1
+    result = export_demonstrations(tmp_path / "early.npz", tmp_path / "set", "lerobot", rate=20)
+    assert result["note"].count("where it was -0.2") == 1
 
 
 @pytest.mark.parametrize("rate", [1e15, 1e308])
@@ -282,5 +282,5 @@ def test_twelve_demonstrations_keep_their_order(kind, tmp_path):
     Demonstrations([t] * 12, [np.full((6, 1), float(k)) for k in range(12)]).save(tmp_path / "many.npz")
     export_demonstrations(tmp_path / "many.npz", tmp_path / "set", kind)
     import_recording(tmp_path / "set", tmp_path / "again.npz")
-    again = Demonstrations.load(tmp_path / "again.npz")
-    assert [one[0, 0] for one in again.outputs] == list(range(12))
+    second = Demonstrations.load(tmp_path / "again.npz")
+    assert [one[0, 0] for one in second.outputs] == list(range(12))

@@ -24,8 +24,8 @@ def test_episode_conditions_depend_on_its_seed_alone():
     env = make_environment("Bead", {})
     four = evaluate_policy(env, lambda observation: np.zeros(2), episodes=4, seed=20)
     assert four["return"].nunique() == 4
-    again = evaluate_policy(env, lambda observation: np.zeros(2), episodes=2, seed=22)
-    assert again["return"].tolist() == four["return"][2:].tolist()
+    second = evaluate_policy(env, lambda observation: np.zeros(2), episodes=2, seed=22)
+    assert second["return"].tolist() == four["return"][2:].tolist()
 
 
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"episodes": 1, "seed": -1}, {"episodes": 1, "seed": 2**31}])
@@ -41,8 +41,8 @@ def test_load_or_compute_computes_once(tmp_path):
         calls.append(1)
         return pd.DataFrame({"success": [1, 0], "return": [0.1 + 0.2, -np.inf]})
 
-    first, again = (load_or_compute(tmp_path / "rows.csv", compute) for _ in range(2))
-    pd.testing.assert_frame_equal(first, again)
+    first, second = (load_or_compute(tmp_path / "rows.csv", compute) for _ in range(2))
+    pd.testing.assert_frame_equal(first, second)
     assert len(calls) == 1
 
 
@@ -71,12 +71,12 @@ def test_baselines_are_evaluated_once(bead_run, capsys):
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
     assert first["uniform_random_mean_return"] != first["zero_mean_return"]
     assert "series 4 of 5: uniform random actions 3/3" in capsys.readouterr().err
-    again = evaluate(bead_run, episodes=3, baselines=policies)
+    second = evaluate(bead_run, episodes=3, baselines=policies)
     printed = capsys.readouterr().err
     for name in ("series 2 of 5: demonstration alone", "series 4 of 5: uniform random actions"):
         assert f"{name}: evaluated before, and used again" in printed
         assert f"{name} 3/3" not in printed
-    assert again == first
+    assert second == first
     four = evaluate(bead_run, episodes=4, baselines=policies)
     assert four["uniform_random_mean_return"] != first["uniform_random_mean_return"]
 

@@ -17,9 +17,9 @@ def test_forked_map_uses_several_processes():
         time.sleep(0.05)  # otherwise the first process takes them all
         return os.getpid()
 
-    found = set(forked_map(slow, 6, 3))
-    assert len(found) > 1
-    assert os.getpid() not in found
+    result = set(forked_map(slow, 6, 3))
+    assert len(result) > 1
+    assert os.getpid() not in result
     assert set(forked_map(slow, 1, 3)) == {os.getpid()}
 
 

@@ -31,25 +31,25 @@ def test_find_streak_returns_the_index_of_the_first_streak():
 
 def test_collisions_differ_from_episodes_ended_by_one():
     rows = episodes("00", collisions=[3, 1], termination=["time_limit", "collision"])
-    found = summary(rows, ("collisions", "ended_in_collision"))
-    assert found == {"collisions": 4, "ended_in_collision": 1}
+    statistics = summary(rows, ("collisions", "ended_in_collision"))
+    assert statistics == {"collisions": 4, "ended_in_collision": 1}
 
 
 def test_nan_is_not_hidden_by_a_maximum():
     rows = episodes("11", max_commanded_violation=[-1.0, np.nan], peak_force=[np.nan, 2.0])
-    found = summary(rows, ("max_commanded_violation", "violating_episodes", "peak_force"))
-    assert np.isnan(found["max_commanded_violation"])
-    assert np.isnan(found["peak_force"])
-    assert found["violating_episodes"] == 1
+    statistics = summary(rows, ("max_commanded_violation", "violating_episodes", "peak_force"))
+    assert np.isnan(statistics["max_commanded_violation"])
+    assert np.isnan(statistics["peak_force"])
+    assert statistics["violating_episodes"] == 1
 
 
 @pytest.mark.parametrize(("successes", "number"), [(0, 10), (7, 10), (10, 10), (98, 100)])
 def test_success_interval_is_that_of_wilson(successes, number):
-    found = summary(episodes("1" * successes + "0" * (number - successes)), ("success_low", "success_high"))
+    statistics = summary(episodes("1" * successes + "0" * (number - successes)), ("success_low", "success_high"))
     p, z = successes / number, 1.959963984540054
     middle = (p + z**2 / (2 * number)) / (1 + z**2 / number)
     half = z / (1 + z**2 / number) * np.sqrt(p * (1 - p) / number + z**2 / (4 * number**2))
-    np.testing.assert_allclose(list(found.values()), [middle - half, middle + half], atol=1e-12)
+    np.testing.assert_allclose(list(statistics.values()), [middle - half, middle + half], atol=1e-12)
 
 
 def test_summary_has_the_statistics_of_the_task():
@@ -109,9 +109,9 @@ def test_demonstration_is_no_success_of_the_learner():
     rows = episodes("1" * 12 + "00" + "1" * 10, is_demonstration=[1] * 12 + [0] * 12)
     assert episodes_to_convergence(rows) == 14
     assert episodes_to_convergence(episodes("1" * 12, is_demonstration=[1] * 12)) is None
-    found = summary(rows, ("success_rate", "success_low", "success_rate_last_10"))
-    assert found["success_rate"] == pytest.approx(10 / 12)
-    assert found["success_low"] == pytest.approx(0.5520, abs=1e-3)
+    statistics = summary(rows, ("success_rate", "success_low", "success_rate_last_10"))
+    assert statistics["success_rate"] == pytest.approx(10 / 12)
+    assert statistics["success_low"] == pytest.approx(0.5520, abs=1e-3)
     assert summary(episodes("1", is_demonstration=[1]), ("success_rate", "success_low")) == dict.fromkeys(
         ("success_rate", "success_low")
     )

@@ -72,8 +72,8 @@ def test_draw_accepts_a_name_with_dollar_signs(run, tmp_path):
 
 
 def test_values_below_names_where_the_policy_fails(run):
-    found = robustness([run], episodes=2)
-    assert -0.5 in values_below(found["rows"], "policy")["wall"]
+    result = robustness([run], episodes=2)
+    assert -0.5 in values_below(result["rows"], "policy")["wall"]
 
 
 def test_robustness_re_evaluates_a_changed_policy(run, capsys):
@@ -96,14 +96,14 @@ def test_robustness_compares_several_runs(run, bead_config, tmp_path, capsys):
     capsys.readouterr()
     with pytest.raises(InputError, match="--out"):
         robustness([run, tmp_path / "other"], episodes=2)
-    found = robustness([run, tmp_path / "other"], episodes=2, out=out, say=sentences.append)
+    result = robustness([run, tmp_path / "other"], episodes=2, out=out, say=sentences.append)
     said = capsys.readouterr().err
-    assert found["policies"] == ["sKGRL", "demonstration alone"]
+    assert result["policies"] == ["sKGRL", "demonstration alone"]
     assert sentences == ["the runs differ in guidance"]
     assert "demonstration 2/2" not in said
     assert "demonstration alone 2/2" in said
-    assert [row["policy"] for row in found["rows"]] == ["sKGRL", "demonstration alone", "demonstration"] * 2
-    assert robustness([run, tmp_path / "other"], episodes=2, out=out)["rows"] == found["rows"]
+    assert [row["policy"] for row in result["rows"]] == ["sKGRL", "demonstration alone", "demonstration"] * 2
+    assert robustness([run, tmp_path / "other"], episodes=2, out=out)["rows"] == result["rows"]
     assert capsys.readouterr().err == ""
 
 
@@ -127,10 +127,10 @@ def test_robustness_refuses_wrong_arguments(run, wrong):
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
 def test_points_cover_every_value_or_state_why_not(task):
     arguments = check_environment(task, {})
-    found, left_out = points(task, arguments, AXES)
-    assert len(found) + len(left_out) == sum(len(axis.values) for axis in AXES)
+    result, left_out = points(task, arguments, AXES)
+    assert len(result) + len(left_out) == sum(len(axis.values) for axis in AXES)
     for axis in AXES:
-        at = {point.value: point.environment for point in found if point.axis is axis}
+        at = {point.value: point.environment for point in result if point.axis is axis}
         if axis.default in at:
             assert at[axis.default] == arguments
         assert all(at[value] != arguments for value in at if value != axis.default)
@@ -141,18 +141,18 @@ def test_points_cover_every_value_or_state_why_not(task):
 
 def test_points_replace_a_range_by_each_value():
     arguments = check_environment("BncConnector", {"friction_factor": (0.5, 2.0), "stiffness_factor": 1.7})
-    found, _ = points("BncConnector", arguments, select_axes("friction,stiffness,lost"))
-    at = {(point.axis.name, point.value): point for point in found}
+    result, _ = points("BncConnector", arguments, select_axes("friction,stiffness,lost"))
+    at = {(point.axis.name, point.value): point for point in result}
     assert at["friction", 1.0].environment["friction_factor"] == (1.0, 1.0)
     assert at["stiffness", 1.0].environment["stiffness_factor"] == 1.0
     assert at["lost", 0.0].environment == arguments
-    assert {point.axis.name: point.trained for point in found} == {"friction": None, "stiffness": None, "lost": 0.0}
+    assert {point.axis.name: point.trained for point in result} == {"friction": None, "stiffness": None, "lost": 0.0}
 
 
 @pytest.mark.parametrize(("fixture_offset", "is_resampled"), [("per_run", True), ("per_episode", False)])
 def test_only_the_offset_axis_resamples_hidden_offsets(fixture_offset, is_resampled):
-    found, _ = points("BncConnector", {"fixture_offset": fixture_offset}, AXES)
-    for point in found:
+    result, _ = points("BncConnector", {"fixture_offset": fixture_offset}, AXES)
+    for point in result:
         assert point.options == ({"new_run": True} if is_resampled and point.axis.name == "offsets" else {})
 
 
@@ -195,5 +195,5 @@ def test_all_policies_get_the_same_resampled_offsets(bead_config, tmp_path, monk
 
 def test_offsets_reach_twice_the_trained_ones():
     (offsets,) = select_axes("offsets")
-    found, _ = points("BncConnector", {"fixture_offset": "per_episode"}, [offsets])
-    assert found[-1].environment["offset_range"] == (0.0, 2.0 * 1.5e-3)
+    result, _ = points("BncConnector", {"fixture_offset": "per_episode"}, [offsets])
+    assert result[-1].environment["offset_range"] == (0.0, 2.0 * 1.5e-3)

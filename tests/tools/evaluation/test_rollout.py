@@ -49,11 +49,11 @@ def test_seed_repeats_an_episode_and_held_out_differs():
 
 
 def test_policy_that_is_a_callback_is_called_once():
-    env, told = make_environment("Bead", {}), []
+    env, messages = make_environment("Bead", {}), []
 
     class Policy(Callback):
         def on_episode_start(self):
-            told.append("begin")
+            messages.append("begin")
 
         def __call__(self, observation):
             return np.zeros(2)
@@ -61,7 +61,7 @@ def test_policy_that_is_a_callback_is_called_once():
     policy = Policy()
     rollout(env, policy, seed=0)
     rollout(env, policy, policy, seed=0)
-    assert told == ["begin", "begin"]
+    assert messages == ["begin", "begin"]
 
 
 def test_failed_simulation_has_a_row():

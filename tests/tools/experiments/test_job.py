@@ -24,11 +24,11 @@ def test_log_has_the_attempts_and_the_outcome(tmp_path):
     job, versions = Job(tmp_path / "log.txt"), installed_versions()
     assert count_attempts(job.log) == 0
     assert attempt(job, work=work, versions=versions).rows == ({"success_rate": 1.0},)
-    known = job.log.stat().st_size
-    assert (count_attempts(job.log), count_attempts(job.log, known)) == (1, 0)
+    size = job.log.stat().st_size
+    assert (count_attempts(job.log), count_attempts(job.log, size)) == (1, 0)
     assert "is done" in job.log.read_text()
     attempt(job, work=work, versions=versions)
-    assert count_attempts(job.log, known) == 1
+    assert count_attempts(job.log, size) == 1
 
 
 @pytest.mark.parametrize(

@@ -270,10 +270,10 @@ def test_ratio_is_per_seed_and_of_sums():
     rows = pd.DataFrame(
         {"method": ["a", "a", "b", "b"], "seed": [0, 1, 0, 1], "force": [1.0, 2.0, 4.0, 2.0], "after": [3, None, 1, 2]}
     )
-    wanted = Ratio(of="force", method="a", against="b")
-    assert list(ratio(rows, wanted).values()) == ["0.25, 1.00", "0.50"]
-    assert ratio(rows[:2], wanted) == ratio(rows[:3], wanted) == {}
-    assert ratio(rows.assign(seed=[0, 1, 1, 2]), wanted) == {}
+    expected = Ratio(of="force", method="a", against="b")
+    assert list(ratio(rows, expected).values()) == ["0.25, 1.00", "0.50"]
+    assert ratio(rows[:2], expected) == ratio(rows[:3], expected) == {}
+    assert ratio(rows.assign(seed=[0, 1, 1, 2]), expected) == {}
     assert each(rows[:2].astype(object), "after") == "3.0, never"
 
 
@@ -368,9 +368,9 @@ def test_study_of_research_is_valid(name, tmp_path):
     import_modules(declared.imports)
     for method in declared.methods:
         check_job(Job(declared, method, declared.seeds[0], tmp_path))
-    for wanted in declared.ratios:
-        assert wanted.of.removeprefix("training_") in statistics_of(declared.task)
-        assert {wanted.method, wanted.against} <= declared.methods.keys()
+    for expected in declared.ratios:
+        assert expected.of.removeprefix("training_") in statistics_of(declared.task)
+        assert {expected.method, expected.against} <= declared.methods.keys()
 
 
 def test_scripted_pour_succeeds_with_constraints_only(tmp_path):
@@ -402,12 +402,12 @@ def test_sweep_is_evaluated_at_each_value_and_drawn(tmp_path):
     walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
     methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "uniform_random"}}
     one = study(methods=methods, sweeps=[walls], eval_set=[])
-    found = study_command(one, tmp_path, make_engine(processes=1))
+    result = study_command(one, tmp_path, make_engine(processes=1))
     rows = read_table(tmp_path / "beads.csv")
     assert rows["eval_set"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
     assert rows[rows["eval_set"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
-    assert found["picture"] == str(tmp_path / "beads.png")
-    assert found["nothing, below 90% at wall [m]"] == "from the easiest on"
+    assert result["picture"] == str(tmp_path / "beads.png")
+    assert result["nothing, below 90% at wall [m]"] == "from the easiest on"
     assert (tmp_path / "beads.png").stat().st_size > 10_000
     assert run_study(one, tmp_path, make_engine(processes=1))["eval_set"].tolist() == rows["eval_set"].tolist()
 
@@ -436,10 +436,10 @@ def test_subset_of_a_study_has_a_table_of_its_own(tmp_path):
 
 
 def sweep_rows(*rates):
-    found = [
+    result = [
         {"method": "one", "eval_set": "x", "seed": k, "after_episodes": 60, "episodes": 50} for k in range(len(rates))
     ]
-    return pd.DataFrame(found, dtype=object).assign(success_rate=rates)
+    return pd.DataFrame(result, dtype=object).assign(success_rate=rates)
 
 
 def test_band_spans_the_intervals_of_all_seeds():
@@ -454,5 +454,5 @@ def test_sweep_of_one_value_is_drawn(tmp_path):
         {"name": "one", "task": "Bead", "methods": {"one": {"policy": "zero"}}, "seeds": [0], "eval_set": [],
          "sweeps": [{"quantity": "x", "at": {1.0: {}}}]}
     )  # fmt: skip
-    found = sweep_rows(0.5).assign(eval_set="x 1")
-    assert draw_sweeps(one, found, tmp_path / "one.png").is_file()
+    result = sweep_rows(0.5).assign(eval_set="x 1")
+    assert draw_sweeps(one, result, tmp_path / "one.png").is_file()

@@ -42,11 +42,11 @@ def at_target(env, observation):
 
 
 def guided(guidance="kgrl", kind="box", **keywords):
-    given = {
+    arguments = {
         "demonstrations": SHOWN, "frame": at_target, "constraints": LIMIT, "pose": pose, "to_action": to_action,
         "guidance": guidance, "period": PERIOD, "action_repeat": 3,
     }  # fmt: skip
-    return GuidedEnv(PointEnv(kind), **(given | keywords))
+    return GuidedEnv(PointEnv(kind), **(arguments | keywords))
 
 
 def episode(env, policy, seed=0, options=None):

@@ -74,13 +74,13 @@ def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path)
 
 
 def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_path):
-    lcm, asked, imported = DrakeLcm("memq://"), [], []
+    lcm, requests, imported = DrakeLcm("memq://"), [], []
     task = EnvConfig.resolve("BncConnector", {}).make_task()
     clock = Together(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
     def policy(observation):
-        asked.append(observation)
-        return np.full(2, 0.0 if len(asked) <= 2 else np.nan)
+        requests.append(observation)
+        return np.full(2, 0.0 if len(requests) <= 2 else np.nan)
 
     @contextmanager
     def simulated_driver(connection, task, url, imports):
@@ -111,11 +111,11 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
 
 @pytest.mark.parametrize("valid", [0, 2])  # valid actions; the first call is the warm-up
 def test_arm_rests_when_the_policy_returns_no_action(make_executor, valid):
-    asked = []
+    requests = []
 
     def policy(observation):
-        asked.append(observation)
-        return np.full(2, 0.0 if len(asked) <= valid else np.nan)
+        requests.append(observation)
+        return np.full(2, 0.0 if len(requests) <= valid else np.nan)
 
     executor, clock = make_executor(policy=policy)
     commands = []

@@ -1,4 +1,4 @@
-"""Offsets of the parts in front of a simulated driver are those of a reset in simulation."""
+"""With a simulated driver the parts have the same offsets as after a reset in simulation."""
 
 import numpy as np
 from pydrake.lcm import DrakeLcm

@@ -41,7 +41,7 @@ def make(patch, start, **options):
         bus.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
         station = make_station(declared)
     task = build_task_diagram(declared, station, make_guidance(declared, station))
-    clock, keys, asked = Together(declared.workcell(), lcm, start), OperatorKeys(), []
+    clock, keys, requests = Together(declared.workcell(), lcm, start), OperatorKeys(), []
     begin = declared.start_pose(np.random.default_rng(0))
     transfer_station = station.clone(declared.workcell())
     env = RobotEnv(
@@ -52,10 +52,10 @@ def make(patch, start, **options):
         clock,
         action_repeat=5,
         keys=keys,
-        confirm_resume=asked.append,
+        confirm_resume=requests.append,
         log=lambda text: None,
     )
-    env.clock, env.keys, env.asked, env.begin = clock, keys, asked, begin
+    env.clock, env.keys, env.asked, env.begin = clock, keys, requests, begin
     return env
 
 
@@ -107,8 +107,8 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
     learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
     env.keys.is_pause_requested = True
-    found = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
-    assert (found["episodes"], found["success_rate"]) == (2, 0.0)
+    result = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
+    assert (result["episodes"], result["success_rate"]) == (2, 0.0)
     assert (env.asked, env.keys.is_pause_requested) == (
         ["stop requested by the user"],
         False,
@@ -128,8 +128,8 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
 
 def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path, forkserver):
     small = {"net_arch": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_freq": 1}
-    given = {"algorithm": "sac", "episodes": 5, "settings": small}
-    config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **given)
+    arguments = {"algorithm": "sac", "episodes": 5, "settings": small}
+    config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **arguments)
     folder, idle, before = RunFolder(tmp_path), env.idle, []
 
     def refuse():
@@ -178,7 +178,7 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
 
     infos = []
     step = env.step
-    monkeypatch.setattr(env, "step", lambda action: infos.append(found := step(action)) or found)
+    monkeypatch.setattr(env, "step", lambda action: infos.append(result := step(action)) or result)
     row = rollout(env, act)
     assert (row["termination"], row["steps"]) == ("stopped", 8)
     for column, key, signal in (
@@ -195,7 +195,7 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
 def ready(monkeypatch):
     """Return clock of a waiting arm, list of the questions, and function that starts a `robot_session`."""
     lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
-    clock, asked = Together(declared.workcell(), lcm, START), []
+    clock, requests = Together(declared.workcell(), lcm, START), []
 
     @contextmanager
     def no_process(connection, *arguments):
@@ -205,9 +205,9 @@ def ready(monkeypatch):
     monkeypatch.setattr(RobotConnection, "simulated_driver", no_process)
     monkeypatch.setattr(RobotConnection, "clocks", lambda connection, station: (clock, None))
     monkeypatch.setattr("guiderail.tools.hardware.session.set_realtime_priority", lambda: True)
-    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", asked.append)
+    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", requests.append)
     config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
-    return clock, asked, lambda: robot_session(config, RobotConnection(), assume_yes=False, log=lambda text: None)
+    return clock, requests, lambda: robot_session(config, RobotConnection(), assume_yes=False, log=lambda text: None)
 
 
 @pytest.mark.parametrize("name", ["start", "monitor", "commands"])
@@ -231,11 +231,11 @@ def test_session_raises_when_a_check_fails_after_the_question(ready, monkeypatch
 
 def test_clock_begins_again_before_control_is_taken(ready, monkeypatch):
     """Time for the question and for building the learner is no gap between statuses."""
-    clock, asked, begin = ready
+    clock, requests, begin = ready
     commands = []
     clock.monitor._driver.lcm.Subscribe(IiwaDriver.command_channel, commands.append)
     with begin() as robot:
-        assert (len(asked), commands) == (1, [])  # nothing was sent yet
+        assert (len(requests), commands) == (1, [])  # nothing was sent yet
         begun, step = [], clock.step
         monkeypatch.setattr(clock, "begin", lambda: begun.append(clock.step))
         robot.env._take_control()

@@ -62,10 +62,10 @@ def test_actors_act_with_weights_of_a_fixed_age(parallel_config, tmp_path):
 
 def test_demonstrator_acts_in_actors(parallel_config, tmp_path):
     config = parallel_config(2, demonstration_episodes=2)
-    found = run_training(
+    result = run_training(
         RunFolder(tmp_path / "run"), config, demonstrator=lambda env: lambda seen: env.action_space.low
     )
-    assert [row["is_demonstration"] for row in found] == [1, 1, 0, 0, 0, 0, 0, 0]
+    assert [row["is_demonstration"] for row in result] == [1, 1, 0, 0, 0, 0, 0, 0]
 
 
 def test_killed_actor_ends_the_run_with_one_sentence(parallel_config, tmp_path, monkeypatch):

@@ -31,17 +31,17 @@ def make(config, seed=0):
 
 
 def learn(learner, episodes, rng, length=7):
-    """Learn from random episodes; the learner's actions are returned."""
+    """Train on random episodes; return the learner's actions."""
     actions = []
     for _ in range(episodes):
         learner.on_episode_start()
-        seen = rng.uniform(-1, 1, 3).astype(np.float32)
+        observation = rng.uniform(-1, 1, 3).astype(np.float32)
         for step in range(length):
-            action = learner.act(seen)
-            following, is_last = rng.uniform(-1, 1, 3).astype(np.float32), step == length - 1
-            learner.on_step(Transition(seen, action, float(rng.normal()), following, False, is_last, {}))
+            action = learner.act(observation)
+            next_observation, is_last = rng.uniform(-1, 1, 3).astype(np.float32), step == length - 1
+            learner.on_step(Transition(observation, action, float(rng.normal()), next_observation, False, is_last, {}))
             actions.append(action)
-            seen = following
+            observation = next_observation
         learner.on_episode_end({"success": 0})
     return np.array(actions)
 
@@ -57,10 +57,10 @@ def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
     arrays, values = learner.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
     expected = learn(learner, 3, np.random.default_rng(1))
-    again = make(config, seed=9)
-    again.restore(arrays, values)
-    np.testing.assert_array_equal(learn(again, 3, np.random.default_rng(1)), expected)
-    policies = [one.policy({"observation_shape": [3]}) for one in (learner, again)]
+    restored = make(config, seed=9)
+    restored.restore(arrays, values)
+    np.testing.assert_array_equal(learn(restored, 3, np.random.default_rng(1)), expected)
+    policies = [one.policy({"observation_shape": [3]}) for one in (learner, restored)]
     np.testing.assert_array_equal(*[policy(OBSERVATION) for policy in policies])
     assert not learner.has_diverged()
 
@@ -104,12 +104,12 @@ def test_on_policy_settings_reach_the_algorithm():
 def test_on_policy_learner_bootstraps_a_time_limit():
     """By hand: with γ = 1 and λ = 1, the return of a truncated step is its reward plus the next state's value."""
     learner = make(make_config("ppo", {"n_steps": 8, "gamma": 1.0, "gae_lambda": 1.0, "net_arch": "4"}))
-    following = np.full(3, 0.5, np.float32)
-    value = float(learner._value(following))
+    next_observation = np.full(3, 0.5, np.float32)
+    value = float(learner._value(next_observation))
     for truncated, terminated, expected in ((True, False, 2.0 + value), (False, True, 2.0)):
         learner.on_episode_start()
         action = learner.act(OBSERVATION)
-        learner.on_step(Transition(OBSERVATION, action, 2.0, following, terminated, truncated, {}))
+        learner.on_step(Transition(OBSERVATION, action, 2.0, next_observation, terminated, truncated, {}))
         buffer = learner.model.rollout_buffer
         assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
 
@@ -122,8 +122,8 @@ def test_on_policy_learner_leaves_a_failed_simulation_out():
     assert learner.model.rollout_buffer.pos == 0
 
 
-def demonstrated(fraction, **more):
-    settings = {"net_arch": "4", "batch_size": 8, "learning_starts": 50, "demonstration_episodes": 2, **more}
+def make_with_demonstrations(fraction, **more_settings):
+    settings = {"net_arch": "4", "batch_size": 8, "learning_starts": 50, "demonstration_episodes": 2, **more_settings}
     return make(resolve_preset(None, "tqc", {**settings, "demonstration_fraction": fraction}))
 
 
@@ -138,19 +138,20 @@ def fill(learner, episodes, length=5):
 
 @pytest.mark.parametrize("fraction", [0.25, 0.5, 0.75])
 def test_every_batch_has_its_fraction_of_demonstrations(fraction):
-    learner = demonstrated(fraction)
+    learner = make_with_demonstrations(fraction)
     fill(learner, 5)
     assert learner.model.replay_buffer.num_demonstrated == 10
-    for part in learner.model.replay_buffer.sample(10 * 8).rewards.view(10, 8):  # as the fast step divides it
+    # Ten batches in one draw, as the fast step samples them.
+    for part in learner.model.replay_buffer.sample(10 * 8).rewards.view(10, 8):
         assert (part < 2).float().mean() == fraction
     arrays, values = learner.state()
-    again = demonstrated(fraction)
-    again.restore(arrays, values)
-    assert again.model.replay_buffer.num_demonstrated == 10
+    restored = make_with_demonstrations(fraction)
+    restored.restore(arrays, values)
+    assert restored.model.replay_buffer.num_demonstrated == 10
 
 
 def test_demonstrations_are_not_overwritten():
-    learner = demonstrated(0.5, buffer_size=15)
+    learner = make_with_demonstrations(0.5, buffer_size=15)
     fill(learner, 7)
     rewards = learner.model.replay_buffer.rewards[:, 0]
     np.testing.assert_array_equal(rewards[:10], [0.0] * 5 + [1.0] * 5)
@@ -190,8 +191,9 @@ def clone(learner, episodes, rng, length=20):
     for _ in range(episodes):
         learner.on_episode_start()
         for step in range(length):
-            seen, following = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
-            learner.on_step(Transition(seen, demonstrator_action(seen), 0.0, following, False, step == length - 1, {}))
+            observation, next_observation = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
+            action, is_last = demonstrator_action(observation), step == length - 1
+            learner.on_step(Transition(observation, action, 0.0, next_observation, False, is_last, {}))
         learner.on_episode_end({"success": 1})
 
 
@@ -203,20 +205,20 @@ def test_behavior_cloning_acts_as_the_demonstrator():
     arrays, values = learner.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
     clone(learner, 1, np.random.default_rng(5))
-    clone(learner, 1, rng)  # episodes of its own change nothing
-    seen = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
+    clone(learner, 1, rng)  # only the first four episodes, the demonstrations, are learned from
+    observation = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
     policy = learner.policy({"observation_shape": [3]})
-    errors = [policy(one) - demonstrator_action(one) for one in seen]
+    errors = [policy(one) - demonstrator_action(one) for one in observation]
     assert np.sqrt(np.mean(np.square(errors))) < 0.1
-    np.testing.assert_allclose(learner.act(seen[0]), policy(seen[0]), atol=1e-6)
+    np.testing.assert_allclose(learner.act(observation[0]), policy(observation[0]), atol=1e-6)
     assert learner.metrics()["train/loss"] < 0.02
-    again = make(config)
-    again.restore(arrays, values)
-    clone(again, 1, np.random.default_rng(5))
-    np.testing.assert_array_equal(again.act(seen[1]), learner.act(seen[1]))
+    restored = make(config)
+    restored.restore(arrays, values)
+    clone(restored, 1, np.random.default_rng(5))
+    np.testing.assert_array_equal(restored.act(observation[1]), learner.act(observation[1]))
 
 
-def test_behavior_cloning_refuses_no_demonstrations():
+def test_behavior_cloning_refuses_zero_demonstrations():
     assert make_config("bc", {"demonstration_episodes": 1}).demonstration_episodes == 1
     with pytest.raises(InputError, match="learns from demonstrations"):
         make_config("bc", {"demonstration_episodes": 0})

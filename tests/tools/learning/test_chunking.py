@@ -41,10 +41,10 @@ def test_chunks_follow_the_commands_of_the_demonstrations(trained):
 
 def test_same_seed_gives_the_same_policy_also_when_resumed(trained, tmp_path):
     run, arguments = trained
-    again = train("NarrowPassage", "kgrl", out=tmp_path / "again", **arguments, **OPTIONS)
+    second = train("NarrowPassage", "kgrl", out=tmp_path / "again", **arguments, **OPTIONS)
     for path in ("policy.safetensors", "policy.json"):
-        assert (run.path / path).read_bytes() == (again.path / path).read_bytes()
-    resumed = train("NarrowPassage", out=again.path, resume=True, episodes=5, pictures=False)
+        assert (run.path / path).read_bytes() == (second.path / path).read_bytes()
+    resumed = train("NarrowPassage", out=second.path, resume=True, episodes=5, pictures=False)
     assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
 

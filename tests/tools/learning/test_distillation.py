@@ -55,8 +55,8 @@ def test_student_predicts_the_commands_of_the_teacher(teacher, tmp_path):
         errors.append(np.abs(chunk[0] - learner.label(observation, step)).max())
         observation, *_ = env.step(learner._teacher(observation))
     assert np.median(errors) < 0.02  # the passage is 0.9 m long
-    again = train("NarrowPassage", guidance, out=tmp_path / "again", settings=settings, **arguments | {"episodes": 2})
-    resumed = train("NarrowPassage", out=again.path, resume=True, episodes=3, pictures=False)
+    second = train("NarrowPassage", guidance, out=tmp_path / "again", settings=settings, **arguments | {"episodes": 2})
+    resumed = train("NarrowPassage", out=second.path, resume=True, episodes=3, pictures=False)
     assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
 

@@ -67,8 +67,8 @@ def train_both(plain, ensemble, seed=0):
 
 def same(plain, ensemble, tolerance):
     for network in ("actor", "critic", "critic_target"):
-        expected, found = (parameters_to_vector(getattr(x.model, network).parameters()) for x in (plain, ensemble))
-        torch.testing.assert_close(found.detach(), expected.detach(), rtol=0, atol=tolerance)
+        expected, result = (parameters_to_vector(getattr(x.model, network).parameters()) for x in (plain, ensemble))
+        torch.testing.assert_close(result.detach(), expected.detach(), rtol=0, atol=tolerance)
     if plain._log_ent_coef() is not None:
         torch.testing.assert_close(ensemble._log_ent_coef(), plain._log_ent_coef().detach(), rtol=0, atol=tolerance)
 
@@ -79,22 +79,22 @@ def same(plain, ensemble, tolerance):
     [("tqc_contact", {}), ("tqc_fast", {"n_steps": 3}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
 )
 def test_fast_step_equals_that_of_stable_baselines3(plain, ensemble, preset, settings):
-    expected, found = make(plain, preset, **settings), make(ensemble, preset, **settings)
-    same(expected, found, 0.0)
+    expected, result = make(plain, preset, **settings), make(ensemble, preset, **settings)
+    same(expected, result, 0.0)
     for seed in range(2):
-        train_both(expected, found, seed)
-        same(expected, found, 2e-6)
+        train_both(expected, result, seed)
+        same(expected, result, 2e-6)
     # A step of Adam is the same whatever a gradient is multiplied with; the actor's is left by both.
     gradient = torch.cat([p.grad.flatten() for p in expected.model.actor.parameters()])
     largest = gradient.abs().max()
-    torch.testing.assert_close(found.model.actor.optimizer.gradient / largest, gradient / largest, rtol=0, atol=2e-5)
+    torch.testing.assert_close(result.model.actor.optimizer.gradient / largest, gradient / largest, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
 def test_fast_step_on_images_equals_stable_baselines3(plain, ensemble):
-    expected, found = make(plain, env=Image), make(ensemble, env=Image)
-    train_both(expected, found)
-    same(expected, found, 2e-6)
+    expected, result = make(plain, env=Image), make(ensemble, env=Image)
+    train_both(expected, result)
+    same(expected, result, 2e-6)
 
 
 def test_tqc_critic_gradient_is_that_of_its_loss():
@@ -104,19 +104,19 @@ def test_tqc_critic_gradient_is_that_of_its_loss():
     target = 2 * torch.randn(BATCH, 46, generator=generator)
     loss = quantile_huber_loss(values.transpose(0, 1), target[:, None], sum_over_quantiles=False)
     (expected,) = torch.autograd.grad(loss, values)
-    found = learner.model._critic_gradient(values.detach(), target)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-9)
+    result = learner.model._critic_gradient(values.detach(), target)
+    torch.testing.assert_close(result, expected, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
 def test_fast_step_continues_stable_baselines3_state(plain, ensemble):
-    expected, found = make(plain), make(ensemble)
+    expected, result = make(plain), make(ensemble)
     train_both(expected, make(ensemble))
     arrays, values = expected.state()
-    found.restore({key: np.ascontiguousarray(value).copy() for key, value in arrays.items()}, values)  # as in a file
-    assert found.state()[0].keys() == arrays.keys()
-    train_both(expected, found, seed=1)
-    same(expected, found, 2e-6)
+    result.restore({key: np.ascontiguousarray(value).copy() for key, value in arrays.items()}, values)  # as in a file
+    assert result.state()[0].keys() == arrays.keys()
+    train_both(expected, result, seed=1)
+    same(expected, result, 2e-6)
 
 
 def test_flat_adam_refuses_moments_of_other_shapes():

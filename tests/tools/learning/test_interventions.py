@@ -1,4 +1,4 @@
-"""Human-in-the-loop training: corrections, labels and stops, and that they are part of the run."""
+"""Human-in-the-loop training: corrections, labels and stops, and their record in the run folder."""
 
 import numpy as np
 import pytest
@@ -58,8 +58,8 @@ def still():
 class Scripted(Supervisor):
     """Supervisor with corrections (first step, last step, offset) and labels (step, label) by episode."""
 
-    def __init__(self, pushes, words=None):
-        self.pushes, self.words, self.episode = pushes, words or {}, -1
+    def __init__(self, pushes, labels=None):
+        self.pushes, self.labels, self.episode = pushes, labels or {}, -1
 
     def on_episode_start(self, env):
         self.episode += 1
@@ -70,8 +70,8 @@ class Scripted(Supervisor):
         return np.array(push) if first <= self.env._control_steps <= last else None
 
     def label(self):
-        step, word = self.words.get(self.episode, (None, None))
-        return word if step is not None and self.env._control_steps >= step else None
+        step, label = self.labels.get(self.episode, (None, None))
+        return label if step is not None and self.env._control_steps >= step else None
 
 
 def passage(episodes, **environment):
@@ -87,16 +87,16 @@ def test_correction_becomes_transitions_and_via_points(tmp_path):
     assert [row["interventions"] for row in rows] == [1, 0]
     actions = np.array([transition.action for transition in learners[0].seen])
     pushed = (actions != 0).any(axis=1)
-    np.testing.assert_array_equal(actions[pushed], np.tile([0.5, 1.0], (pushed.sum(), 1)))  # as far as actions reach
-    np.testing.assert_array_equal(np.flatnonzero(pushed), [5, 6, 7, 8, 9])  # remembered where they were done
-    found = folder.config()
-    assert found.human_in_the_loop
-    points = np.reshape(found.environment["via_points"], (-1, 3))
+    np.testing.assert_array_equal(actions[pushed], np.tile([0.5, 1.0], (pushed.sum(), 1)))  # clipped to 1
+    np.testing.assert_array_equal(np.flatnonzero(pushed), [5, 6, 7, 8, 9])  # actions of steps 10 to 19
+    config = folder.config()
+    assert config.human_in_the_loop
+    points = np.reshape(config.environment["via_points"], (-1, 3))
     np.testing.assert_array_equal(points[:, 0], [11, 17, 19])
     corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
-    shown = corrections._reference.means[points[:, 0].astype(int)]
-    wanted = shown + np.array([0.5, 3.0]) * corrections.reach
-    assert (np.abs(points[:, 1:] - wanted).min(axis=0) < 1e-9).all()  # but for where the constraints stop it
+    reference = corrections._reference.means[points[:, 0].astype(int)]
+    expected = reference + np.array([0.5, 3.0]) * corrections.reach
+    assert (np.abs(points[:, 1:] - expected).min(axis=0) < 1e-9).all()  # the constraints shorten some
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
@@ -126,8 +126,8 @@ def test_held_correction_applies_to_the_rest_of_the_motion():
 
 
 def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
-    words = {0: (10, "success"), 1: (10, "failure"), 2: (10, "stop")}
-    rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, words))
+    labels = {0: (10, "success"), 1: (10, "failure"), 2: (10, "stop")}
+    rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, labels))
     assert [row["termination"] for row in rows] == ["success", "failure", "stop"]
     assert [row["success"] for row in rows] == [1, 0, 0]
     last = [transition for transition in learners[0].seen if transition.is_last]
@@ -144,8 +144,8 @@ def test_supervised_run_resumes_with_its_corrections(tmp_path):
     run_training(RunFolder(tmp_path / "parts"), passage(2), supervisor=Scripted(pushes))
     later = Scripted({episode - 2: push for episode, push in pushes.items()})
     folder = RunFolder(tmp_path / "parts")
-    again = run_training(folder, passage(3), resume=True, supervisor=later)
-    for one, other in zip(whole, again, strict=True):
+    second = run_training(folder, passage(3), resume=True, supervisor=later)
+    for one, other in zip(whole, second, strict=True):
         assert one | {"wall_time": 0} == other | {"wall_time": 0}
     assert folder.config().environment == RunFolder(tmp_path / "whole").config().environment
     with pytest.raises(InputError, match="--human-in-the-loop"):
@@ -166,12 +166,12 @@ def test_corrections_rescue_demonstrations_that_are_5_mm_off(tmp_path):
         "action_repeat": 10,
         "action_dims": (0, 1),
     }
-    shown = ViaPointCorrections("BncConnector", environment)
-    steps = np.arange(0, shown._reference.num_steps, VIA_POINT_SPACING)
-    astray = np.column_stack([steps, shown._reference.means[steps]])
+    corrections = ViaPointCorrections("BncConnector", environment)
+    steps = np.arange(0, corrections._reference.num_steps, VIA_POINT_SPACING)
+    astray = np.column_stack([steps, corrections._reference.means[steps]])
     astray[:, 1] += 5e-3
     environment["via_points"] = tuple(astray.ravel())
-    push = [-5e-3 / shown.reach[0], 0.0]
+    push = [-5e-3 / corrections.reach[0], 0.0]
     config = configure(
         "BncConnector", environment, algorithm="still", episodes=3, human_in_the_loop=True, step_log=False
     )

@@ -245,9 +245,9 @@ def test_extended_actions_end_when_greedy_episodes_succeed(config):
     for success, extended in ((None, True), (True, True), (True, False), (True, False), (False, True)):
         if success is not None:
             learner.on_episode_end({"success": int(success)})  # the greedy episode
-        again = make(settled, seed=9)
-        again.restore(*learner.state())
-        for one in (again, learner):
+        second = make(settled, seed=9)
+        second.restore(*learner.state())
+        for one in (second, learner):
             exploring = actions_of(one, 1, number=30)[0]
             assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is extended
         learner.on_episode_end({"success": 0})  # an exploring episode counts for nothing
@@ -314,9 +314,9 @@ def test_another_algorithm_is_one_class(monkeypatch):
     learner = make(resolve_preset("tqc_contact", "ddpg", SETTINGS))
     learn_from_random_transitions(learner, 24)
     arrays, values = learner.state()
-    again = make(learner.config, seed=9)
-    again.restore({key: value.copy() for key, value in arrays.items()}, values)
-    np.testing.assert_array_equal(weights(again), weights(learner))
+    second = make(learner.config, seed=9)
+    second.restore({key: value.copy() for key, value in arrays.items()}, values)
+    np.testing.assert_array_equal(weights(second), weights(learner))
     policy, seen = learner.policy({"observation_shape": [3]}), np.full(3, 0.3, np.float32)
     expected = learner.actor()._predict(torch.as_tensor(seen)[None]).detach().numpy()[0]
     np.testing.assert_allclose(policy(seen), expected, atol=1e-6)

@@ -87,8 +87,8 @@ def test_load_refuses_a_flipped_bit(learner, file, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
     export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     content = bytearray((tmp_path / file).read_bytes())
-    at = content.index(b"action_high") + 14 if file.endswith("json") else len(content) - 4
-    content[at] ^= 1
+    position = content.index(b"action_high") + 14 if file.endswith("json") else len(content) - 4
+    content[position] ^= 1
     (tmp_path / file).write_bytes(content)
     with pytest.raises(InputError, match="damaged"):
         Policy.load(tmp_path)
@@ -108,9 +108,9 @@ def test_policy_refuses_parts_that_do_not_fit(entry, value, tmp_path):
     Policy(layers, values).save(tmp_path)
     Policy.load(tmp_path)
     layers[0][0][0, 0] = np.inf
-    for described, of in ((values | {entry: value}, [*layers[1:]]), (values, layers), (values, [])):
+    for description, policy_layers in ((values | {entry: value}, [*layers[1:]]), (values, layers), (values, [])):
         with pytest.raises(ValueError):
-            Policy(of, described)
+            Policy(policy_layers, description)
     stored = json.loads((tmp_path / "policy.json").read_text())
     del stored["digest"]
     stored |= {entry: value}
@@ -120,13 +120,13 @@ def test_policy_refuses_parts_that_do_not_fit(entry, value, tmp_path):
         Policy.load(tmp_path)
 
 
-@pytest.mark.parametrize("lacking", ["observation_shape", "action_low", "action_high", "pool"])
-def test_image_policy_refuses_an_incomplete_description(lacking):
+@pytest.mark.parametrize("missing", ["observation_shape", "action_low", "action_high", "pool"])
+def test_image_policy_refuses_an_incomplete_description(missing):
     layers = [(np.ones((1, 3), np.float32), np.zeros(1, np.float32))]
-    whole = {"observation_shape": [2, 2, 3], "action_low": [-1.0], "action_high": [1.0], "pool": 2}
-    Policy(layers, whole)
+    description = {"observation_shape": [2, 2, 3], "action_low": [-1.0], "action_high": [1.0], "pool": 2}
+    Policy(layers, description)
     with pytest.raises(ValueError):
-        Policy(layers, {name: value for name, value in whole.items() if name != lacking})
+        Policy(layers, {name: value for name, value in description.items() if name != missing})
 
 
 def test_load_names_a_missing_policy(tmp_path):

@@ -106,8 +106,8 @@ def test_fast_step_equals_that_of_stable_baselines3(plain, fast):
         torch.manual_seed(0)
         learner.model.train(4, 8)
     for network in ("actor", "critic", "critic_target"):
-        expected, found = (parameters_to_vector(getattr(x.model, network).parameters()).detach() for x in learners)
-        torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+        expected, result = (parameters_to_vector(getattr(x.model, network).parameters()).detach() for x in learners)
+        torch.testing.assert_close(result, expected, rtol=0, atol=2e-6)
 
 
 def test_symmetry_acts_on_what_is_hidden():
@@ -131,8 +131,8 @@ def test_state_is_restored_exactly():
         torch.manual_seed(3)
         np.random.seed(3)  # noqa: NPY002
         one.model.train(4, 8)
-    expected, found = (parameters_to_vector(one.model.critic.parameters()) for one in (learner, other))
-    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    expected, result = (parameters_to_vector(one.model.critic.parameters()) for one in (learner, other))
+    torch.testing.assert_close(result, expected, rtol=0, atol=0)
 
 
 def test_learner_raises_when_nothing_privileged_is_declared():

@@ -57,12 +57,12 @@ def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, tmp_path)
     begun.create(config)
     before = (folder / name).read_text()
     (folder / name).write_text(CHANGES[name])
-    for again in (
+    for second in (
         lambda: start_or_resume(None, begun.path, environment={}, resume=True),
         lambda: begun.refuse_another(configure("parts/pin", {}, episodes=2)),
     ):
         with pytest.raises(InputError, match="the files of parts/pin are not those"):
-            again()
+            second()
     (folder / name).write_text(before)
     begun.refuse_another(config)
     begun.write_config(replace(config, task_content=""))  # as it was written before anybody kept this

@@ -264,11 +264,11 @@ def test_table_is_completed_from_the_checkpoint(bead_config, tmp_path):
 
 def refused_in(episode):
     """Return a demonstrator that raises an InputError in the episode of that number."""
-    asked = []
+    requests = []
 
     def demonstrator(env):
-        asked.append(env)
-        if len(asked) == episode + 2:  # the first call checks the compatibility
+        requests.append(env)
+        if len(requests) == episode + 2:  # the first call checks the compatibility
             raise InputError("this is wrong")
         return always_left(env)
 
@@ -343,9 +343,9 @@ def test_default_learner_is_the_tasks(task, preset, algorithm):
 
 
 def test_chosen_learner_replaces_the_tasks():
-    given = with_defaults("GridClamp", {"algorithm": "tqc"})
-    assert given == {"algorithm": "tqc"}
-    assert configure("GridClamp", {"guidance": "none"}, **given).preset == "tqc_contact"
+    arguments = with_defaults("GridClamp", {"algorithm": "tqc"})
+    assert arguments == {"algorithm": "tqc"}
+    assert configure("GridClamp", {"guidance": "none"}, **arguments).preset == "tqc_contact"
 
 
 @pytest.mark.parametrize("pipelined", [False, True])

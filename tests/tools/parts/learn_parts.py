@@ -48,8 +48,8 @@ def finished(kept: Path, make) -> dict:
     """Return the result of a step with its duration [min], from its file if it exists."""
     if not kept.exists():
         start = time.perf_counter()
-        found = make()
-        kept.write_text(json.dumps({**found, "minutes": (time.perf_counter() - start) / 60}), encoding="utf-8")
+        result = make()
+        kept.write_text(json.dumps({**result, "minutes": (time.perf_counter() - start) / 60}), encoding="utf-8")
     return json.loads(kept.read_text(encoding="utf-8"))
 
 
@@ -93,16 +93,16 @@ def table_row(name: str, out: Path, episodes: int, seed: int, held_out: int) -> 
     if not episodes:
         return [*row, *[""] * 5, f"{measured['minutes']:.1f}"]
     trained = finished(kept / f"{name}-training.json", lambda: train(name, out, log, episodes, seed))
-    found = finished(kept / f"{name}-evaluation.json", lambda: evaluate(name, out, log, held_out))
-    minutes = measured["minutes"] + trained["training_minutes"] + found["minutes"]
+    result = finished(kept / f"{name}-evaluation.json", lambda: evaluate(name, out, log, held_out))
+    minutes = measured["minutes"] + trained["training_minutes"] + result["minutes"]
     whose = ("demonstration_success_rate", "uniform_random_success_rate", "success_rate")
-    alone, uniform_random, success = (f"{found[which] * found['episodes']:.0f}" for which in whose)
+    alone, uniform_random, success = (f"{result[which] * result['episodes']:.0f}" for which in whose)
     return [
         *row,
         alone,
         uniform_random,
-        f"{success} of {found['episodes']}",
-        found["episodes_to_convergence"],
+        f"{success} of {result['episodes']}",
+        result["episodes_to_convergence"],
         trained["episodes"],
         f"{minutes:.1f}",
     ]
@@ -117,14 +117,14 @@ def main() -> None:
     parser.add_argument("--held-out", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
-    given = parser.parse_args()
+    args = parser.parse_args()
     for folder in ("drawn", "tasks", "runs", "logs", "kept"):
-        (given.out / folder).mkdir(parents=True, exist_ok=True)
+        (args.out / folder).mkdir(parents=True, exist_ok=True)
     rows, failed = {}, {}
-    with ThreadPoolExecutor(given.processes) as pool:
+    with ThreadPoolExecutor(args.processes) as pool:
         asked = {
-            name: pool.submit(table_row, name, given.out, given.episodes, given.seed, given.held_out)
-            for name in given.parts.split(",")
+            name: pool.submit(table_row, name, args.out, args.episodes, args.seed, args.held_out)
+            for name in args.parts.split(",")
         }
         for name, one in asked.items():
             try:
@@ -134,8 +134,8 @@ def main() -> None:
             lines = [
                 "| " + " | ".join(map(str, row)) + " |" for row in (COLUMNS, ["---"] * len(COLUMNS), *rows.values())
             ]
-            (given.out / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print((given.out / "table.md").read_text(encoding="utf-8"))
+            (args.out / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print((args.out / "table.md").read_text(encoding="utf-8"))
     for name, why in failed.items():
         print(f"{name}: {why}")
     sys.exit(1 if failed else 0)

@@ -106,8 +106,8 @@ def test_created_folder_is_a_task(folder, tmp_path, capsys):
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
     call("evaluate", tmp_path / "run", "--episodes", 1, "--baselines", "none", "--json")
-    found = json.loads(capsys.readouterr().out)
-    assert found["max_commanded_violation"] <= 1e-9
+    result = json.loads(capsys.readouterr().out)
+    assert result["max_commanded_violation"] <= 1e-9
     assert (tmp_path / "run/replay.html").is_file()
 
 
@@ -154,11 +154,13 @@ def test_difficulties_of_a_created_task_bound_the_offset_and_the_command(folder)
 
 def test_hard_is_calibrated_with_few_episodes(folder):
     tree = yaml.safe_load((folder / "task.yaml").read_text())
-    found, hard = tree["measured"]["hard"], tree["hard"]
-    assert found["force_limit"] == hard["force_limit"] == min(35.0, max(10.0, np.ceil(2.5 * tree["measured"]["force"])))
+    result, hard = tree["measured"]["hard"], tree["hard"]
+    assert (
+        result["force_limit"] == hard["force_limit"] == min(35.0, max(10.0, np.ceil(2.5 * tree["measured"]["force"])))
+    )
     assert hard["guidance"] == "kgrl"
     for policy in ("uniform_random", "scripted"):
-        successes, episodes = map(int, found[policy].split(" of "))
+        successes, episodes = map(int, result[policy].split(" of "))
         assert 0 <= successes <= episodes <= 1
 
 

@@ -26,13 +26,13 @@ from guiderail.tools.parts.difficulty import (
 
 def scores(random, scripted):
     """Scores of ten episodes for each setting, and the list of settings that were asked for."""
-    asked = []
+    requests = []
 
     def score(setting):
-        asked.append(SETTINGS.index(setting))
-        return Score(random[asked[-1]], 10, scripted[asked[-1]], 10)
+        requests.append(SETTINGS.index(setting))
+        return Score(random[requests[-1]], 10, scripted[requests[-1]], 10)
 
-    return score, asked
+    return score, requests
 
 
 @pytest.mark.parametrize(
@@ -48,14 +48,14 @@ def scores(random, scripted):
     ],
 )
 def test_setting_is_the_first_with_the_required_rates(random, scripted, chosen, tried):
-    score, asked = scores(random, scripted)
-    setting, found, is_hard = choose_setting(score)
-    assert asked == tried
+    score, requests = scores(random, scripted)
+    setting, result, is_hard = choose_setting(score)
+    assert requests == tried
     assert is_hard is (chosen is not None)
     if chosen is not None:
         assert setting is SETTINGS[chosen]
     else:
-        assert found.margin == pytest.approx(max(scripted[one] - random[one] for one in tried) / 10)
+        assert result.margin == pytest.approx(max(scripted[one] - random[one] for one in tried) / 10)
 
 
 @pytest.mark.parametrize(

@@ -71,13 +71,13 @@ def test_report_states_differences_when_asked(studied, tmp_path):
 
 
 def test_methods_are_named_after_differing_settings(studied):
-    gathered = gather([studied / "skgrl-1", studied / "kmp-1"])
-    assert [run.method for run in gathered.runs] == ["sKGRL", "demonstration alone"]
-    assert not gathered.is_study
-    assert len(gathered.held_out) == 0
-    again = gather([studied / "skgrl-1", studied / "skgrl-2"])
-    assert {run.method for run in again.runs} == {"sKGRL"}
-    assert [len(runs) for runs in again.methods("Bead").values()] == [2]
+    data = gather([studied / "skgrl-1", studied / "kmp-1"])
+    assert [run.method for run in data.runs] == ["sKGRL", "demonstration alone"]
+    assert not data.is_study
+    assert len(data.held_out) == 0
+    second = gather([studied / "skgrl-1", studied / "skgrl-2"])
+    assert {run.method for run in second.runs} == {"sKGRL"}
+    assert [len(runs) for runs in second.methods("Bead").values()] == [2]
 
 
 def test_report_evaluates_a_run_and_baselines_once(studied):
@@ -178,13 +178,13 @@ def test_command_of_a_run_reproduces_its_configuration(bead_config):
     words = shlex.split(command(config, "runs/bead"))
     assert words[:3] == ["guiderail", "train", "Bead"]
     assert words[-3:] == ["--no-step-log", "--out", "runs/bead"]
-    given = dict(word.split("=") for before, word in itertools.pairwise(words) if before == "--set")
+    arguments = dict(word.split("=") for before, word in itertools.pairwise(words) if before == "--set")
     option = dict(zip(words[3:-3:2], words[4:-3:2], strict=True))
-    again = configure(
+    second = configure(
         "Bead", {"guidance": option["--guidance"]}, algorithm=option["--algorithm"], preset=option["--preset"],
-        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=given, step_log=False,
+        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=arguments, step_log=False,
     )  # fmt: skip
-    assert again == config
+    assert second == config
 
 
 @pytest.mark.parametrize("name", ["report.pdf", "report"])

@@ -261,8 +261,8 @@ def _time(
     file: Path, columns: Sequence[_Column], given: str | None, assumptions: list[str]
 ) -> tuple[_Column, np.ndarray]:
     """Return the column of time, and the time since its first sample (N,) [s]."""
-    found = [one for one in columns if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", one.plain))]
-    clock = _only(file, found, "time")
+    matches = [one for one in columns if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", one.plain))]
+    clock = _only(file, matches, "time")
     if clock is None:
         raise InputError(f"{file} has no column t, time or timestamp: add one")
     (unit,) = _units(file, [clock], _TIME_UNITS, given, "--time-unit")
@@ -295,31 +295,31 @@ def _rotations(
 ) -> tuple[list[_Column], Rotation | None]:
     """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation."""
     for names in _QUATERNION:
-        found = [one for name in names if (one := _column(file, columns, name)) is not None]
-        if len(found) == len(names):
-            return found, rotations_of(np.column_stack([one.values for one in found]), str(file))
+        matches = [one for name in names if (one := _column(file, columns, name)) is not None]
+        if len(matches) == len(names):
+            return matches, rotations_of(np.column_stack([one.values for one in matches]), str(file))
     for names in _UNNAMED:
         same = [_only(file, [one for one in columns if one.plain == name], name) for name in names]
-        found = [one for one in same if one is not None]
-        if len(found) == len(names):
+        matches = [one for one in same if one is not None]
+        if len(matches) == len(names):
             if quaternion is None:
                 raise InputError(
                     f"{file} has the quaternion {', '.join(names)} and does not state which is its scalar: give "
                     "--quaternion wxyz or xyzw"
                 )
-            values = np.column_stack([one.values for one in found])
-            return found, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
+            values = np.column_stack([one.values for one in matches])
+            return matches, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
     for euler in _EULER:
-        found = [one for name in euler if (one := _column(file, columns, name)) is not None]
-        if len(found) == len(euler):
-            units = _units(file, found, _ANGLE_UNITS, angles, "--angles")
-            for column, one_unit in zip(found, units, strict=True):
+        matches = [one for name in euler if (one := _column(file, columns, name)) is not None]
+        if len(matches) == len(euler):
+            units = _units(file, matches, _ANGLE_UNITS, angles, "--angles")
+            for column, one_unit in zip(matches, units, strict=True):
                 if one_unit is None:
                     raise InputError(
                         f"{file} does not state whether {column.name} is in degrees: give --angles deg or rad"
                     )
             assumptions.append("roll, pitch and yaw are about fixed axes, Rz(yaw) Ry(pitch) Rx(roll)")
             scales = [_ANGLE_UNITS[str(one_unit)] for one_unit in units]
-            rotation_angles = np.column_stack([column.values for column in found]) * scales
-            return found, Rotation.from_euler("xyz", rotation_angles)
+            rotation_angles = np.column_stack([column.values for column in matches]) * scales
+            return matches, Rotation.from_euler("xyz", rotation_angles)
     return [], None

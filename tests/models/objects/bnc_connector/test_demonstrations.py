@@ -49,8 +49,8 @@ def test_deviations_are_wide_at_the_rim_and_small_when_seated():
 
 
 def test_motions_differ_and_repeat_with_a_seed():
-    session, again, other = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(session, again)
+    session, second, other = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(session, second)
     assert np.abs(session[0] - session[1])[:, :2].max() > 0.5 * MM
     assert np.abs(session[0] - other[0])[:, :2].max() > 0.5 * MM
 

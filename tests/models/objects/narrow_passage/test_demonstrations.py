@@ -16,10 +16,10 @@ def paths():
 
 
 def test_generate_reproduces_the_shipped_file(paths):
-    again = narrow_passage.generate()
+    second = narrow_passage.generate()
     # Another BLAS may round the Cholesky factor differently.
-    np.testing.assert_allclose(np.stack(again.outputs), paths, atol=1e-8)
-    np.testing.assert_array_equal(again.times[0], narrow_passage.load().times[0])
+    np.testing.assert_allclose(np.stack(second.outputs), paths, atol=1e-8)
+    np.testing.assert_array_equal(second.times[0], narrow_passage.load().times[0])
 
 
 def test_load_returns_nine_times_400_points(paths):

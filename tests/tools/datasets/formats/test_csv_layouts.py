@@ -30,14 +30,14 @@ def file(tmp_path):
     ],
 )
 def test_positions_have_the_unit_of_their_column(header, given, scales, file):
-    found = read_csv_files(write(file, header, 9, 8, 7), unit=given)
-    np.testing.assert_allclose(found.outputs[0][0], np.array([9, 8, 7]) * scales)
+    result = read_csv_files(write(file, header, 9, 8, 7), unit=given)
+    np.testing.assert_allclose(result.outputs[0][0], np.array([9, 8, 7]) * scales)
 
 
 def test_angles_have_the_unit_of_their_column(file):
     header = "t,x_m,y_m,z_m,roll_rad,pitch [deg],yaw (degrees)"
-    found = read_csv_files(write(file, header, 0, 0, 0, 0.1, 10, 20))
-    np.testing.assert_allclose(found.outputs[0][0, 3:], [np.deg2rad(20), np.deg2rad(10), 0.1])
+    result = read_csv_files(write(file, header, 0, 0, 0, 0.1, 10, 20))
+    np.testing.assert_allclose(result.outputs[0][0, 3:], [np.deg2rad(20), np.deg2rad(10), 0.1])
 
 
 @pytest.mark.parametrize(
@@ -149,9 +149,9 @@ def test_unknown_unit_in_a_name_is_refused(header, given, refused, file):
 )
 def test_spellings_of_units_are_recognized(unit, scale, file):
     write(file, f"t [{unit}],x [meters],y (M),Z [m] (raw)", 1, 2, 3)
-    found = read_csv_files(file)
-    np.testing.assert_allclose(found.times[0], CLOCK * scale)
-    np.testing.assert_array_equal(found.outputs[0][0], [1, 2, 3])
+    result = read_csv_files(file)
+    np.testing.assert_allclose(result.times[0], CLOCK * scale)
+    np.testing.assert_array_equal(result.outputs[0][0], [1, 2, 3])
 
 
 @pytest.mark.parametrize("option", ["unit", "time_unit", "quaternion", "angles"])
@@ -169,24 +169,24 @@ def test_time_that_does_not_increase_is_refused(header, file):
 
 
 def test_duplicated_samples_do_not_change_the_time_unit(file):
-    found = read_csv_files(write(file, "t,x_m,y_m,z_m", 1, 2, 3, clock=np.repeat(CLOCK, 2)))
-    assert "t is in seconds, 100 samples in each" in found.assumptions
+    result = read_csv_files(write(file, "t,x_m,y_m,z_m", 1, 2, 3, clock=np.repeat(CLOCK, 2)))
+    assert "t is in seconds, 100 samples in each" in result.assumptions
 
 
 @pytest.mark.parametrize("prefix", ["v.", "vel_", "tcp_velocity_", "twist.linear.", "wrench.force."])
 def test_velocity_and_force_columns_are_not_positions(prefix, file):
     others = ",".join(prefix + axis for axis in "xyz")
-    found = read_csv_files(write(file, f"t,pos_x_mm,pos_y_mm,pos_z_mm,{others}", 1, 2, 3, 4, 5, 6))
-    np.testing.assert_allclose(found.outputs[0][0], [1e-3, 2e-3, 3e-3])
+    result = read_csv_files(write(file, f"t,pos_x_mm,pos_y_mm,pos_z_mm,{others}", 1, 2, 3, 4, 5, 6))
+    np.testing.assert_allclose(result.outputs[0][0], [1e-3, 2e-3, 3e-3])
     with pytest.raises(InputError, match="no columns x, y and z"):
         read_csv_files(write(file, f"t,{others}", 4, 5, 6), unit="m")
 
 
 def test_unused_columns_are_listed(file):
-    found = read_csv_files(write(file, "t [s],x_m,y_m,z_m,rx,ry,rz", *range(6)))
-    assert found.assumptions == ["there is no orientation", "rx, ry and rz are left out"]
+    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,rx,ry,rz", *range(6)))
+    assert result.assumptions == ["there is no orientation", "rx, ry and rz are left out"]
     many = ",".join(f"f{n}" for n in range(20))
-    found = read_csv_files(write(file, f"t [s],x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,{many}", *range(26)))
-    assert found.assumptions[-1] == "f0, f1, f2, f3, f4, f5, f6, f7 and 12 more are left out"
-    found = read_csv_files(write(file, "t [s],x_m,y_m,z_m,force", *range(4)))
-    assert found.assumptions[-1] == "force is left out"
+    result = read_csv_files(write(file, f"t [s],x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,{many}", *range(26)))
+    assert result.assumptions[-1] == "f0, f1, f2, f3, f4, f5, f6, f7 and 12 more are left out"
+    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,force", *range(4)))
+    assert result.assumptions[-1] == "force is left out"

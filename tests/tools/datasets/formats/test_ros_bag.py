@@ -49,17 +49,17 @@ def array(types, values):
 
 def test_joint_order_may_differ_between_messages(tmp_path):
     orders = [("abc", (1, 2, 3)), ("cab", (3, 1, 2)), ("bca", (2, 3, 1)), ("abc", (1, 2, 3))]
-    found = read_bags(write(tmp_path / "bag", JOINTS, joints, orders), None, None)
-    assert found.names == ("a [rad]", "b [rad]", "c [rad]")
-    np.testing.assert_array_equal(found.outputs[0], [[1, 2, 3]] * 4)
+    result = read_bags(write(tmp_path / "bag", JOINTS, joints, orders), None, None)
+    assert result.names == ("a [rad]", "b [rad]", "c [rad]")
+    np.testing.assert_array_equal(result.outputs[0], [[1, 2, 3]] * 4)
 
 
 def test_joint_order_may_differ_between_bags(tmp_path):
     for name, order in (("0", ("abc", (1, 2, 3))), ("1", ("cab", (3, 1, 2)))):
         write(tmp_path / name, JOINTS, joints, [order] * 2)
-    found = read_bags(tmp_path, None, None)
-    assert found.names == ("a [rad]", "b [rad]", "c [rad]")
-    np.testing.assert_array_equal(found.outputs, [[[1, 2, 3]] * 2] * 2)
+    result = read_bags(tmp_path, None, None)
+    assert result.names == ("a [rad]", "b [rad]", "c [rad]")
+    np.testing.assert_array_equal(result.outputs, [[[1, 2, 3]] * 2] * 2)
 
 
 @pytest.mark.parametrize(
@@ -93,9 +93,9 @@ def test_bag_export_shifts_negative_time(tmp_path):
     t = 0.1 * np.arange(5)
     notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
     assert "first sample, where it was -0.2 to 0.3" in notes[-1]
-    back = read_bags(tmp_path / "bags", None, None)
-    np.testing.assert_allclose(back.times, [t, t], atol=1e-9)
-    np.testing.assert_array_equal(back.outputs, [t[:, None]] * 2)
+    loaded = read_bags(tmp_path / "bags", None, None)
+    np.testing.assert_allclose(loaded.times, [t, t], atol=1e-9)
+    np.testing.assert_array_equal(loaded.outputs, [t[:, None]] * 2)
 
 
 @pytest.mark.parametrize(

@@ -134,10 +134,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--bead", action="store_true", help="the tests' smallest environment")
-    given = parser.parse_args()
-    found = compare(given.out.absolute(), given.bead)
-    print(json.dumps(found, indent=2))
-    sys.exit(bool(found["exit_code"] or found["differences"] or len(found["begun_again"]) < 2))
+    args = parser.parse_args()
+    result = compare(args.out.absolute(), args.bead)
+    print(json.dumps(result, indent=2))
+    sys.exit(bool(result["exit_code"] or result["differences"] or len(result["begun_again"]) < 2))
 
 
 if __name__ == "__main__":

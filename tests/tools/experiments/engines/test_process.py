@@ -50,16 +50,16 @@ def test_single_process_is_this_one(monkeypatch):
 
 
 def test_job_of_a_killed_worker_is_run_by_another(tmp_path):
-    found = run(work, {0: tmp_path / "once", 1: 5})
-    assert found[0].rows[0] == {"found": str(tmp_path / "once")}
-    assert found[1].rows[0]["square"] == 25
+    result = run(work, {0: tmp_path / "once", 1: 5})
+    assert result[0].rows[0] == {"found": str(tmp_path / "once")}
+    assert result[1].rows[0]["square"] == 25
 
 
 def test_job_that_kills_its_workers_is_given_up():
-    found = run(die, {n: n for n in range(4)})
-    assert [found[n].rows[0]["square"] for n in (0, 2)] == [0, 4]
+    result = run(die, {n: n for n in range(4)})
+    assert [result[n].rows[0]["square"] for n in (0, 2)] == [0, 4]
     for n in (1, 3):
-        assert found[n].failure == "3 workers were lost with it, one after the other, the last by exit code 3"
+        assert result[n].failure == "3 workers were lost with it, one after the other, the last by exit code 3"
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
