@@ -105,6 +105,13 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("KGRL", "sKGRL, adaptive history"),
         ),
         Section(
+            "Connector, hard, from one demonstration",
+            [
+                Row("KGRL", "connector_hard_one_demonstration", "kgrl"),
+                *_baselines("connector_hard_one_demonstration", ("demonstration",), names=BASELINES[:1]),
+            ],
+        ),
+        Section(
             "Connector, hard, trained in Drake, evaluated in MuJoCo",
             [
                 Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
