@@ -91,7 +91,8 @@ class ReferenceTrajectory:
             num_steps: Number of steps N; that of the longest demonstration by default.
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
                 such as the resolution of a sensor or a controller if demonstrations differ by less.
-            prior_std: Standard deviation of a single demonstration, as in `interpolate_prior`; required for one
+            prior_std: Standard deviation, (O,), scalar, or rows of a phase and these, (K · (1 + O),), of a single
+                demonstration, as in `interpolate_prior`; required for one
                 demonstration, refused for several.
 
         Raises:
