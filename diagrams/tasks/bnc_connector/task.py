@@ -52,11 +52,15 @@ TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
 
 
-@cache
 def reference_trajectory(
     demonstrations: str, count: int | None = None, prior_std: tuple[float, ...] | None = None
 ) -> ReferenceTrajectory:
     """Return the Gaussian mixture regression of demonstrations, shipped or in a file, fitted once per process."""
+    return _fit_reference(demonstrations, count, prior_std)
+
+
+@cache  # its arguments are positional, so that omitted and default arguments share a fit
+def _fit_reference(demonstrations: str, count: int | None, prior_std: tuple[float, ...] | None) -> ReferenceTrajectory:
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), prior_std, count)
     loaded = DEMONSTRATIONS[demonstrations]().first(count)
