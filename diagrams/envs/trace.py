@@ -90,15 +90,17 @@ class EpisodeTrace:
         Raises:
             InputError: If a signal of the trace is missing.
         """
-        if signals is not None and (missing := [name for name in self._signals if name not in signals]):
-            raise InputError(f"a control step lacks the signal {missing[0]!r} of its trace, and has {sorted(signals)}")
         n = self._length
         self._commanded[n] = commanded
         self._measured[n] = measured
         self._force[n] = force
         self._reward[n] = reward
-        for name, values in self._signals.items():
-            values[n] = signals[name] if signals is not None else np.nan
+        try:
+            for name, values in self._signals.items():
+                values[n] = signals[name] if signals is not None else np.nan
+        except KeyError as error:
+            has = sorted(signals or {})
+            raise InputError(f"a control step lacks the signal {error} of its trace, and has {has}") from None
         self._length = n + 1
 
     def statistics(self) -> dict[str, float]:

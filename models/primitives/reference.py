@@ -92,8 +92,7 @@ class ReferenceTrajectory:
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
                 such as the resolution of a sensor or a controller if demonstrations differ by less.
             prior_std: Standard deviation, (O,), scalar, or rows of a phase and these, (K · (1 + O),), of a single
-                demonstration, as in `interpolate_prior`; required for one
-                demonstration, refused for several.
+                demonstration, as in `interpolate_prior`; required for one demonstration, refused for several.
 
         Raises:
             InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is

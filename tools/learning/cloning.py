@@ -98,7 +98,7 @@ class BcLearner(Learner):
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        self._loss = float(loss)
+        self._loss = float(loss.detach())
 
     def metrics(self) -> Mapping[str, float]:
         """Return the loss of the last batch."""
