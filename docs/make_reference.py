@@ -429,6 +429,10 @@ STATE_WORDS = {
     "transition_distance": "distance to the end of the state, in meters or degrees; `…` below is the unit",
     "starts_at_…": "distance at which the state's progress is 0",
     "ends_at_…": "distance at which the state ends; that of the first transition by default",
+    "max_force_n": "largest force of the impedance [N]; default: the task's, which no state can raise",
+    "max_torque_nm": "largest torque of the impedance [Nm]; default: the task's",
+    "max_speed_m_per_s": "largest commanded speed [m/s]; default: the template's, which no state can raise",
+    "max_speed_rad_per_s": "largest commanded angular speed [rad/s]; default: the template's",
     "weight_per_…": "weight of a meter or a degree in the reward's progress; 1 by default",
     "transitions": "list of `to`, `below_…` and optionally `hysteresis_…`: the state changes to `to` when its "
     "distance falls below `below_…`, and back when that distance exceeds `below_…` + `hysteresis_…`; without "

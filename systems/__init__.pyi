@@ -31,6 +31,7 @@ from .meshcat_device import MeshcatDevice as MeshcatDevice
 from .mujoco_gantry import DivergedError as DivergedError
 from .mujoco_gantry import MovedBodies as MovedBodies
 from .mujoco_gantry import MujocoGantry as MujocoGantry
+from .phase_wrench_limit import PhaseWrenchLimit as PhaseWrenchLimit
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
 from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter

@@ -21,6 +21,7 @@ from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
@@ -208,10 +209,28 @@ class Loop:
         self.signals.add({"action": guidance.GetOutputPort("held_action")})
         if not station.HasOutputPort("exact_wrench"):
             self.signals.add({"exact_wrench": station.get_wrench_output_port()})
-        self.signals.add(task.signals(builder, station))
+        signals = task.signals(builder, station)
+        self.signals.add(signals)
+        self._connect_max_wrench(task, signals.get("max_wrench"))
         self.space, self.observation = self._add_observation(task)
         if guidance.HasInputPort("reference_window"):
             self._add_reference(task)
+
+    def _connect_max_wrench(self, task: Task, bound: OutputPort | None) -> None:
+        """Connect the station's `max_wrench` to the task's `bound`, lowered to the limits of the template's state."""
+        limit = None
+        if self.guidance.HasOutputPort("state") and "template" in task.provides():
+            impedance = task.impedance() if self.station.HasInputPort("max_wrench") else None
+            limit = make_phase_wrench_limit(task.template().template, impedance, self.station.control_period)
+        if limit is not None:
+            self.builder.AddNamedSystem("phase_wrench_limit", limit)
+            self.builder.Connect(self.guidance.GetOutputPort("state"), limit.get_state_input_port())
+            if bound is not None:
+                self.builder.Connect(bound, limit.get_max_wrench_input_port())
+            bound = limit.get_phase_max_wrench_output_port()
+            self.signals.add({"max_wrench": bound})
+        if bound is not None:
+            self.builder.Connect(bound, self.station.GetInputPort("max_wrench"))
 
     def _add_reference(self, task: Task) -> None:
         """Add the system that predicts the reference from the observation.

@@ -10,18 +10,24 @@ from guiderail.diagrams.stations.station import (
     Impedance,
     command_timeout,
     export_station_ports,
+    max_wrench,
     to_wrench_order,
 )
+from guiderail.models.common.errors import InputError
+from guiderail.models.templates import SharedControlTemplate
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.energy_tank import EnergyTank
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.systems.reference_governor import ReferenceGovernor
 
 TANK_CAPACITY = 5.0  # capacity of the energy tank [J], a multiple of the work of an insertion
 # Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. The damping for them is a lower bound of the
 # dissipation that refills a tank.
 LEAST_MASS, LEAST_INERTIA = 1.5, 2e-3
+WRENCH_RATE = np.array([100.0] * 3 + [10.0] * 3 + [100.0, 10.0])
+"""Largest rate at which the limits of force and torque change from state to state of a template, (8,) [N/s, Nm/s]."""
 
 
 def add_controller(
@@ -67,6 +73,35 @@ def add_energy_tank(
     builder.AddNamedSystem("tank", tank)
     builder.Connect(pose, tank.get_pose_input_port())
     return tank
+
+
+def make_phase_wrench_limit(
+    template: SharedControlTemplate, impedance: Impedance | None, period: float
+) -> PhaseWrenchLimit | None:
+    """Return the system that limits the wrench by a template's state, or None if no state has a limit.
+
+    Args:
+        template: Shared control template.
+        impedance: Impedance of the station; None if its wrench cannot be limited at run time.
+        period: Control period [s].
+
+    Raises:
+        InputError: If a state has a limit, and the impedance is not bounded.
+    """
+    limited = [state.name for state in template.states if state.limits_wrench]
+    if not limited:
+        return None
+    if impedance is None or impedance.bound is None:
+        raise InputError(
+            f"state {limited[0]!r} of template {template.name!r} limits force or torque, and the impedance of this "
+            "station has no bound: choose another station or bounded_force=true, or remove the limit"
+        )
+    # A state without limits has the station's bound, from which the limits of other states are approached.
+    bounds = [impedance.bound.numbers] * len(template.states)
+    for number, state in enumerate(template.states):
+        given = [np.inf if limit is None else limit for limit in (state.max_force_n, state.max_torque_nm)]
+        bounds[number] = np.minimum(bounds[number], max_wrench(*given)) if state.limits_wrench else bounds[number]
+    return PhaseWrenchLimit(np.array(bounds), WRENCH_RATE, period=period)
 
 
 def add_impedance_control(

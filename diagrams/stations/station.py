@@ -136,6 +136,20 @@ class Impedance:
         return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS))
 
 
+def max_wrench(force: float, torque: float = np.inf) -> np.ndarray:
+    """Return the value (8,) of a station's `max_wrench` that keeps the impedance below a force [N] and a torque [Nm].
+
+    A torque is limited to 1/√3 of `torque` about each axis, so that the norm never exceeds `torque`.
+    """
+    bound = Impedance().with_max_force(force).bound
+    assert bound is not None
+    numbers = bound.numbers
+    if torque < np.inf:
+        numbers[3:6] = np.minimum(numbers[3:6], torque / np.sqrt(3.0))
+        numbers[7] = np.linalg.norm(numbers[3:6])
+    return numbers
+
+
 def whole_multiple(period: float, unit: float, name: str = "control_period") -> float:
     """Return a period [s] as an exact multiple of `unit` [s]; `name` is its name in error messages.
 

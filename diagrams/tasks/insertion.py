@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.envs.options import Number, Numbers, Options, ResetOptions
-from guiderail.diagrams.stations.station import Impedance, Station
+from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task
 from guiderail.models.common.transforms import MM, POSE_SIZE
@@ -69,13 +69,6 @@ class ForceOptions(Options):
         return self.force_limit if self.force_limit_range is None else self.force_limit_range[1]
 
 
-def max_wrench(force_limit: float) -> np.ndarray:
-    """Return the value (8,) of a station's `max_wrench` that keeps the impedance's force below a limit [N]."""
-    bound = Impedance().with_max_force(force_limit).bound
-    assert bound is not None
-    return bound.numbers
-
-
 HIDDEN_OFFSET_SCALE = (2.0 * MM, 2.0 * MM, 0.1)
 EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
 """Scales of a privileged critic's observation: x, y and turn of the fixture, force and torque."""
@@ -122,7 +115,7 @@ class InsertionTask(Task):
         """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
         On hardware the pose is estimated from the robot's own pose, if the task defines `observable_success`. A sampled
-        force limit is the signal `force_limit`, and it bounds the station's force.
+        force limit is the signal `force_limit`, and the signal `max_wrench` bounds the station's force by it.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -133,11 +126,11 @@ class InsertionTask(Task):
         # The smallest force limit applies until a reset samples another one.
         limit = EpisodeConstant(builder, "force_limit", 1, np.array(sampled[:1]))
         self.episode_constants["force_limit"] = limit
-        if station.HasInputPort("max_wrench"):
-            bound = EpisodeConstant(builder, "max_wrench", MAX_WRENCH_SIZE, max_wrench(sampled[0]))
-            builder.Connect(bound.port, station.GetInputPort("max_wrench"))
-            self.episode_constants["max_wrench"] = bound
-        return {"force_limit": limit.port}
+        if not station.HasInputPort("max_wrench"):
+            return {"force_limit": limit.port}
+        bound = EpisodeConstant(builder, "max_wrench", MAX_WRENCH_SIZE, max_wrench(sampled[0]))
+        self.episode_constants["max_wrench"] = bound
+        return {"force_limit": limit.port, "max_wrench": bound.port}
 
     @property
     def _force_limit_range(self) -> tuple[float, ...] | None:

@@ -165,6 +165,8 @@ class Task(ABC):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Add systems and return their output ports by name, as signals of this task.
 
+        The signal `max_wrench` (8,), if there is one, is connected to the station's input of this name.
+
         Args:
             builder: Builder of the root diagram.
             station: Station, already in the builder.

@@ -70,6 +70,21 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
     return replace(bound, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))
 
 
+def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:
+    """Move a bound straight towards another one, so that no number changes by more than `max_change`.
+
+    On the straight line the norms stay at least those of the limits per axis, if that holds at both ends.
+
+    Args:
+        bound: Bound as a signal (8,).
+        target: Bound to approach (8,).
+        max_change: Largest changes (8,), positive.
+    """
+    change = target - bound
+    excess = float(np.max(np.abs(change) / max_change))
+    return target.copy() if excess <= 1.0 else bound + change / excess
+
+
 def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: float) -> np.ndarray:
     """Clip a wrench (6,) to limits per axis (6,), then scale force and torque to the limits of their norms."""
     clipped = np.minimum(np.maximum(wrench, -axes), axes)

@@ -202,12 +202,19 @@ def _field_type(hint: Any) -> Any:
     return FIELD_TYPES.get(hint, hint)
 
 
+_UNLIMITED: Any = Field(None)
+
+
 class _State(_Entry):
     """A state without the fields that have the unit of its transition distance in their names."""
 
     transition_distance: AnyDistance
     input_mapping: tuple[AnyMapping, ...] = Field(max_length=MAX_PARTS)
     active_constraints: tuple[AnyConstraint, ...] = Field(max_length=MAX_PARTS)
+    max_force_n: Positive = _UNLIMITED
+    max_torque_nm: Positive = _UNLIMITED
+    max_speed_m_per_s: Positive = _UNLIMITED
+    max_speed_rad_per_s: Positive = _UNLIMITED
 
 
 @lru_cache
@@ -303,7 +310,11 @@ def _read(data: Any, where: str, given: Mapping[str, float]) -> SharedControlTem
 
 
 def _check_references(template: SharedControlTemplate, state: TemplateState) -> None:
-    """Raise an InputError if a state names a state, frame or input that the template does not have."""
+    """Raise an InputError if a state names what the template does not have, or has a higher speed than the template."""
+    for name in ("max_speed_m_per_s", "max_speed_rad_per_s"):
+        speed, largest = getattr(state, name), getattr(template, name)
+        if speed is not None and speed > largest:
+            raise InputError(f"states.{state.name}.{name} must be at most the template's, {largest:g}, not {speed:g}")
     for transition in state.transitions:
         names = [other.name for other in template.states]
         _check_known(f"states.{state.name}: there is no state", transition.to, names)

@@ -45,6 +45,15 @@ class TemplateState:
     ends_at: float  # distance at which the phase is complete [m] or [rad]
     weight: float = 1.0  # progress per unit of distance [1/m] or [1/rad]
     transitions: tuple[Transition, ...] = ()
+    max_force_n: float | None = None  # largest force of the impedance [N]; None: that of the task
+    max_torque_nm: float | None = None  # largest torque of the impedance [Nm]; None: that of the task
+    max_speed_m_per_s: float | None = None  # largest speed of the command, at most that of the template
+    max_speed_rad_per_s: float | None = None
+
+    @property
+    def limits_wrench(self) -> bool:
+        """True if the state has a limit of force or torque of its own."""
+        return self.max_force_n is not None or self.max_torque_nm is not None
 
     @property
     def frame_names(self) -> set[str]:
@@ -85,7 +94,7 @@ class SharedControlTemplate:
         frames: Names of the object frames.
         states: States in the order of the file, numbered from 0; at least one.
         initial_state: Number of the initial state.
-        max_speed_m_per_s, max_speed_rad_per_s: Largest speeds of the command.
+        max_speed_m_per_s, max_speed_rad_per_s: Largest speeds of the command; a state may have lower ones.
         parameters: Values of the parameters in the expressions of the file, by name.
     """
 
@@ -151,13 +160,13 @@ class SharedControlTemplate:
         moved) is led inside at the largest speed.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
-        fraction = 1.0 / max(1.0, self._load(X_WLast, X_WRequest, period_s))
+        fraction = 1.0 / max(1.0, self._load(state, X_WLast, X_WRequest, period_s))
         constraints = self._constraints_at(state, X_WLast, frames)
         for _ in range(BACKTRACKS):
             X_WE = between(X_WLast, X_WRequest, fraction)
             for constraint in constraints:
                 X_WE = constraint.project(X_WE, frames)
-            load = self._load(X_WLast, X_WE, period_s)
+            load = self._load(state, X_WLast, X_WE, period_s)
             if load <= 1.0 and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
                 return Command(X_WE, fraction)
             fraction *= 0.98 / load if load > 1.0 else 0.5
@@ -166,7 +175,7 @@ class SharedControlTemplate:
         X_WE = X_WLast
         for constraint in constraints:
             X_WE = constraint.project(X_WE, frames)
-        load = self._load(X_WLast, X_WE, period_s)
+        load = self._load(state, X_WLast, X_WE, period_s)
         return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)
 
     def _constraints_at(
@@ -184,17 +193,32 @@ class SharedControlTemplate:
     def can_enter(self, state: int, X_WLast: RigidTransform, frames: Frames, period_s: float) -> bool:
         """Return True if one period is enough to move from the last command into a state's active constraints."""
         X_WE = self.project(state, X_WLast, frames)
-        return self._load(X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
+        return self._load(state, X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
 
     def _is_inside(self, state: int, X_WE: RigidTransform, frames: Frames) -> bool:
         return self.violation(state, X_WE, frames) <= INSIDE
 
-    def _load(self, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
-        """Return the speed between two poses relative to its limit, the larger of translation and rotation."""
+    @cached_property
+    def _max_speeds(self) -> tuple[tuple[float, float], ...]:
+        """Largest speed [m/s] and angular speed [rad/s] of the command in each state."""
+        return tuple(
+            (
+                min(self.max_speed_m_per_s, math.inf if state.max_speed_m_per_s is None else state.max_speed_m_per_s),
+                min(
+                    self.max_speed_rad_per_s,
+                    math.inf if state.max_speed_rad_per_s is None else state.max_speed_rad_per_s,
+                ),
+            )
+            for state in self.states
+        )
+
+    def _load(self, state: int, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
+        """Return the speed between two poses relative to a state's limit, the larger of translation and rotation."""
         difference = X_WE.translation() - X_WLast.translation()
+        speed, angular_speed = self._max_speeds[state]
         return max(
-            math.sqrt(difference @ difference) / (self.max_speed_m_per_s * period_s),
-            angle_between(X_WLast.rotation(), X_WE.rotation()) / (self.max_speed_rad_per_s * period_s),
+            math.sqrt(difference @ difference) / (speed * period_s),
+            angle_between(X_WLast.rotation(), X_WE.rotation()) / (angular_speed * period_s),
         )
 
     @cached_property

@@ -85,6 +85,7 @@ def built():
         systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
         systems.PoseRateLimiter(period=PERIOD),
         systems.EnergyTank(np.ones(6), np.ones(6), WrenchBound(np.ones(6), 1.0, 1.0), capacity=1.0, period=PERIOD),
+        systems.PhaseWrenchLimit(np.ones((2, 8)), np.ones(8), period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
         systems.ExternalTorqueSensor(plant, body, np.ones(7), np.ones(7), period=PERIOD),

@@ -1,5 +1,7 @@
 """Commands for arbitrary requests: inside the constraints, within the speeds, and near to the request."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -247,3 +249,24 @@ def test_command_leaves_a_shape_that_moved_over_it(constraint):
     assert violations[0] > 0.005
     assert violations[-1] <= 1e-9
     assert (np.diff(violations) <= 1e-9).all()
+
+
+@given(SEEDS)
+def test_command_keeps_the_speeds_of_its_state(seed):
+    rng = np.random.default_rng(seed)
+    slow = state("slow", max_speed_m_per_s=0.05, max_speed_rad_per_s=0.3)
+    s = template(state("fast"), slow, state("none", max_speed_m_per_s=9.0))
+    last, request = pose(rng, 0.3), pose(rng, 1.0)
+    loads = [load(s, last, s.command(number, last, request, F, PERIOD).X_WE) for number in range(3)]
+    slower = replace(s, max_speed_m_per_s=0.05, max_speed_rad_per_s=0.3)
+    command = s.command(1, last, request, F, PERIOD).X_WE
+    assert 0.97 <= load(slower, last, command) <= 1 + 1e-9
+    assert loads[0] == loads[2]  # a state cannot raise the template's speeds
+    assert 0.97 <= loads[0] <= 1 + 1e-9
+
+
+def test_state_is_entered_at_its_own_speed():
+    plane = (ac.KeepAbove(0.003, "f"),)  # reached in one period at 0.2 m/s, and not at 0.1 m/s
+    for speed, expected in ((0.2, True), (0.1, False)):
+        s = template(state("fast"), state("next", plane, max_speed_m_per_s=speed))
+        assert s.can_enter(1, RigidTransform(), F, PERIOD) is expected

@@ -11,6 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
+from guiderail.models.templates.drawing import state_lines
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register
 
 TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
@@ -37,6 +38,19 @@ def test_parse_evaluates_expressions_of_parameters():
     larger = parse_template(TEMPLATE, rim_m=0.06).states[0].active_constraints[0]
     assert isinstance(larger, Cylinder)
     assert (larger.min_radius_m, larger.max_radius_m) == pytest.approx((0.07, 0.36))
+
+
+def test_parse_returns_limits_of_a_state():
+    assert [state.limits_wrench for state in parse_template(TEMPLATE).states] == [False, False]
+    limits = {"max_force_n": "200 * rim_m", "max_torque_nm": 0.5, "max_speed_m_per_s": 0.2, "max_speed_rad_per_s": 1.0}
+    far, near = parse_template(changed(lambda data: data["states"]["far"].update(limits))).states
+    assert (far.max_force_n, far.max_torque_nm) == (10.0, 0.5)
+    assert (far.max_speed_m_per_s, far.max_speed_rad_per_s) == (0.2, 1.0)
+    assert far.limits_wrench
+    assert (near.max_force_n, near.max_speed_m_per_s) == (None, None)
+    lines = state_lines(far)
+    assert lines[-5:-1] == ["|f| ≤ 10 N", "|τ| ≤ 0.5 Nm", "|v| ≤ 0.2 m/s", "|ω| ≤ 1 rad/s"]
+    assert not any("≤" in line for line in state_lines(near))
 
 
 def test_register_adds_a_kind_with_one_decorator():
@@ -124,6 +138,12 @@ TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
         (set_in(*FAR, "transitions", 0, "below_deg", value=5), "below_"),
         (set_in(*FAR, "transitions", 0, "hysteresis_m", value=-0.1), "hysteresis_m should be greater than 0"),
         (set_in(*FAR, "starts_at_m", value=0.05), "distances decrease"),
+        (set_in(*FAR, "max_force_n", value=0), "max_force_n should be greater than 0"),
+        (set_in(*FAR, "max_torque_nm", value=-1), "max_torque_nm should be greater than 0"),
+        (set_in(*FAR, "max_force_n", value=None), "max_force_n: must be a number"),
+        (set_in(*FAR, "max_force", value=5), "did you mean max_force_n"),
+        (set_in(*FAR, "max_speed_m_per_s", value=0.21), "must be at most the template's, 0.2, not 0.21"),
+        (set_in(*FAR, "max_speed_rad_per_s", value="30 * rim_m"), "must be at most the template's, 1, not 1.5"),
         (remove("states", "near", "ends_at_deg"), "ends_at_deg is missing"),
         (set_in("states", "near", "starts_at_m", value=1.0), "did you mean starts_at_deg"),
         (set_in("states", value={}), "at least 1"),

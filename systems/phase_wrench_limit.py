@@ -1,0 +1,94 @@
+"""Limits of force and torque that change with the state of a shared control template."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, approach_bound
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+
+
+class PhaseWrenchLimit(LeafSystem):
+    """Select the wrench limit of the current state, and change it at a bounded rate from state to state.
+
+        b_k = b_{k-1} + s (B_q - b_{k-1}),  with the largest s <= 1 such that |b_k - b_{k-1}| <= r h
+
+    B_q is the limit of state q, r the largest rate and h the period. The rate is bounded in both directions: a limit
+    that falls at once would make the force jump. An episode begins with the limit of its first state. A number that
+    is not a state has the lowest limits of all states.
+
+    .. pydrake_system::
+
+        name: PhaseWrenchLimit
+        input_ports:
+        - state
+        - max_wrench (optional)
+        output_ports:
+        - phase_max_wrench
+
+    ``state`` is (1,), the number of the state. ``max_wrench`` and ``phase_max_wrench`` are (8,), the limits of
+    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. The output is the minimum of b
+    and ``max_wrench``, the task's own limit, which applies at once.
+
+    Args:
+        limits: Limits of each state (n, 8) [N, Nm], finite and not negative.
+        max_rate: Largest rates (8,) [N/s, Nm/s], positive.
+        period: Sampling period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, limits: np.ndarray, max_rate: np.ndarray, *, period: float):
+        super().__init__()
+        check_period(period)
+        self._limits, rate = np.array(limits, dtype=float), np.array(max_rate, dtype=float)
+        if self._limits.ndim != 2 or not len(self._limits) or self._limits.shape[1] != MAX_WRENCH_SIZE:
+            raise InputError(f"the wrench limits of states are rows of {MAX_WRENCH_SIZE}, not {self._limits.shape}")
+        if not ((self._limits >= 0.0) & (self._limits < np.inf)).all():
+            raise InputError("the wrench limits of states must be finite and not negative")
+        if rate.shape != (MAX_WRENCH_SIZE,) or not ((rate > 0.0) & (rate < np.inf)).all():
+            raise InputError(f"the rates of wrench limits are {MAX_WRENCH_SIZE} positive numbers, not {max_rate}")
+        self._max_change = rate * period
+        self._state_port = self.DeclareVectorInputPort("state", 1)
+        self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
+        # NaN until the first update: the state at the port is initialized at the same instant as this system.
+        self._bound = self.DeclareDiscreteState(np.full(MAX_WRENCH_SIZE, np.nan))
+        self._phase_max_wrench_port = self.DeclareVectorOutputPort(
+            "phase_max_wrench",
+            MAX_WRENCH_SIZE,
+            self._calc_phase_max_wrench,
+            prerequisites_of_calc={
+                self._state_port.ticket(),
+                self._max_wrench_port.ticket(),
+                self.discrete_state_ticket(self._bound),
+            },
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    get_state_input_port = input_getter("state", "number of the template's state, (1,)")
+    get_max_wrench_input_port = input_getter("max_wrench", "task's limit of the wrench, (8,); optional")
+    get_phase_max_wrench_output_port = output_getter("phase_max_wrench", "limit in the present state, (8,)")
+
+    def _limit(self, context: Context) -> np.ndarray:
+        """Return the limit of the state at the port, (8,)."""
+        state = float(self._state_port.Eval(context)[0])
+        return self._limits[int(state)] if 0.0 <= state < len(self._limits) else self._limits.min(axis=0)
+
+    def _present(self, context: Context) -> np.ndarray:
+        bound = context.get_discrete_state(self._bound).value()
+        return self._limit(context) if np.isnan(bound).any() else bound
+
+    def _calc_phase_max_wrench(self, context: Context, output: BasicVector) -> None:
+        bound = self._present(context)
+        if self._max_wrench_port.HasValue(context):
+            bound = np.minimum(bound, self._max_wrench_port.Eval(context))
+        output.SetFromVector(bound)
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(self._bound, np.full(MAX_WRENCH_SIZE, np.nan))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        bound = approach_bound(self._present(context), self._limit(context), self._max_change)
+        discrete_state.set_value(self._bound, bound)

@@ -1,0 +1,146 @@
+"""Limits of force and speed that a state of a template adds to those of the task."""
+
+from dataclasses import replace
+from itertools import count
+
+import gymnasium
+import numpy as np
+import pytest
+
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.stations.impedance_control import WRENCH_RATE, make_phase_wrench_limit
+from guiderail.diagrams.stations.station import Impedance, max_wrench
+from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
+from guiderail.diagrams.tasks.registry import TASKS, register_task
+from guiderail.models.common.errors import InputError
+from guiderail.models.templates import Transition, load_template
+
+NUMBERS = count()
+HEIGHT = 0.012  # height at which the second state of `two_states` begins [m]; below it the clamp reaches the table
+
+
+def with_limits(**limits):
+    template = load_template("grid_clamp")
+    return replace(template, states=(replace(template.states[0], **limits),))
+
+
+def two_states(above, below):
+    """Return the clamp's template in two states, each with its limits."""
+    template = load_template("grid_clamp")
+    state = template.states[0]
+    first = replace(state, name="above", transitions=(Transition("below", HEIGHT, 0.001),), ends_at=HEIGHT, **above)
+    return replace(template, states=(first, replace(state, name="below", **below)))
+
+
+def make_clamp(template, **options):
+    """Make the clamp's environment with another template."""
+
+    def place(task):
+        return replace(GridClamp.template(task), template=template)
+
+    # A name of its own, because diagrams of closed environments are reused by name.
+    name = f"lab/Phases{next(NUMBERS)}"
+    register_task(name)(type("Phases", (GridClamp,), {"template": place}))
+    try:
+        return make_env(name, **options)
+    finally:
+        TASKS._entries.pop(name)
+        gymnasium.registry.pop(f"{name}-v0")
+
+
+def press(env, steps=16, action=(1.0, 1.0, -1.0)):
+    """Press down and sideways on holes that are 2.5 mm off; return the force at every control step."""
+    env.reset(seed=0, options={"offset": (0.0025, 0.0)})
+    over = False
+    for _ in range(steps):
+        if not over:
+            *_, terminated, truncated, _ = env.step(np.array(action))
+            over = terminated or truncated
+    return env.trace.force
+
+
+def phase_limit(env):
+    diagram = env.task.diagram
+    return diagram.GetSubsystemByName("phase_wrench_limit") if diagram.HasSubsystemNamed("phase_wrench_limit") else None
+
+
+@pytest.mark.parametrize("station", ["gantry", "arm"])
+def test_force_stays_below_limit_of_state(station):
+    assert press(make_clamp(with_limits(), station=station)).max() > 8.0
+    force = press(make_clamp(with_limits(max_force_n=6.0), station=station))
+    assert 3.0 < force.max() < 6.0
+
+
+def test_task_limit_stays_in_force_when_it_is_lower():
+    force = press(make_clamp(with_limits(max_force_n=25.0), force_limit_range=(8.0, 8.0)))
+    assert 4.0 < force.max() < 8.0
+    force = press(make_clamp(with_limits(max_force_n=6.0), force_limit_range=(25.0, 25.0)))
+    assert 3.0 < force.max() < 6.0
+
+
+def test_limit_changes_with_the_state_at_bounded_rate():
+    env = make_clamp(two_states({}, {"max_force_n": 6.0}), action_repeat=1)
+    limit = phase_limit(env)
+    port, state = limit.get_phase_max_wrench_output_port(), limit.get_state_input_port()
+    env.reset(seed=0, options={"offset": (0.0025, 0.0)})
+    context = limit.GetMyContextFromRoot(env.simulator.get_context())
+    bounds, states = [], []
+    for _ in range(90):
+        env.step(np.array([1.0, 1.0, -1.0]))
+        bounds.append(port.Eval(context).copy())
+        states.append(state.Eval(context)[0])
+    changes = np.abs(np.diff(bounds, axis=0))
+    assert states[0] == 0.0
+    assert states[-1] == 1.0
+    assert (changes <= WRENCH_RATE * env.task.control_period + 1e-12).all()
+    np.testing.assert_array_equal(bounds[0], GridClamp.impedance(env.task.declaration).bound.numbers)
+    np.testing.assert_array_equal(bounds[-1], np.minimum(bounds[0], max_wrench(6.0)))
+    assert env.trace.force[-1] < 6.0
+
+
+def test_command_is_slower_in_state_with_speed_limit():
+    def speeds(template):
+        env = make_clamp(template, action_repeat=1)
+        press(env, 20, (0.3, 0.0, -1.0))
+        return np.linalg.norm(np.diff(env.trace.commanded[:, :3], axis=0), axis=1) / env.task.control_period
+
+    assert speeds(with_limits()).max() > 0.03
+    slow = speeds(with_limits(max_speed_m_per_s=0.01))
+    assert 0.0095 < slow.max() <= 0.01 * (1 + 1e-9)
+
+
+def test_diagram_is_the_same_without_limits():
+    env = make_clamp(with_limits(max_speed_m_per_s=0.01))
+    assert phase_limit(env) is None
+    assert phase_limit(make_clamp(with_limits(max_torque_nm=1.0))) is not None
+    names = [system.get_name() for system in env.task.diagram.GetSystems()]
+    assert names == [system.get_name() for system in make_clamp(with_limits()).task.diagram.GetSystems()]
+
+
+def test_limit_is_refused_when_impedance_has_no_bound():
+    with pytest.raises(InputError, match="state 'insert' of template 'grid_clamp' limits force or torque"):
+        make_clamp(with_limits(max_torque_nm=1.0), bounded_force=False)
+    make_clamp(with_limits(), bounded_force=False)
+
+
+def test_no_state_raises_the_bound_of_the_station():
+    bounded = Impedance().with_max_force(10.0)
+    system = make_phase_wrench_limit(with_limits(max_force_n=100.0, max_torque_nm=100.0), bounded, 0.01)
+    context = system.CreateDefaultContext()
+    system.get_state_input_port().FixValue(context, [0.0])
+    bound = system.get_phase_max_wrench_output_port().Eval(context)
+    np.testing.assert_array_equal(bound, bounded.bound.numbers)
+
+
+def test_torque_limit_bounds_the_norm():
+    low = max_wrench(np.inf, 1.5)
+    assert np.linalg.norm(low[3:6]) == pytest.approx(1.5)
+    assert low[7] == pytest.approx(1.5)
+    np.testing.assert_array_equal(low[[0, 1, 2, 6]], max_wrench(np.inf)[[0, 1, 2, 6]])
+    np.testing.assert_array_equal(max_wrench(20.0, 1e3), max_wrench(20.0))
+
+
+def test_template_of_task_has_no_limits():
+    task = EnvConfig.resolve("GridClamp", {}).make_task()
+    assert make_phase_wrench_limit(task.template().template, None, 0.01) is None

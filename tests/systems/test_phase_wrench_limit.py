@@ -1,0 +1,129 @@
+"""Tests of the system alone; `tests/diagrams/tasks/test_phase_limits.py` tests the physics."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems import PhaseWrenchLimit
+
+PERIOD = 0.01
+RATE = np.array([100.0] * 3 + [10.0] * 3 + [100.0, 10.0])
+HIGH = np.array([9.0, 9.0, 15.0, 1.0, 1.0, 1.0, np.linalg.norm([9.0, 9.0, 15.0]), np.sqrt(3.0)])
+LOW = np.array([2.0, 2.0, 3.0, 0.5, 0.5, 0.5, np.linalg.norm([2.0, 2.0, 3.0]), np.sqrt(0.75)])
+
+
+class Rig:
+    """The system between sources of a state and of a task's limit."""
+
+    def __init__(self, state=0.0, task=None, limits=(HIGH, LOW)):
+        builder = DiagramBuilder()
+        self.source = builder.AddSystem(ConstantVectorSource([state]))
+        self.system = builder.AddSystem(PhaseWrenchLimit(np.array(limits), RATE, period=PERIOD))
+        builder.Connect(self.source.get_output_port(), self.system.get_state_input_port())
+        if task is not None:
+            self.task = builder.AddSystem(ConstantVectorSource(task))
+            builder.Connect(self.task.get_output_port(), self.system.get_max_wrench_input_port())
+        self.simulator = Simulator(builder.Build())
+        self.simulator.Initialize()
+        self.context, self.step = self.simulator.get_mutable_context(), 0
+
+    @property
+    def bound(self):
+        port = self.system.get_phase_max_wrench_output_port()
+        return port.Eval(self.system.GetMyContextFromRoot(self.context)).copy()
+
+    def set(self, source, values):
+        own = source.GetMyMutableContextFromRoot(self.context)
+        source.get_mutable_source_value(own).SetFromVector(values)
+
+    def run(self, steps):
+        """Return the bound after each of some steps, (steps, 8)."""
+        bounds = []
+        for _ in range(steps):
+            self.step += 1
+            self.simulator.AdvanceTo(self.step * PERIOD)
+            bounds.append(self.bound)
+        return np.array(bounds)
+
+
+@pytest.mark.parametrize(("state", "expected"), [(0.0, HIGH), (1.0, LOW)])
+def test_episode_begins_with_limit_of_its_state(state, expected):
+    rig = Rig(state)
+    np.testing.assert_array_equal(rig.bound, expected)
+    np.testing.assert_array_equal(rig.run(3), [expected] * 3)
+
+
+def test_first_update_takes_limit_of_state_at_once():
+    """A state machine may set its first state at the initialization of this system."""
+    rig = Rig(0.0)
+    rig.set(rig.source, [1.0])
+    np.testing.assert_array_equal(rig.run(1)[0], LOW)
+
+
+@pytest.mark.parametrize(("first", "last"), [(HIGH, LOW), (LOW, HIGH)])
+def test_limit_changes_at_bounded_rate_in_both_directions(first, last):
+    rig = Rig(limits=(first, last))
+    rig.run(2)
+    rig.set(rig.source, [1.0])
+    bounds = np.vstack([first, rig.run(40)])
+    changes = np.abs(np.diff(bounds, axis=0)) / (RATE * PERIOD)
+    assert changes.max() <= 1.0 + 1e-9
+    moving = changes.max(axis=1) > 0.0
+    # All steps but the last one use the whole rate.
+    np.testing.assert_allclose(changes.max(axis=1)[moving][:-1], 1.0)
+    np.testing.assert_array_equal(bounds[-1], last)
+    assert (bounds >= np.minimum(HIGH, LOW) - 1e-12).all()
+    assert (bounds <= np.maximum(HIGH, LOW) + 1e-12).all()
+    # The norms never clip a wrench inside the limits of the axes, whose energy the tank accounts for.
+    assert (np.linalg.norm(bounds[:, :3], axis=1) <= bounds[:, 6] + 1e-9).all()
+    assert (np.linalg.norm(bounds[:, 3:6], axis=1) <= bounds[:, 7] + 1e-9).all()
+
+
+def test_lower_limit_of_task_applies_at_once():
+    rig = Rig(task=np.full(8, 100.0))
+    np.testing.assert_array_equal(rig.run(2)[-1], HIGH)
+    rig.set(rig.task, np.full(8, 0.3))
+    np.testing.assert_array_equal(rig.run(1)[0], np.full(8, 0.3))
+    mixed = np.r_[np.full(3, 4.0), np.full(5, 50.0)]
+    rig.set(rig.task, mixed)
+    np.testing.assert_array_equal(rig.run(1)[0], np.minimum(HIGH, mixed))
+
+
+@pytest.mark.parametrize("state", [-1.0, 2.0, np.nan, np.inf])
+def test_unknown_state_has_the_lowest_limits(state):
+    mixed = np.r_[LOW[:3], HIGH[3:6], LOW[6], HIGH[7]]
+    rig = Rig(state, limits=(np.r_[HIGH[:3], LOW[3:6], HIGH[6], LOW[7]], mixed))
+    np.testing.assert_array_equal(rig.run(2)[-1], LOW)
+
+
+def test_reset_forgets_the_limit_of_last_episode():
+    rig = Rig(1.0)
+    rig.run(2)
+    rig.set(rig.source, [0.0])
+    rig.simulator.Initialize()
+    np.testing.assert_array_equal(rig.bound, HIGH)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"limits": np.ones(8)}, "rows of 8"),
+        ({"limits": np.ones((0, 8))}, "rows of 8"),
+        ({"limits": np.ones((2, 6))}, "rows of 8"),
+        ({"limits": np.full((2, 8), np.inf)}, "finite and not negative"),
+        ({"limits": np.full((2, 8), np.nan)}, "finite and not negative"),
+        ({"limits": np.full((2, 8), -1e-9)}, "finite and not negative"),
+        ({"max_rate": np.zeros(8)}, "8 positive numbers"),
+        ({"max_rate": np.full(8, np.inf)}, "8 positive numbers"),
+        ({"max_rate": np.ones(6)}, "8 positive numbers"),
+        ({"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_constructor_refuses_what_is_out_of_range(change, words):
+    arguments = {"limits": np.zeros((2, 8)), "max_rate": RATE, "period": PERIOD}
+    PhaseWrenchLimit(**arguments)
+    with pytest.raises(InputError, match=words):
+        PhaseWrenchLimit(**arguments | change)
