@@ -14,6 +14,8 @@ from guiderail.systems.support.declarations import declare_cache, declare_plant_
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
+MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad], so that no wrench overflows to infinity and, rotated, to NaN
+
 
 @dataclass(frozen=True)
 class ImpedanceGains:
@@ -41,8 +43,10 @@ class ImpedanceGains:
     def __post_init__(self) -> None:
         K = np.asarray(self.stiffness, dtype=float)
         is_symmetric = K.shape == (6, 6) and np.isfinite(K).all() and np.allclose(K, K.T)
-        if not is_symmetric or not (np.linalg.eigvalsh(K) > 0.0).all():
-            raise InputError("a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix")
+        if not is_symmetric or not (np.abs(K) <= MAX_STIFFNESS).all() or not (np.linalg.eigvalsh(K) > 0.0).all():
+            raise InputError(
+                f"a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix, at most {MAX_STIFFNESS:g}"
+            )
         if np.shape(self.wrench_limits) != (6,) or not (np.asarray(self.wrench_limits) > 0.0).all():
             raise InputError(f"an impedance needs six positive wrench limits, not {self.wrench_limits}")
         posture_gains = (self.posture_stiffness, self.posture_damping)

@@ -1,8 +1,9 @@
 """Tables: exact as CSV, and readable as Markdown."""
 
 import csv
+import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -10,10 +11,15 @@ import numpy as np
 import pandas as pd
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import read_bytes
 from guiderail.tools.files import write_atomically
 
 _INTEGER = re.compile(r"-?[0-9]{1,18}")
 _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf|nan")
+
+MAX_FILE_SIZE = 200_000_000  # largest CSV file [bytes]
+_MAX_LIST = 1_000  # longest list of numbers in one row of a Parquet file, on average
+MAX_ROWS = 20_000_000  # largest number of rows of Parquet files that are read together
 
 Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[str, Any]]
 
@@ -30,13 +36,14 @@ def read_table(path: Path) -> pd.DataFrame:
     A column of only numbers and empty cells is numeric; its empty cells are NaN. In a column of text they are "".
 
     Raises:
-        InputError: If the file is missing, a row is not as long as the header, or column names are missing or repeated.
+        InputError: If the file is missing or larger than `MAX_FILE_SIZE`, a row is not as long as the header, or column
+            names are missing or repeated.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
+    data = read_bytes(path, "table", MAX_FILE_SIZE)
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            header, *rows = csv.reader(file, strict=True)
+        header, *rows = csv.reader(io.StringIO(data.decode("utf-8"), newline=""), strict=True)
         if not all(header) or len({*header}) != len(header):
             raise ValueError("missing or repeated names")
         columns = zip(*rows, strict=True) if rows else ([] for _ in header)
@@ -54,6 +61,30 @@ def _parse_column(cells: Sequence[str]) -> pd.Series:
     if {*cells} <= {"True", "False"}:
         return pd.Series([cell == "True" for cell in cells], dtype=object)
     return pd.Series(cells, dtype=object)
+
+
+def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
+    """Check the sizes that the footers of Parquet files claim, before anything is allocated for their rows.
+
+    Raises:
+        InputError: If one is not a readable Parquet file, or together they have too many rows, or values in lists.
+    """
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
+    num_rows = 0
+    for file in files:
+        try:
+            if not file.is_file():  # reading a pipe would block
+                raise InputError(f"{file} is not a regular file: restore it")
+            metadata = parquet.read_metadata(file)
+        except (arrow.ArrowException, OSError) as error:
+            raise InputError(f"{file} is damaged: restore it, or record it again") from error
+        groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+        values = [group.column(number).num_values for group in groups for number in range(group.num_columns)]
+        num_rows += max(metadata.num_rows, max(values, default=0) // _MAX_LIST)
+    if num_rows > max_rows:
+        raise InputError(f"{file} and the files before it have more than {max_rows} rows: read fewer of them")
 
 
 def write_table(path: Path, rows: Rows) -> Path:

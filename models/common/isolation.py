@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import resource
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 _WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # limit of wall time: multiple of the limit of CPU time, plus a constant [s]
@@ -15,20 +16,21 @@ class IsolatedError(Exception):
     """Exception, abort or exceeded time limit of an isolated function; the message gives the reason."""
 
 
-def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int) -> Any:
+def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int, max_bytes: int | None = None) -> Any:
     """Return `function(*arguments)`, computed in a forked process; the result is pickled.
 
     Args:
         function: Function; it needs no import in the child process, which is a copy of this one.
         arguments: Arguments of the function, which are not pickled.
         cpu_seconds: Limit of the function's CPU time [s].
+        max_bytes: Limit of the memory that the function allocates [bytes]; default: none.
 
     Raises:
-        IsolatedError: If the function raised, or its process aborted or exceeded the limit.
+        IsolatedError: If the function raised, or its process aborted or exceeded a limit.
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(sender, function, arguments, cpu_seconds))
+    process = context.Process(target=_child, args=(sender, function, arguments, cpu_seconds, max_bytes))
     process.start()
     sender.close()
     try:
@@ -49,15 +51,23 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     return value
 
 
-def _child(sender: Any, function: Callable[..., Any], arguments: tuple[Any, ...], cpu_seconds: int) -> None:
+def _child(
+    sender: Any, function: Callable[..., Any], arguments: tuple[Any, ...], cpu_seconds: int, max_bytes: int | None
+) -> None:
     used = int(sum(os.times()[:2])) + 1
     resource.setrlimit(resource.RLIMIT_CPU, (used + cpu_seconds, used + cpu_seconds + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if max_bytes is not None:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])  # address space inherited from the parent
+        limit = pages * resource.getpagesize() + max_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, 1)  # compiled libraries print their progress and their aborts
     os.dup2(devnull, 2)
     try:
         sender.send((True, function(*arguments)))
+    except MemoryError:
+        sender.send((False, "it needs too much memory"))
     except BaseException as error:
         sender.send((False, f"{type(error).__name__}: {error}"))
     finally:

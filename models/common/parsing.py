@@ -31,7 +31,7 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
     Directives may refer to packages (folders with a `package.xml`) in the folder of their file.
     """
     with _allow_package_map():
-        parser = Parser(plant)
+        parser = _make_parser(plant)
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
         return parser.AddModels(str(path))
@@ -45,10 +45,17 @@ def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective
     """
     try:
         with _allow_package_map():
-            ProcessModelDirectives(ModelDirectives(directives=list(directives)), Parser(plant))
+            ProcessModelDirectives(ModelDirectives(directives=list(directives)), _make_parser(plant))
     except RuntimeError as error:
         words = " ".join(str(error).split())
         raise InputError(f"the model directives of the robot's surroundings can't be processed: {words}") from error
+
+
+def _make_parser(plant: MultibodyPlant) -> Parser:
+    """Return a parser without the package `drake_models`, whose files Drake would download."""
+    parser = Parser(plant)
+    parser.package_map().Remove("drake_models")
+    return parser
 
 
 @contextmanager

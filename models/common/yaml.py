@@ -5,6 +5,8 @@ text and not the number 8. Reading takes bounded time and memory for any content
 """
 
 import re
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, NoReturn
@@ -68,10 +70,27 @@ def parse_yaml(text: str, where: str = "text") -> Any:
         InputError: If it is not YAML, it has a tag, a date, a duplicate key or a key that is not text, or it is too
             large or too deep.
     """
+    with _refusals(text, where):
+        return _make_yaml().load(text)
+
+
+def check_yaml(text: str, where: str, tags: Collection[str]) -> None:
+    """Check that YAML for another reader is within the limits of `parse_yaml` and has no tags but the given ones.
+
+    Raises:
+        InputError: As `parse_yaml`, except for duplicate keys.
+    """
+    with _refusals(text, where):
+        for _ in _make_yaml(tags).parse(text):
+            pass
+
+
+@contextmanager
+def _refusals(text: str, where: str) -> Iterator[None]:
     if len(text) > MAX_SIZE:
         raise InputError(f"{where} is longer than {MAX_SIZE} characters: leave out what is not needed")
     try:
-        return _make_yaml().load(text)
+        yield
     except _RefusedError as error:
         raise InputError(f"{where}, {error}") from error
     except ReaderError as error:
@@ -99,9 +118,9 @@ for _name, (_pattern, _first) in _PATTERNS.items():
         _Resolver.versioned_resolver.setdefault(_character, []).append(_entry)
 
 
-def _make_yaml() -> YAML:
+def _make_yaml(tags: Collection[str] = ()) -> YAML:
     yaml = YAML(typ="safe", pure=True)
-    yaml.Resolver, yaml.Parser = _Resolver, _Parser
+    yaml.Resolver, yaml.Parser = _Resolver, type("_TagParser", (_Parser,), {"tags": tags})
     return yaml
 
 
@@ -119,6 +138,8 @@ class _Collection:
 
 class _Parser(Parser):
     """Parser that checks each event before anything is built from it."""
+
+    tags: Collection[str] = ()  # accepted tags
 
     def __init__(self, loader: Any):
         super().__init__(loader)
@@ -139,7 +160,7 @@ class _Parser(Parser):
             self._num_entries += entries
         elif isinstance(event, ScalarEvent | CollectionStartEvent):
             is_key = bool(self._parents) and self._parents[-1].is_mapping and self._parents[-1].children % 2 == 0
-            _check_node(event, self.resolver, is_key=is_key)
+            _check_node(event, self.resolver, self.tags, is_key=is_key)
             self._num_entries += 1
             if isinstance(event, CollectionStartEvent):
                 self._parents.append(_Collection(event))
@@ -156,8 +177,8 @@ class _Parser(Parser):
         return event
 
 
-def _check_node(event: Any, resolver: Any, *, is_key: bool) -> None:
-    if event.tag is not None:
+def _check_node(event: Any, resolver: Any, tags: Collection[str], *, is_key: bool) -> None:
+    if event.tag is not None and event.tag not in tags:
         _refuse(f"the tag {brief(event.tag)} has no meaning here: leave it out", event)
     kind = "collection"
     if isinstance(event, ScalarEvent):

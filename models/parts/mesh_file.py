@@ -1,5 +1,6 @@
 """Mesh files of parts: read in meters and checked to be solids, and written with their SDF models."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import read_bytes
+from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.objects.sdf import ContactMaterial, TriangleMesh, at, collision, convex_mesh, mesh, model, visual
 from guiderail.models.parts.repair import Repair, close_surface
 from guiderail.models.parts.solids import require_module, to_manifold
@@ -20,6 +23,7 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 SMALLEST, LARGEST = 1e-3, 0.5  # bounds of the longest side of a part that an arm inserts [m]
 MAX_FILE_SIZE = 200_000_000  # [bytes]
 MAX_TRIANGLES = 2_000_000  # largest number of triangles of a file
+_CPU_SECONDS, _MAX_MEMORY = 120, 2 * 2**30  # limits of a parser: CPU time [s] and memory [bytes]
 NOTHING_REPAIRED = Repair()
 _KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
 
@@ -84,22 +88,23 @@ def load_part(path: Path, unit: str) -> Part:
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
+    require_module("trimesh")
+    if path.suffix.lower() in (".step", ".stp"):
+        require_module("cascadio")
+    data = read_bytes(path, "mesh", MAX_FILE_SIZE)
     try:
-        if not path.is_file():
-            raise InputError(f"there is no file {path}: name the part's mesh")
-        file_size = path.stat().st_size
-    except OSError as error:  # such as a name that is too long
-        raise InputError(f"{brief(str(path))} can't be read ({error.strerror}): check the path") from error
-    if file_size > MAX_FILE_SIZE:
-        raise InputError(f"{path} is larger than {MAX_FILE_SIZE} bytes: export it with a coarser tolerance")
-    mesh = _read(path)
-    if mesh is None or not len(mesh.faces):
-        raise InputError(f"{path} holds no triangles: export the part as a mesh")
-    if len(mesh.faces) > MAX_TRIANGLES:
-        raise InputError(
-            f"{path} has {len(mesh.faces)} triangles, more than {MAX_TRIANGLES}: export it with a coarser tolerance"
+        vertices, triangles, number = run_isolated(
+            _parse, data, path.suffix[1:].lower(), cpu_seconds=_CPU_SECONDS, max_bytes=_MAX_MEMORY
         )
-    corners = np.asarray(mesh.vertices, dtype=float)[mesh.faces.ravel()]
+    except IsolatedError as error:
+        raise InputError(f"{path} can't be read as a mesh ({brief(str(error))}): export it again") from error
+    if number > MAX_TRIANGLES:
+        raise InputError(
+            f"{path} has {number} triangles, more than {MAX_TRIANGLES}: export it with a coarser tolerance"
+        )
+    if not len(triangles):
+        raise InputError(f"{path} holds no triangles: export the part as a mesh")
+    corners = vertices[triangles.ravel()]
     if not np.isfinite(corners).all():
         raise InputError(f"{path} holds vertices that are NaN or infinite: export it again")
     with np.errstate(over="ignore"):
@@ -108,6 +113,7 @@ def load_part(path: Path, unit: str) -> Part:
         fitting = [name for name, scale in UNITS.items() if SMALLEST <= size / UNITS[unit] * scale <= LARGEST]
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
+    mesh = require_module("trimesh").Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     if not (mesh.area > 0.0):
         raise InputError(f"{path} holds triangles without an area only: export the part as a mesh")
@@ -116,14 +122,18 @@ def load_part(path: Path, unit: str) -> Part:
     return Part(path, tuple(bodies), repair)
 
 
-def _read(path: Path) -> Any:
-    trimesh = require_module("trimesh")
-    if path.suffix.lower() in (".step", ".stp"):
-        require_module("cascadio")
-    try:
-        return trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # a parser may raise anything for a damaged file
-        raise InputError(f"{path} can't be read as a mesh ({brief(str(error))}): export it again") from error
+def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return vertices (V, 3), triangles (T, 3), and the number of triangles; both are empty if there are too many.
+
+    Without a path and materials, a parser opens no other file and decodes no image.
+    """
+    import trimesh
+
+    mesh: Any = trimesh.load(io.BytesIO(data), file_type=ending, force="mesh", process=False, skip_materials=True)
+    number = 0 if mesh is None else max(len(mesh.faces), len(mesh.vertices) // 3)
+    if not 0 < number <= MAX_TRIANGLES:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=int), number
+    return np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces), number
 
 
 class Surface(Protocol):

@@ -5,15 +5,17 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, DiscreteValues, InputPort, LeafSystem
 
-from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period
 
 _TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s], far above rounding errors after days, far below any period
 
 
+_MAX_COORDINATE = 1e6  # largest number in a command [m, rad], so that no wrench overflows
+
+
 class CommandValidity:
-    """Check of a command: finite, neither stale nor in the future.
+    """Check of a command: finite, within 1e6 m and rad, neither stale nor in the future.
 
     A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A time stamp that lies further in the
     future is refused, because such a command would time out too late. A time stamp that is not finite is refused too.
@@ -38,7 +40,7 @@ class CommandValidity:
 
     def is_valid(self, context: Context, time: float) -> bool:
         """Return True if the present command is valid at `time` [s]; `context` is the system's."""
-        if not is_finite(self._desired_pose.Eval(context)):
+        if not np.abs(self._desired_pose.Eval(context)).max() <= _MAX_COORDINATE:  # False for NaN too
             return False
         if not self._command_time.HasValue(context):
             return True

@@ -228,10 +228,12 @@ def test_last_valid_pose_is_followed_when_commands_stop():
     np.testing.assert_allclose(arm.pose(), safe, atol=5e-4)
 
 
-def test_command_is_ignored_when_it_is_not_finite():
-    arm = FreeArm(POSTURES[0], time_step=0.005)
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300, 1.001e6])
+def test_command_is_ignored_when_it_is_not_finite(wrong):
+    """A stiffness frame that is turned rotates the wrench, in which an overflow would become NaN."""
+    arm = FreeArm(POSTURES[0], time_step=0.005, turned_axes=RotationMatrix.MakeZRotation(0.7))
     start = arm.pose()
-    arm.command(np.full(6, np.nan))
+    arm.command(np.array([wrong, -wrong, wrong, 0.0, 0.0, 0.0]))
     arm.advance(0.5)
     assert np.isfinite(arm.torque()).all()
     np.testing.assert_allclose(arm.pose(), start, atol=1e-4)
@@ -282,6 +284,7 @@ def test_damping_gives_every_mode_its_damping_ratio():
         {"damping_ratio": 0.0},
         {"posture_stiffness": -1.0},
         {"stiffness": np.diag([np.inf] * 6)},
+        {"stiffness": np.diag([1e300] * 6)},
         {"stiffness": np.diag([np.nan] * 6)},
         {"wrench_limits": np.full(6, np.nan)},
         {"damping_ratio": np.inf},

@@ -1,11 +1,13 @@
 import math
+import os
+from contextlib import nullcontext
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.tables import read_table, table_text, write_table
+from guiderail.tools.tables import check_parquet, read_table, table_text, write_table
 
 
 def test_rows_are_read_as_written(tmp_path):
@@ -59,3 +61,28 @@ def test_read_refuses_an_invalid_table(text, tmp_path):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InputError, match="not a table"):
         read_table(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize(("more", "is_accepted"), [(0, True), (-1, False)])
+def test_size_of_a_table_is_limited(more, is_accepted, tmp_path, monkeypatch):
+    (tmp_path / "t.csv").write_text("a,b\n1,2\n")
+    monkeypatch.setattr("guiderail.tools.tables.MAX_FILE_SIZE", 8 + more)
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="larger than 7 bytes"):
+        read_table(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize(("max_rows", "is_accepted"), [(6, True), (5, False)])
+def test_number_of_rows_of_parquet_files_is_limited(max_rows, is_accepted, tmp_path):
+    for name in "ab":
+        pd.DataFrame({"x": [1.0, 2.0, 3.0]}).to_parquet(tmp_path / f"{name}.parquet")
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="more than 5 rows"):
+        check_parquet([tmp_path / "a.parquet", tmp_path / "b.parquet"], max_rows)
+
+
+def test_long_lists_and_pipes_are_refused_as_parquet(tmp_path):
+    pd.DataFrame({"x": [[0.0] * 100_000]}).to_parquet(tmp_path / "list.parquet")
+    with pytest.raises(InputError, match="more than 50 rows"):
+        check_parquet([tmp_path / "list.parquet"], 50)
+    os.mkfifo(tmp_path / "pipe.parquet")
+    with pytest.raises(InputError, match="not a regular file"):
+        check_parquet([tmp_path / "pipe.parquet"])

@@ -18,6 +18,7 @@ from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import EnvCallback
 from guiderail.tools.files import write_atomically
+from guiderail.tools.tables import check_parquet
 
 SLACK = "distance outside of the constraint; negative is slack"
 # Unit and meaning of each column; "_i" stands for one column per component of a pose or a wrench.
@@ -119,11 +120,12 @@ def read_step_log(folder: Path, columns: list[str] | None = None) -> pd.DataFram
         columns: Names of the columns to read; all by default.
 
     Raises:
-        InputError: If there is no step log, or a file is damaged or lacks a column.
+        InputError: If there is no step log, it has more than `MAX_ROWS` rows, or a file is damaged or lacks a column.
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:
         raise InputError(f"{folder} holds no step log: the run was trained without one")
+    check_parquet(files)
     tables = []
     for file in files:
         try:

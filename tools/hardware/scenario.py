@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import yaml
@@ -10,9 +11,12 @@ from pydrake.lcm import DrakeLcmParams
 from pydrake.manipulation import IiwaDriver
 from pydrake.multibody.parsing import ModelDirective
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import read_bytes
+from guiderail.models.common.yaml import MAX_SIZE, check_yaml
 
 HARDWARE, SIMULATION = "hardware", "simulation"
+_TAGS = ("!IiwaDriver", "!PandaDriver", "!Rpy")  # accepted tags, which name classes
 # Supported fields of Drake's classes. Others are refused: with a channel suffix, for example, another robot would move.
 SUPPORTED = ("control_mode", "lcm_bus", "lcm_url")
 
@@ -63,10 +67,10 @@ def load_scenario(path: Path) -> Scenario:
     Raises:
         InputError: If the file does not exist or is invalid, or sets an unsupported field of a driver or a bus.
     """
-    if not path.is_file():
-        raise InputError(f"there is no scenario {path}")
+    text = read_bytes(path, "scenario", MAX_SIZE).decode("utf-8", errors="replace")
+    check_yaml(text, str(path), _TAGS)  # Drake's reader has no limits
     try:
-        scenario = yaml_load_typed(schema=Scenario, filename=str(path), defaults=Scenario())
+        scenario = yaml_load_typed(schema=Scenario, data=text, defaults=Scenario())
     except (yaml.YAMLError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, AssertionError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path} is no scenario: {reason}") from error
@@ -83,6 +87,12 @@ def load_scenario(path: Path) -> Scenario:
     if driver.lcm_bus not in scenario.lcm_buses:
         raise InputError(
             f"{path}: {scenario.robot}'s driver is on the bus {driver.lcm_bus!r}, which lcm_buses does not define"
+        )
+    url = urlsplit(scenario.robot_url)
+    if url.scheme not in ("", "udpm", "memq") or parse_qs(url.query).get("ttl", ["0"])[-1] not in ("0", "1"):
+        raise InputError(
+            f"{path}: messages to {brief(scenario.robot_url)} leave the local network: give a udpm:// address with a "
+            "ttl of 0 or 1, or give another address by --robot-url"
         )
     for config in (driver, scenario.lcm_buses[driver.lcm_bus]):
         for name in (one.name for one in getattr(config, "__fields__", ()) if one.name not in SUPPORTED):

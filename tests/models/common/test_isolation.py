@@ -27,3 +27,9 @@ def test_run_isolated_returns_the_result():
 def test_run_isolated_gives_the_reason_when_a_function_fails(function, words):
     with pytest.raises(IsolatedError, match=words):
         run_isolated(function, cpu_seconds=1)
+
+
+def test_run_isolated_limits_memory():
+    with pytest.raises(IsolatedError, match="too much memory"):
+        run_isolated(bytearray, 2**30, cpu_seconds=5, max_bytes=2**27)
+    assert len(run_isolated(bytearray, 2**20, cpu_seconds=5, max_bytes=2**27)) == 2**20

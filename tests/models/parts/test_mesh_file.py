@@ -1,5 +1,8 @@
 """A faulty mesh is repaired and reported, or refused in one sentence with the remedy."""
 
+import json
+import os
+import struct
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -134,3 +137,32 @@ def test_size_of_a_mesh_file_is_limited(more, is_accepted, tmp_path, monkeypatch
     monkeypatch.setattr("guiderail.models.parts.mesh_file.MAX_FILE_SIZE", file.stat().st_size + more)
     with nullcontext() if is_accepted else pytest.raises(InputError, match="is larger than"):
         load_part(file, "mm")
+
+
+def test_load_part_opens_no_file_that_a_mesh_names(tmp_path):
+    """A pipe as a material would block, and a file of another folder must not be read."""
+    os.mkfifo(tmp_path / "pipe.mtl")
+    box().export(tmp_path / "part.obj")
+    for name in ("pipe.mtl", "../secret.mtl", "/dev/zero"):
+        text = f"mtllib {name}\n" + (tmp_path / "part.obj").read_text()
+        (tmp_path / "named.obj").write_text(text)
+        assert len(load_part(tmp_path / "named.obj", "mm").bodies) == 1
+
+
+def test_load_part_refuses_a_mesh_that_claims_more_than_it_holds(tmp_path, monkeypatch):
+    monkeypatch.setattr("guiderail.models.parts.mesh_file._MAX_MEMORY", 2**28)
+    header = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": 4}],
+        "bufferViews": [],
+        "accessors": [{"componentType": 5126, "count": 30_000_000, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    content = b"glTF" + struct.pack("<III", 2, 32 + len(text), len(text)) + b"JSON" + text
+    (tmp_path / "part.glb").write_bytes(content + struct.pack("<I", 4) + b"BIN\0" + bytes(4))
+    with pytest.raises(InputError, match="too much memory"):
+        load_part(tmp_path / "part.glb", "m")

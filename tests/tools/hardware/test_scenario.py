@@ -56,7 +56,12 @@ def test_shipped_scenario_has_a_simulated_driver():
         ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "must accept them"),
         (DRIVER, "does not define"),
         ("directives: 3\n", "is no scenario"),
-        ("{{", "is no scenario"),
+        ("{{", "as a key is no text"),
+        ("[" * 5000, "inside each other"),
+        ("station: [\n", "is not YAML"),
+        ("station: !python/object:os.system x\n", "the tag"),
+        (BUS.replace("ttl=0", "ttl=32") + DRIVER, "leave the local network"),
+        (BUS.replace("udpm://239.255.76.67:7668?ttl=0", "tcpq://192.0.2.1:7700") + DRIVER, "leave the local network"),
         ("nonsense: 1\n", "nonsense"),
         (BUS.replace("'}}", "', channel_suffix: _LEFT}}") + DRIVER, "channel_suffix is '_LEFT'"),
         (BUS + OF_BUS % "lcm_status_period: 0.001", "lcm_status_period is 0.001"),
@@ -107,5 +112,10 @@ directives:
     lost = load_scenario(
         written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'file:///nowhere.sdf'}}]\n")
     )
+    remote = load_scenario(
+        written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'package://drake_models/box.sdf'}}]\n")
+    )
+    with pytest.raises(InputError, match="unknown package"):
+        SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=remote.directives)
     with pytest.raises(InputError, match="can't be processed"):
         SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=lost.directives)

@@ -10,8 +10,10 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.datasets.formats.recorded import Recorded, choose_signal, describe_time_shift
 from guiderail.tools.files import atomic_folder
+from guiderail.tools.tables import check_parquet
 
 VERSION = "v3.0"
 INFO = Path("meta") / "info.json"
@@ -52,6 +54,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
         raise InputError(f"{folder} has no data/*.parquet: copy the whole dataset")
+    check_parquet(files, MAX_LINES)
     columns = [chosen, "frame_index", "episode_index"]
     try:
         tables = [parquet.read_table(file, columns=columns) for file in files]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.datasets.formats.recorded import (
     POSE_NAMES,
     Recorded,
@@ -100,13 +102,16 @@ def _read_bag(
             raise InputError(
                 f"{bag} has {len(connections)} publishers on {chosen}, which would be mixed: record one of them"
             )
-        rows = [(stamp, reader.deserialize(raw, kinds[chosen])) for _, stamp, raw in reader.messages(connections)]
+        received = islice(reader.messages(connections), MAX_LINES + 1)
+        rows = [(stamp, reader.deserialize(raw, kinds[chosen])) for _, stamp, raw in received]
     except InputError:
         raise
     except Exception as error:  # the reader raises many types for damaged messages
         raise InputError(f"{bag} holds a message that cannot be read: {brief(str(error))}") from error
     finally:
         reader.close()
+    if len(rows) > MAX_LINES:
+        raise InputError(f"{bag} has more than {MAX_LINES} messages on {chosen}: record a shorter motion")
     if len(rows) < 2:
         raise InputError(f"{bag} has {len(rows)} messages on {chosen}: a motion needs at least two")
     times, remarks = _clock(rows)

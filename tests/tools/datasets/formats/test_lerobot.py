@@ -35,6 +35,12 @@ def test_invalid_description_is_refused(changed, words, dataset):
         read_lerobot(dataset, "action")
 
 
+def test_dataset_with_too_many_rows_is_refused(dataset, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.datasets.formats.lerobot.MAX_LINES", len(CLOCK) - 1)
+    with pytest.raises(InputError, match=f"more than {len(CLOCK) - 1} rows"):
+        read_lerobot(dataset, "action")
+
+
 def test_lerobot_export_states_a_shifted_start(dataset, tmp_path):
     notes = write_lerobot(tmp_path / "later", Demonstrations([CLOCK - 0.2], [CLOCK[:, None]]))
     assert "where it was -0.2" in notes[-1]
