@@ -1,8 +1,6 @@
 """Workcell with a tool on a gantry, simulated by MuJoCo."""
 
 import math
-from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, OutputPort
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
@@ -22,20 +20,6 @@ if TYPE_CHECKING:
     import mujoco
 
 MAX_JOINT_SPEED = 1e3  # joint speed above which a simulation counts as diverged [m/s, rad/s]
-
-
-def mujoco_engine() -> ModuleType:
-    """Import and return the module `mujoco`.
-
-    Raises:
-        InputError: If MuJoCo is not installed.
-    """
-    try:
-        return import_module("mujoco")
-    except ModuleNotFoundError:
-        raise InputError(
-            "station='mujoco' needs the package mujoco, which is not installed: pip install 'guiderail[mujoco]'"
-        ) from None
 
 
 class DivergedError(RuntimeError):
@@ -122,7 +106,7 @@ class MujocoGantry(LeafSystem):
         self._num_steps = round(period / step)
         if abs(self._num_steps * step - period) > 1e-9:
             raise InputError(f"MuJoCo's step of {step} s does not divide the period of {period} s")
-        self._mujoco = mujoco_engine()
+        self._mujoco = import_extra("mujoco")
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
         self.model, self._data = model, self._mujoco.MjData(model)

@@ -7,7 +7,6 @@ own loop, and runs on every e-Series. This driver has not been tested on a real 
 
 from __future__ import annotations
 
-import importlib
 import logging
 import threading
 import time as clock
@@ -21,7 +20,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_limits import MotionLimits
 from guiderail.models.robots.mounting import add_robot
@@ -286,14 +285,11 @@ class RtdeDriver(PoseDriver):
 
 
 def _import_client() -> Any:
-    try:
-        return SimpleNamespace(
-            RTDEControlInterface=importlib.import_module("rtde_control").RTDEControlInterface,
-            RTDEReceiveInterface=importlib.import_module("rtde_receive").RTDEReceiveInterface,
-            DashboardClient=importlib.import_module("dashboard_client").DashboardClient,
-        )
-    except ImportError:
-        raise InputError('the driver rtde needs ur-rtde: pip install "guiderail[rtde]"') from None
+    return SimpleNamespace(
+        RTDEControlInterface=import_extra("rtde_control").RTDEControlInterface,
+        RTDEReceiveInterface=import_extra("rtde_receive").RTDEReceiveInterface,
+        DashboardClient=import_extra("dashboard_client").DashboardClient,
+    )
 
 
 def _turn(wrench: np.ndarray) -> np.ndarray:

@@ -25,10 +25,10 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
-from guiderail.systems.mujoco_gantry import MovedBodies, MujocoGantry, mujoco_engine
+from guiderail.systems.mujoco_gantry import MovedBodies, MujocoGantry
 
 if TYPE_CHECKING:
     import mujoco
@@ -75,7 +75,7 @@ def mujoco_model(
     Raises:
         InputError: If MuJoCo is not installed, or there are more kinds of pairs than a contact mask has bits.
     """
-    mujoco = mujoco_engine()
+    mujoco = import_extra("mujoco")
     pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
     if len(pairs) > MAX_PAIRS:
         raise InputError(
@@ -120,7 +120,7 @@ def mujoco_parts(
 
     Their contact masks leave the first bit, MuJoCo's default, to the other model.
     """
-    mujoco = mujoco_engine()
+    mujoco = import_extra("mujoco")
     pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
     masks = {pair: 2 << bit for bit, pair in enumerate(pairs)}
     spec = mujoco.MjSpec()
@@ -272,7 +272,7 @@ def constraint_torques(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray
 
     MuJoCo's own sum, `qfrc_constraint`, includes joint friction.
     """
-    engine = mujoco_engine()
+    engine = import_extra("mujoco")
     force = np.where(data.efc_type == engine.mjtConstraint.mjCNSTR_FRICTION_DOF, 0.0, data.efc_force)
     result = np.zeros(model.nv)
     engine.mj_mulJacTVec(model, data, result, force)

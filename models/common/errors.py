@@ -1,6 +1,7 @@
 """Exceptions with messages for users, and errors of missing dependencies that name the extra to install."""
 
 import reprlib
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -50,7 +51,21 @@ EXTRAS = {
     "torch": ("PyTorch", "learn"),
     "stable_baselines3": ("Stable-Baselines3", "learn"),
     "sb3_contrib": ("sb3-contrib", "learn"),
+    "osqp": ("OSQP", "osqp"),
+    "piqp": ("PIQP", "piqp"),
     "mujoco": ("MuJoCo", "mujoco"),
+    "trimesh": ("trimesh", "onboard"),
+    "manifold3d": ("manifold3d", "onboard"),
+    "igl": ("libigl", "onboard"),
+    "cascadio": ("cascadio", "onboard"),
+    "pytetwild": ("pytetwild", "repair"),
+    "pyvista": ("PyVista", "repair"),
+    "rosbags": ("rosbags", "bags"),
+    "franky": ("franky", "fci"),
+    "rtde_control": ("ur-rtde", "rtde"),
+    "rtde_receive": ("ur-rtde", "rtde"),
+    "dashboard_client": ("ur-rtde", "rtde"),
+    "tensorboard": ("TensorBoard", "tensorboard"),
     "ray": ("Ray", "ray"),
     "onnxruntime": ("ONNX Runtime", "onnx"),
     "wandb": ("Weights & Biases", "wandb"),
@@ -69,6 +84,18 @@ def explain_missing(error: ImportError) -> MissingExtraError | None:
         return None
     software, name = extra
     return MissingExtraError(f'this needs {software}, which is not installed: pip install "guiderail[{name}]"')
+
+
+def import_extra(module: str) -> Any:
+    """Import a module of an extra, and return it.
+
+    Raises:
+        MissingExtraError: If it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise (explain_missing(error) or error) from None
 
 
 def require_extra(module: str) -> None:

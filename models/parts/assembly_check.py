@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import MM
 from guiderail.models.parts.mesh_file import Part
-from guiderail.models.parts.solids import SurfaceLocator, require_module, sample_surface, to_arrays, to_manifold
+from guiderail.models.parts.solids import SurfaceLocator, sample_surface, to_arrays, to_manifold
 
 MAX_WALL_SLOPE = 0.5  # largest component of a wall's normal along the axis
 MAX_RESTING_OVERLAP = 2e-6  # largest overlap that counts as rounding of faces in contact [m]
@@ -79,7 +79,7 @@ def measure_overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float,
 
 def compute_center_of_mass(part: Part) -> np.ndarray:
     """Return the center of mass (3,) [m] of a part with uniform density."""
-    trimesh = require_module("trimesh")
+    trimesh = import_extra("trimesh")
     meshes = [trimesh.Trimesh(vertices, triangles, process=False) for vertices, triangles in part.bodies]
     volumes = np.array([mesh.volume for mesh in meshes])
     return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.parts.solids import require_module, to_arrays
+from guiderail.models.common.errors import import_extra
+from guiderail.models.parts.solids import to_arrays
 
 MAX_PIECES = 150
 _SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding error
@@ -52,7 +53,7 @@ def _with_large_faces(convex: Any) -> Any:
     """Return a convex solid without vertices whose faces are too small for Drake (near an edge or another vertex)."""
     from pydrake.geometry import Convex  # imported here because it takes half a second
 
-    manifold3d = require_module("manifold3d")
+    manifold3d = import_extra("manifold3d")
     points = to_arrays(convex)[0]
     while len(points) > 4:
         points = np.round(points, _DIGITS)
@@ -112,7 +113,7 @@ def _best_cut(solid: Any, total: float) -> list[Any] | None:
 
 def _planes(solid: Any) -> list[tuple[np.ndarray, float]]:
     """Return planes of faces at concave edges, those with the longest edges first."""
-    trimesh = require_module("trimesh")
+    trimesh = import_extra("trimesh")
     vertices, triangles = to_arrays(solid)
     mesh = trimesh.Trimesh(vertices * _SCALE, triangles, process=False)
     concave = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _FLAT)

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.mesh_file import obj_text
-from guiderail.models.parts.solids import require_module, to_arrays
+from guiderail.models.parts.solids import to_arrays
 from guiderail.models.parts.tetrahedra import vtk_text
 
 
@@ -74,7 +75,7 @@ def _hull_volume(piece: Piece) -> float:
 
 
 def _hull(points: np.ndarray) -> Any:
-    return require_module("manifold3d").Manifold.hull_points(np.ascontiguousarray(1e3 * points))
+    return import_extra("manifold3d").Manifold.hull_points(np.ascontiguousarray(1e3 * points))
 
 
 def _rounded(piece: Piece) -> list[Piece]:

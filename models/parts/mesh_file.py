@@ -9,12 +9,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, import_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.objects.sdf import ContactMaterial, TriangleMesh, at, collision, convex_mesh, mesh, model, visual
 from guiderail.models.parts.repair import Repair, close_surface
-from guiderail.models.parts.solids import require_module, to_manifold
+from guiderail.models.parts.solids import to_manifold
 
 ENDINGS = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
@@ -80,7 +80,7 @@ def load_part(path: Path, unit: str) -> Part:
     """Read a mesh file.
 
     Args:
-        path: STL, OBJ, PLY or GLB file, or a STEP file if cascadio is installed.
+        path: STL, OBJ, PLY, GLB or STEP file.
         unit: Unit of the file's numbers, one of `UNITS`.
 
     Raises:
@@ -88,9 +88,9 @@ def load_part(path: Path, unit: str) -> Part:
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
-    require_module("trimesh")
+    import_extra("trimesh")
     if path.suffix.lower() in (".step", ".stp"):
-        require_module("cascadio")
+        import_extra("cascadio")
     data = read_bytes(path, "mesh", MAX_FILE_SIZE)
     try:
         vertices, triangles, number = run_isolated(
@@ -113,7 +113,7 @@ def load_part(path: Path, unit: str) -> Part:
         fitting = [name for name, scale in UNITS.items() if SMALLEST <= size / UNITS[unit] * scale <= LARGEST]
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
-    mesh = require_module("trimesh").Trimesh(vertices, triangles, process=False)
+    mesh = import_extra("trimesh").Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     if not (mesh.area > 0.0):
         raise InputError(f"{path} holds triangles without an area only: export the part as a mesh")

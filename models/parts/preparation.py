@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids
 from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.simplification import as_hull_if_near, count_simplified, crop_to_contact, simplify
-from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, require_module, to_arrays
+from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, to_arrays
 from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
@@ -113,7 +114,7 @@ def prepare_surfaces(
 
 
 def _unite(solids: Sequence[Any]) -> Any:
-    manifold3d = require_module("manifold3d")
+    manifold3d = import_extra("manifold3d")
     return solids[0] if len(solids) == 1 else manifold3d.Manifold.batch_boolean(list(solids), manifold3d.OpType.Add)
 
 
@@ -168,7 +169,7 @@ def cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
     """Return convex pieces of all bodies; None if there are too many pieces or they deviate too much."""
     from guiderail.models.parts.solids import to_manifold
 
-    manifold3d = require_module("manifold3d")
+    manifold3d = import_extra("manifold3d")
     pieces: list[Piece] = []
     for number, arrays in enumerate(surface.bodies):
         solid = to_manifold(*arrays)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.solids import measure_distance, require_module, to_arrays, to_manifold
+from guiderail.models.parts.solids import measure_distance, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
 MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
@@ -101,12 +101,12 @@ def find_open_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[int, n
 
 
 def _is_solid(solid: Any) -> bool:
-    return bool(solid.status() == require_module("manifold3d").Error.NoError and not solid.is_empty())
+    return bool(solid.status() == import_extra("manifold3d").Error.NoError and not solid.is_empty())
 
 
 def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
     """Return the solid of a mesh without doubled faces and with consistent normals; it may be empty."""
-    trimesh = require_module("trimesh")
+    trimesh = import_extra("trimesh")
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(digits_vertex=8)
     mesh.update_faces(mesh.unique_faces())

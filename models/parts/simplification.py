@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.parts.solids import measure_deviation, require_module, to_arrays
+from guiderail.models.common.errors import import_extra
+from guiderail.models.parts.solids import measure_deviation, to_arrays
 
 _SLABS = 8  # slabs along z in which a part is cropped
 _HULL = 0.5  # fraction of the tolerance by which a part may differ from its hull
@@ -66,7 +67,7 @@ def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plu
         turn: Turn of the plug about z at the target [rad].
         is_plug: Whether `part` is the plug.
     """
-    manifold3d = require_module("manifold3d")
+    manifold3d = import_extra("manifold3d")
     low, high = part.bounding_box()[2], part.bounding_box()[5]
     cuts, kept = np.linspace(low, high, _SLABS + 1), []
     turns = np.rad2deg(np.linspace(0.0, turn, 9)) if turn else (0.0,)

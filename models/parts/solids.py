@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import import_extra
 
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
 
-def require_module(module: str) -> Any:
-    """Import an optional library for meshes.
-
-    Raises:
-        InputError: If the library is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError:
-        raise InputError(f"meshes need {module}, which is not installed: pip install 'guiderail[onboard]'") from None
-
-
 def to_manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
     """Return a `manifold3d.Manifold` in millimeters from vertices (V, 3) [m] and triangles (T, 3)."""
-    manifold3d = require_module("manifold3d")
+    manifold3d = import_extra("manifold3d")
     mesh = manifold3d.Mesh64(np.ascontiguousarray(vertices * _SCALE), np.ascontiguousarray(triangles, dtype=np.uint64))
     mesh.merge()
     return manifold3d.Manifold(mesh)
@@ -53,7 +40,7 @@ class SurfaceLocator:
         """
         self._vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         self._triangles = np.ascontiguousarray(triangles, dtype=np.int64)
-        self._tree: Any = require_module("igl").AABB()
+        self._tree: Any = import_extra("igl").AABB()
         self._tree.init(self._vertices, self._triangles)
 
     def find_nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.common.errors import import_extra
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids, move_solid
 from guiderail.models.parts.mesh_file import Part
-from guiderail.models.parts.solids import require_module
 
 # Map of (x, y) of each candidate, in the order of `diagrams.tasks.bnc_connector.rewards.sides_of_the_rim`.
 SYMMETRIES = {
@@ -56,12 +56,12 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
 def _outline(bodies: Sequence[Any], height: float) -> Any:
     """Return the section of a part at a height [m], in millimeters."""
     sections = [body.slice(1e3 * height) for body in bodies]
-    return require_module("manifold3d").CrossSection.batch_boolean(sections, require_module("manifold3d").OpType.Add)
+    return import_extra("manifold3d").CrossSection.batch_boolean(sections, import_extra("manifold3d").OpType.Add)
 
 
 def _hole(bodies: Sequence[Any], height: float, radius: float) -> Any:
     """Return the opening of a part around the axis at a height [m], in millimeters."""
-    return require_module("manifold3d").CrossSection.circle(radius, 64) - _outline(bodies, height)
+    return import_extra("manifold3d").CrossSection.circle(radius, 64) - _outline(bodies, height)
 
 
 def _similarity(outline: Any, move: np.ndarray) -> float:

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from guiderail.models.parts.solids import require_module
+from guiderail.models.common.errors import import_extra
 
 _FACES = ([0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3])
 _FLAT = 1e-21  # six times the volume below which a tetrahedron is degenerate [m³]
@@ -27,7 +27,7 @@ def tetrahedralize(
     """
     scale = 1e3  # tolerances of fTetWild are meant for numbers around one
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    mesher = require_module("pytetwild")
+    mesher = import_extra("pytetwild")
     with TemporaryDirectory() as folder, chdir(folder):  # the mesher writes a file into the current folder
         points, cells = mesher.tetrahedralize(
             np.ascontiguousarray(scale * vertices),

@@ -14,7 +14,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 
 RELAXATIONS = (1e-10, 1e-9)
 """Relaxations of the bounds, tried in turn until a solver succeeds, relative to the largest required correction."""
@@ -40,10 +40,7 @@ def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
 
 
 def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        import piqp
-    except ImportError as error:
-        raise InputError("the solver 'piqp' is not installed: pip install 'guiderail[piqp]'") from error
+    piqp = import_extra("piqp")
     size = rows.shape[1]
     solver = piqp.DenseSolver()
     solver.settings.verbose = False
@@ -58,10 +55,7 @@ def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
 
 
 def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        import osqp
-    except ImportError as error:
-        raise InputError("the solver 'osqp' is not installed: pip install 'guiderail[osqp]'") from error
+    osqp = import_extra("osqp")
     from scipy import sparse
 
     size = rows.shape[1]

@@ -11,7 +11,6 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -204,10 +203,8 @@ def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name not in LOG_FORMATS:
             raise InputError(f"there is no log format {brief(name)}: {did_you_mean(name, LOG_FORMATS)}")
-    if "tensorboard" in names and find_spec("tensorboard") is None:
-        raise InputError("the log format tensorboard needs TensorBoard: pip install 'guiderail[tensorboard]'")
-    if "wandb" in names:
-        require_extra("wandb")
+    for package in {"tensorboard", "wandb"}.intersection(names):
+        require_extra(package)
     return names
 
 

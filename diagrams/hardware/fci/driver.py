@@ -7,7 +7,6 @@ With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
 
 from __future__ import annotations
 
-import importlib
 import logging
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_limits import FRANKA_LIMITS
 
@@ -61,7 +60,7 @@ class FciDriver(PoseDriver):
         super().__init__(url)
         if not url:
             raise InputError("the driver fci needs the robot's host: give --robot-url")
-        self._franky = client or _import_franky()
+        self._franky = client or import_extra("franky")
         self._robot: Any = None
         self._is_lost = False
         self._motion: Any = None
@@ -197,13 +196,6 @@ class FciDriver(PoseDriver):
             raise InputError(f"the connection to the robot at {self.url} is lost: start the program again")
         if not self._robot.recover_from_errors():
             raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
-
-
-def _import_franky() -> Any:
-    try:
-        return importlib.import_module("franky")
-    except ImportError:
-        raise InputError('the driver fci needs franky: pip install "guiderail[fci]"') from None
 
 
 def _flat(X: RigidTransform) -> list[float]:

@@ -278,5 +278,5 @@ def test_station_raises_when_surfaces_are_missing():
 
 def test_station_raises_when_mujoco_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"pip install 'guiderail\[mujoco\]'"):
+    with pytest.raises(InputError, match=r'pip install "guiderail\[mujoco\]"'):
         MujocoStation(CONNECTOR)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, import_extra
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.datasets.formats.recorded import (
@@ -37,14 +37,6 @@ TOPIC = "/demonstration/commanded_pose"
 DATA = "std_msgs/msg/Float64MultiArray"
 _NANO = 1e-9
 _MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bits
-
-
-def _rosbags() -> Any:
-    try:
-        import rosbags.highlevel as highlevel
-    except ImportError:
-        raise InputError("bags need rosbags, which is not installed: pip install 'guiderail[bags]'") from None
-    return highlevel
 
 
 def find_bags(path: Path) -> list[Path]:
@@ -85,7 +77,7 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
 def _read_bag(
     bag: Path, topic: str | None, target: Sequence[float] | None, like: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], list[str]]:
-    highlevel = _rosbags()
+    highlevel = import_extra("rosbags.highlevel")
     from rosbags.typesys import Stores, get_typestore
 
     try:
@@ -202,7 +194,7 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
     Raises:
         InputError: If a bag cannot represent the demonstrations' times, or the folder cannot be written.
     """
-    _rosbags()
+    import_extra("rosbags")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 

@@ -8,7 +8,7 @@ import socket
 from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, import_extra
 from guiderail.tools.experiments.engines.engine import GIVEN_UP, MAX_ATTEMPTS, Engine, Outcome, Work, register_engine
 from guiderail.tools.experiments.engines.process import DEFAULT_PROCESSES
 
@@ -34,11 +34,7 @@ class RayEngine(Engine):
         Raises:
             InputError: If Ray is not installed, or `processes` is given for a cluster.
         """
-        try:
-            import ray
-        except ImportError:
-            raise InputError("the engine ray needs Ray: pip install 'guiderail[ray]', or leave --engine out") from None
-        self._ray: Any = ray
+        self._ray = import_extra("ray")
         self._address = address or os.environ.get("RAY_ADDRESS") or LOCAL
         if self._address != LOCAL and processes is not None:
             raise InputError("a Ray cluster runs as many jobs at once as it has cores: leave --processes out")
