@@ -246,6 +246,11 @@ def _try_contact(folder: Path, contact: Contact, surfaces: dict[str, ContactSurf
         for push in PUSHES if contact.snapping else PUSHES[:1]:
             file = make_file(contact, push)
             aligned = insert(folder, file, snapping=contact.snapping_pieces)
+            if aligned.success and aligned.lowest < -file.tolerance.height:
+                # Nothing stops the plug at the target, and a push would move it on.
+                without = insert(folder, make_file(contact, 0.0), snapping=contact.snapping_pieces)
+                if without.success:
+                    push, file, aligned = 0.0, make_file(contact, 0.0), without
             if aligned.success:
                 # Penetration is largest on the rim, where edges meet.
                 misaligned = tuple(

@@ -52,6 +52,7 @@ class Trial:
     Attributes:
         success: Whether the plug reached the target.
         pose: Final pose of the plug in the socket, position and rotation vector (6,) [m, rad].
+        lowest: Smallest height of the plug above the target [m].
         peak_force: Largest contact force [N].
         penetration: Largest penetration of the parts [m], without snapping pieces.
         resting_penetration: Penetration at the end of the motion, while the plug is pushed at rest [m].
@@ -62,6 +63,7 @@ class Trial:
 
     success: bool
     pose: np.ndarray
+    lowest: float
     peak_force: float
     penetration: float
     resting_penetration: float
@@ -165,10 +167,10 @@ def insert(
     }
     depths = Depths(station, compliant, set(snapping), times[-1] - _AT_REST)
     driven.start(poses[0])
-    steps, blocked = 0, 0
+    steps, blocked, lowest = 0, 0, np.inf
 
     def monitor(root_context: Any) -> EventStatus:
-        nonlocal steps, blocked
+        nonlocal steps, blocked, lowest
         steps += 1
         if steps % _INTERVAL:
             return EventStatus.DidNothing()
@@ -176,8 +178,9 @@ def insert(
             depths.monitor(root_context)
         now = root_context.get_time()
         # A plug that stays far above its command is blocked. Stop then, because the rest would simulate slowly.
-        below = _plug_pose(driven)[2] - np.interp(now, times, poses[:, 2])
-        blocked = blocked + 1 if below > _BLOCKED else 0
+        height = _plug_pose(driven)[2]
+        lowest = min(lowest, height)
+        blocked = blocked + 1 if height - np.interp(now, times, poses[:, 2]) > _BLOCKED else 0
         if blocked * _INTERVAL * station.plant.time_step() < _BLOCKED_TIME:
             return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(station, "blocked")
@@ -191,6 +194,7 @@ def insert(
     return Trial(
         success=is_seated(file, pose),
         pose=pose,
+        lowest=float(min(lowest, pose[2])),
         peak_force=float(recording["contact_force"].max()),
         penetration=depths.deepest,
         resting_penetration=depths.deepest_at_rest,

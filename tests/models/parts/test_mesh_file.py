@@ -55,6 +55,11 @@ def test_load_part_returns_meters(ending, tmp_path):
     assert str(part.repair) == ""
 
 
+def test_load_part_reads_step():
+    part = load_part(Path(__file__).with_name("box.step"), "m")
+    np.testing.assert_allclose(np.ptp(part.bounds, axis=0), [0.01, 0.01, 0.02], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("spoil", "words", "bodies"),
     [

@@ -363,3 +363,16 @@ def test_axis_is_near_the_plug(distance, is_accepted, tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     with nullcontext() if is_accepted else pytest.raises(InputError, match="is not near the plug"):
         read_parts(plug, socket, "mm", (0,) * 6, "+z", (distance, 0, 0))
+
+
+def test_plug_without_a_stop_is_not_pushed_past_the_target(tmp_path):
+    import trimesh
+
+    plug = trimesh.creation.box((8.0, 8.0, 30.0))
+    plate = trimesh.creation.box((30.0, 30.0, 10.0)).difference(trimesh.creation.box((8.4, 8.4, 20.0)))
+    plug.apply_translation((0.0, 0.0, 15.0)).export(tmp_path / "plug.stl")
+    plate.apply_translation((0.0, 0.0, 5.0)).export(tmp_path / "socket.stl")
+    create_task(tmp_path / "plug.stl", tmp_path / "socket.stl", tmp_path / "task", unit="mm", hard_episodes=0)
+    created = yaml.safe_load((tmp_path / "task" / "task.yaml").read_text())
+    assert created["motion"]["push"] == 0.0
+    assert int(created["measured"]["demonstrations_seated"][0]) >= 3

@@ -13,7 +13,7 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is an extra
 
 def test_ray_engine_names_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(InputError, match=r"pip install 'guiderail\[ray\]'"):
+    with pytest.raises(InputError, match=r'pip install "guiderail\[ray\]"'):
         make_engine("ray")
 
 
