@@ -178,3 +178,16 @@ def load_demonstrations(path: Path) -> Demonstrations:
         times, outputs = ([array for part in parts for array in getattr(part, name)] for name in ("times", "outputs"))
         return Demonstrations(times, outputs, parts[0].names)
     return Demonstrations.load(path)
+
+
+def refuse_existing_run(path: Path) -> None:
+    """Raise an InputError if the folder of a new run holds anything but hidden files.
+
+    Hidden files may be left over from a run that was killed before its configuration was written.
+    """
+    try:
+        is_taken = path.exists() and (not path.is_dir() or any(not one.name.startswith(".") for one in path.iterdir()))
+    except OSError as error:
+        raise InputError(f"{brief(path)} is no folder for a run: {error.strerror}") from error
+    if is_taken:
+        raise InputError(f"{path} already exists: name another folder, or resume that run with --resume")

@@ -111,9 +111,11 @@ def train(
     if task is not None and not modules and not resume:
         if out is None:
             raise InputError("the run needs a folder: name one with --out RUN")
+        from guiderail.tools.files import refuse_existing_run
         from guiderail.tools.learning.config import check_choices
         from guiderail.tools.learning.learner import check_log_formats
 
+        refuse_existing_run(out)
         check_log_formats(log or ())
         check_choices(
             task,

@@ -19,7 +19,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import check_environment, task_content
 from guiderail.tools.evaluation.metrics import check_rows
-from guiderail.tools.files import LOCK, remove_partial_files, write_atomically, write_error
+from guiderail.tools.files import LOCK, refuse_existing_run, remove_partial_files, write_atomically, write_error
 from guiderail.tools.imports import import_stored
 from guiderail.tools.learning.config import config_values, make_config
 from guiderail.tools.learning.learner import LearnerConfig
@@ -132,18 +132,8 @@ class RunFolder:
                 self.path.rmdir()
 
     def refuse_existing(self) -> None:
-        """Raise an InputError if the folder holds anything but hidden files.
-
-        Hidden files may be left over from a run that was killed before its configuration was written.
-        """
-        try:
-            is_taken = self.path.exists() and (
-                not self.path.is_dir() or any(not one.name.startswith(".") for one in self.path.iterdir())
-            )
-        except OSError as error:
-            raise InputError(f"{brief(self.path)} is no folder for a run: {error.strerror}") from error
-        if is_taken:
-            raise InputError(f"{self.path} already exists: name another folder, or resume that run with --resume")
+        """Raise an InputError if the folder holds anything but hidden files."""
+        refuse_existing_run(self.path)
 
     def refuse_another(self, config: RunConfig) -> None:
         """Check that the folder holds the run of a configuration.

@@ -255,23 +255,24 @@ for words in ("--version", "--help", "study --help", "evaluate --help", "list ta
 
 
 def test_train_refuses_mistakes_before_slow_imports(tmp_path):
+    (tmp_path / "notes.txt").write_text("")  # the working directory holds files, so it is refused as a run's folder
     code = """
 import sys
 from guiderail.tools.cli.main import main
 for words in (
     "", "--guidance nope", "--env guidance=nope", "--station nope", "--algorithm nope", "--preset nope", "--set nope=1",
-    "--preset tqc_fast --set batch_size=0", "--episodes 0", "--seed -1", "--log nope",
+    "--preset tqc_fast --set batch_size=0", "--episodes 0", "--seed -1", "--log nope", "--out .",
 ):
     try:
-        main(["train", "BncConnector", *words.split(), *(["--out", "run"] if words else [])])
+        main(["train", "BncConnector", *(["--out", "run"] if words else []), *words.split()])
     except SystemExit as end:
         assert end.code == 2, words
     assert not {"pydrake", "pandas", "torch", "scipy"} & set(sys.modules), words
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    assert len(result.stderr.splitlines()) == 11, result.stderr
-    assert not any(tmp_path.iterdir())
+    assert len(result.stderr.splitlines()) == 12, result.stderr
+    assert not (tmp_path / "run").exists()
 
 
 def test_train_draws_no_pictures_when_none_are_wanted(capsys, tmp_path):
