@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.shapes import CLEARANCE, ConvexShape
 from guiderail.models.primitives import LinearConstraints, UnsolvableError
 from guiderail.models.primitives.constraints import TOLERANCE
@@ -32,8 +33,22 @@ class StateConstraints(Protocol):
         ...
 
     def violation(self, output: np.ndarray) -> float:
-        """Return the violation of an output (O,), negative inside."""
+        """Return the violation of an output (O,) [rad], negative inside."""
         ...
+
+
+class Violations(NamedTuple):
+    """Largest violation of each kind of constraint, negative inside and −inf without constraints of the kind.
+
+    Attributes:
+        linear: max(c − G y) with rows of unit norm [unit of the output].
+        shapes: Largest distance into a shape to stay outside of, or out of one to stay inside of [m].
+        state: Largest violation of state constraints, such as joint limits [rad].
+    """
+
+    linear: float
+    shapes: float
+    state: float
 
 
 @dataclass(frozen=True)
@@ -81,12 +96,19 @@ class MotionConstraints:
         """None: the constraints are the same at every step."""
         return None
 
-    def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Return the largest violation of linear, shape and state constraints by one command (O,); negative inside."""
+    def violations(self, output: np.ndarray, step: int = 0) -> Violations:
+        """Return the largest violation of each kind of constraint by one command (O,); negative inside."""
         shapes = [-shape.distance(output[: shape.num_dims]) for shape in self.outside]
         shapes += [shape.distance(output[: shape.num_dims]) for shape in self.inside]
-        further = (constraint.violation(output) for constraint in self.state)
-        return max(self.linear.violation(output, step), *shapes, *further, -np.inf)
+        state = (constraint.violation(output) for constraint in self.state)
+        return Violations(
+            self.linear.violation(output, step), max(shapes, default=-np.inf), max(state, default=-np.inf)
+        )
+
+    def violation(self, output: np.ndarray, step: int = 0) -> float:
+        """Return the largest of the `violations` of a command (O,); an angle counts as its arc at `LEVER`."""
+        linear, shapes, state = self.violations(output, step)
+        return max(linear, shapes, LEVER * state)
 
 
 class MotionConstraintFilter:

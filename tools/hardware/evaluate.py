@@ -74,6 +74,10 @@ def evaluate_on_robot(
     config = folder.config()
     own_policy = Policy.load(folder.path) if make_policy is None else None
     environment = hardware_environment(config.task, config.environment, station)
+    if environment.get("reward") != config.environment.get("reward"):
+        log(
+            f"mean_return is that of the reward {environment['reward']!r}, because the run's own needs simulation state"
+        )
     config = replace(config, environment=environment | connection.environment_options(station))
     path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
     rows: list[dict[str, Any]] = []

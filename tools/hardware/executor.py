@@ -23,6 +23,7 @@ from guiderail.diagrams.hardware.clock import Clock, garbage_collection_disabled
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.control.joint_status import Fault
@@ -332,10 +333,18 @@ def deploy(
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
     """Return a run's environment options without those of the station that it was trained on.
 
+    A reward that needs simulation state is replaced by the task's first one that does not: no policy depends on it.
+
     Raises:
         InputError: If `station` is simulated.
     """
     if STATIONS.get(station).is_simulated:
         raise InputError(f"station {station!r} is a simulation: watch the policy there with guiderail visualize")
-    training_options = EnvConfig.resolve(task, environment).station_kind.options or Options
-    return {name: value for name, value in environment.items() if name not in training_options.model_fields}
+    config = EnvConfig.resolve(task, environment)
+    training_options = config.station_kind.options or Options
+    kept = {name: value for name, value in environment.items() if name not in training_options.model_fields}
+    task_class = TASKS.get(config.task)
+    simulated = getattr(task_class, "simulated_rewards", ())
+    if environment.get("reward") in simulated:
+        kept["reward"] = next(reward for reward in task_class.rewards if reward not in simulated)
+    return kept

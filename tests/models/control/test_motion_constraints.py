@@ -143,3 +143,29 @@ def test_constraints_raise_when_an_argument_is_out_of_range(arguments, match):
 def test_filter_raises_when_the_period_is_not_positive(period):
     with pytest.raises(InputError, match="period"):
         MotionConstraintFilter(MotionConstraints(LINEAR), period)
+
+
+class AngleLimit:
+    """State constraint that the last output is at most 0.1 rad."""
+
+    def linearize(self, output):
+        return -np.eye(2)[1:], np.array([-0.1])
+
+    def violation(self, output):
+        return float(output[1] - 0.1)
+
+
+@pytest.mark.parametrize(
+    ("output", "expected", "largest"),
+    [
+        ([0.3, 0.5], (0.2, 0.1, 0.4), 0.2),
+        ([0.0, 0.5], (-0.1, -0.2, 0.4), 0.1),
+        ([0.0, 0.0], (-0.1, -0.2, -0.1), -0.025),
+    ],
+)
+def test_violations_of_lengths_and_angles_are_apart(output, expected, largest):
+    """The largest of them counts an angle as its arc at 0.25 m."""
+    linear = LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-0.1]))
+    constraints = MotionConstraints(linear, inside=[Sphere([0.0], 0.2)], state=[AngleLimit()])
+    np.testing.assert_allclose(constraints.violations(np.array(output)), expected, atol=1e-12)
+    assert constraints.violation(np.array(output)) == pytest.approx(largest, abs=1e-12)

@@ -846,7 +846,8 @@ def test_state_is_restored_from_its_vector():
 
 def test_torque_that_is_not_finite_counts_as_zero():
     rig = Rig().settle()
-    np.testing.assert_array_equal(rig.estimator.advance(rig.estimate, np.array([np.nan, 2.0])).torque, [0.0, 2.0])
+    for wrong in (np.nan, np.inf, -np.inf):
+        np.testing.assert_array_equal(rig.estimator.advance(rig.estimate, np.array([wrong, 2.0])).torque, [0.0, 2.0])
 
 
 def test_estimator_is_finite_when_its_state_is_not():
@@ -869,3 +870,103 @@ def test_commanded_impulse_is_not_learned_when_the_command_ends():
     for _ in range(10):
         assert rig.check(torque=np.zeros(2)) == Fault.NONE
     np.testing.assert_allclose(rig.state.bias, 0.0, atol=0.02)
+
+
+def test_initial_state_is_zero_without_statuses():
+    state = EstimatorState.initial(2)
+    expected = np.zeros(12 + 20 * 2)
+    expected[2] = Fault.NO_STATUS
+    expected[[4, 8, 10]] = np.nan
+    np.testing.assert_array_equal(state.vector(), expected)
+    assert (state.fault, state.early, state.last_offset, state.accepted_offset) == (Fault.NO_STATUS, 0.0, 0.0, 0.0)
+
+
+def random_status(rng, rig):
+    """Return the status of a simulated robot, falsified with a probability of one tenth, or None."""
+    status, old = rig.status(), rig.sent[-1] if rig.sent else rig.status()
+    rig.sent.append(status)
+    change = 10.0 ** rng.uniform(-4, 0.5, 2) * rng.choice([-1.0, 0.0, 1.0], 2)
+    falsified = (
+        lambda: replace(status, velocities=status.velocities + change),
+        lambda: replace(status, positions=status.positions + 0.02 * change),
+        lambda: replace(status, external_torque=status.external_torque + 20.0 * change),
+        lambda: replace(old, time=status.time),
+        lambda: replace(status, velocities=old.velocities),
+        lambda: replace(status, positions=old.positions),
+        lambda: old,
+        lambda: rig.sent[max(-4, -len(rig.sent))],
+        lambda: replace(status, time=status.time + rng.choice([-1.0, 0.5, 1.0, 8.0, 9.0]) * PERIOD),
+        lambda: replace(status, conflicts=rig.state.conflicts + 1),
+        lambda: replace(status, foreign_commands=rig.state.foreign_commands + 1),
+        lambda: replace(status, positions=np.full(2, np.nan)),
+        lambda: None,
+    )
+    return rng.choice(falsified)() if rng.random() < 0.1 else status
+
+
+def recorded(seed):
+    """Return sums over the estimator's state and 30 checks each, (10,), while faults of all kinds occur."""
+    rng, rig = np.random.default_rng(seed), Rig(limits=replace(LIMITS, settling_time=6 * PERIOD, max_age=8 * PERIOD))
+    rig.sent, sums = [], []
+    for step in range(300):
+        torque = rig.balance + rng.choice([0.0, 4.0]) * rng.standard_normal(2)
+        torque *= (step >= 40, step >= 60)  # without a commanded torque the bias is learned
+        gap = (rig.step + 1 + rng.choice([0.0, 0.0, 0.0, 0.5, -0.5, 2.0])) * PERIOD - rig.now
+        rig.external = EXTERNAL * rng.uniform(0.8, 1.2, 2)
+        rig.check(lambda _, rig=rig: random_status(rng, rig), torque, gap)
+        size = 12 + 20 * 2
+        values = np.nan_to_num(rig.state.vector(), nan=-1.0) * np.cos(np.arange(size))
+        finite_age = min(rig.estimate.age, 10.0)
+        sums.append(values.sum() + rig.estimate.fault + 2.0 * rig.estimate.is_new + 3.0 * finite_age)
+    return np.reshape(sums, (10, 30)).sum(axis=1)
+
+
+@pytest.mark.parametrize(("periods", "is_compared"), [(8.0, True), (8.001, False)])
+def test_statuses_are_compared_up_to_the_maximum_age(periods, is_compared):
+    """Between statuses that are further apart, values may have changed and returned."""
+    rig = Rig(limits=replace(LIMITS, max_age=8 * PERIOD, max_lead=1.0)).settle()
+    rig.check(lambda true: replace(true, positions=true.positions + 4e-4))
+    before = rig.state
+    assert before.residual.any()
+    rig.check(lambda true: replace(true, time=before.last_time + periods * PERIOD), gap=periods * PERIOD)
+    assert rig.state.residual.any() == is_compared
+
+
+def test_first_status_has_no_age():
+    """Before the clocks are synchronized, a difference between them is no age."""
+    rig = Rig()
+    rig.now = 5.0 + CLOCK
+    rig.check()
+    assert (rig.estimate.is_new, rig.estimate.age) == (True, 0.0)
+
+
+@pytest.mark.parametrize(("share", "is_old"), [(0.9995, False), (1.0005, True)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_inconsistent_status_is_old_beyond_the_agreement(joint, share, is_old):
+    """Positions and velocity of one joint contradict each other, and both contradict the prediction."""
+    rig = Rig().settle()
+    predicted, other = rig.state.velocity, np.eye(2)[joint]
+    wrong = share * module.AGREEMENT * other
+    fault = rig.check(
+        lambda true: replace(true, positions=true.positions + 0.5 * PERIOD * other, velocities=CRUISE + wrong)
+    )
+    assert fault == Fault.INCONSISTENT
+    np.testing.assert_allclose(rig.state.velocity, predicted if is_old else predicted + wrong, atol=2e-3)
+
+
+RECORDED = {
+    0: [-2266.329405628, -2085.379557559, -2156.434310693, -2189.282259142, -2133.538923268,
+        -2126.445494212, -2115.928889287, -2214.862761329, -2081.720369681, -2153.444531319],
+    1: [-2264.11268847, -2127.294497457, -2156.411385816, -2154.586427333, -2065.165428004,
+        -2126.248973664, -2030.800514005, -2091.411074537, -2195.66557227, -2134.486176513],
+    2: [-2104.976408498, -2262.674028121, -2165.002381618, -2174.930863794, -2105.460984536,
+        -2119.344136933, -2146.16557792, -2136.237995545, -2173.748841011, -2117.256441564],
+    3: [-2218.643448572, -2019.29925024, -2208.725787128, -2079.624770698, -2164.391990983,
+        -2219.874036089, -1982.400251905, -2134.662438109, -2174.157573395, -2145.168982726],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", RECORDED)
+def test_estimator_repeats_recorded_states(seed):
+    """The numbers were recorded from this estimator; a difference is a change of its behavior."""
+    np.testing.assert_allclose(recorded(seed), RECORDED[seed], rtol=0.0, atol=1e-8)

@@ -166,6 +166,12 @@ def test_hardware_environment_drops_options_of_the_training(monkeypatch):
     assert "end_effector" not in executing.hardware_environment("BncConnector", environment, "hardware")
 
 
+@pytest.mark.parametrize(("reward", "replaced"), [("aligned", "sparse"), ("shaped", "shaped")])
+def test_hardware_environment_replaces_a_reward_of_simulation(reward, replaced):
+    environment = EnvConfig.resolve("BncConnector", {"station": "arm", "reward": reward}).options
+    assert executing.hardware_environment("BncConnector", environment, "hardware")["reward"] == replaced
+
+
 def test_deploy_exits_with_2_when_there_is_no_run(capsys, tmp_path):
     with pytest.raises(SystemExit) as end:
         main(["deploy", str(tmp_path), "--sim"])
