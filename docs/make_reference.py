@@ -507,7 +507,7 @@ def templates() -> str:
     return page + shipped_templates()
 
 
-def worlds() -> str:
+def workcells() -> str:
     """Return the page of workcells and stations with their signals."""
     from pydrake.systems.framework import PortDataType
 
@@ -536,7 +536,7 @@ def worlds() -> str:
         workcell = EnvConfig.resolve(task, {}).make_task().workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
         page += f"`{type(workcell).__module__}.{type(workcell).__name__}`.\n\n"
-        if kind == "workcell":
+        if kind == "insertion":
             page += "Any object with these methods is a workcell:\n\n"
             for protocol in (Workcell, ConvexWorkcell):
                 where = " (for `station=mujoco`)" if protocol is ConvexWorkcell else ""
@@ -740,7 +740,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "names": api,
     "command": command,
     "options": options,
-    "worlds": worlds,
+    "workcells": workcells,
     "templates": templates,
     "studies": studies,
     "files": files,

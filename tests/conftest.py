@@ -16,14 +16,14 @@ settings.load_profile("quick")
 # Tests with Python LCM handlers while a simulator handles subscriptions, which some versions of Drake do not support.
 WITH_HANDLERS = (
     "hardware/test_station.py", "hardware/test_injections.py", "hardware/test_clock.py",
-    "hardware/test_part_randomization.py", "hardware/test_connection.py", "hardware/test_executor.py",
+    "hardware/test_sim_driver.py", "hardware/test_connection.py", "hardware/test_executor.py",
     "hardware/test_train.py", "benchmarks/test_loop.py",
 )  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
     """Skip tests with LCM handlers if a handler would abort the process."""
-    from guiderail.diagrams.hardware.lcm.driver import handlers_are_safe
+    from guiderail.diagrams.hardware.lcm import handlers_are_safe
 
     if not handlers_are_safe():
         for item in items:

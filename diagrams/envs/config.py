@@ -112,7 +112,7 @@ def option_models(task: type[Task], guidance: str, station: str) -> dict[str, ty
     """
     kind = check_guidance(guidance, task.provides(), task.name)
     disturbances: type[Options] = Options
-    if task.workcell_kind == "workcell":
+    if task.workcell_kind == "insertion":
         from guiderail.diagrams.stations.disturbances import Disturbances
 
         disturbances = Disturbances
@@ -164,7 +164,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     name = task.name
     stations = task.stations()
     if not stations:
-        kinds = {STATIONS.get(station).world for station in STATIONS.names()}
+        kinds = {STATIONS.get(station).workcell_kind for station in STATIONS.names()}
         raise InputError(
             f"no station works on a workcell of the kind {brief(task.workcell_kind)}, which {name} has: "
             f"{did_you_mean(task.workcell_kind, kinds)}"

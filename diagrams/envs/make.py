@@ -51,7 +51,7 @@ def make_station(task: Task) -> Station:
     if config.control_period is not None and "control_period" in inspect.signature(kind.build).parameters:
         arguments["control_period"] = task.control_period
     build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
-    if task.workcell_kind == "workcell":
+    if task.workcell_kind == "insertion":
         from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
 
         assert isinstance(disturbances, Disturbances)

@@ -53,7 +53,7 @@ class HardwareOptions(Options):
     robot_timeout: Number = Field(10.0, gt=0, description="how long to wait for the robot's first status [s]")
 
 
-@register_station("hardware", world="workcell", options=HardwareOptions, is_simulated=False)
+@register_station("hardware", workcell_kind="insertion", options=HardwareOptions, is_simulated=False)
 class HardwareStation(Station):
     """A real arm under the impedance controller of this program, behind a `Driver`.
 

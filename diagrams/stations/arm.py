@@ -177,7 +177,7 @@ class ArmOptions(ContactOptions):
     end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
 
 
-@register_station("arm", world="workcell", options=ArmOptions)
+@register_station("arm", workcell_kind="insertion", options=ArmOptions)
 class ArmStation(Station):
     """Arm under a Cartesian impedance controller, and a workcell.
 

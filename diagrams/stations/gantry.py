@@ -76,7 +76,7 @@ class GantryOptions(ContactOptions):
     )
 
 
-@register_station("gantry", world="workcell", options=GantryOptions)
+@register_station("gantry", workcell_kind="insertion", options=GantryOptions)
 class GantryStation(Station):
     """Gantry with joints x, y, z, Rz, Ry, Rx from the target frame to the tool center.
 

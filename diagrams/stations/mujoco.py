@@ -189,7 +189,7 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
     )
 
 
-@register_station("mujoco", world="workcell", options=ContactOptions)
+@register_station("mujoco", workcell_kind="insertion", options=ContactOptions)
 class MujocoStation(Station):
     """`GantryStation` in MuJoCo, with the same ports, joints, impedance, watchdog and filter.
 

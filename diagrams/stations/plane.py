@@ -76,7 +76,7 @@ class PlaneConfig:
         return (1 - np.sqrt(self.mass / inertia)) ** 2 * inertia / self.plant_period**2
 
 
-@register_station("plane", world="plane")
+@register_station("plane", workcell_kind="plane")
 class PlaneStation(Station):
     """Point robot under position control in a plane with walls.
 
@@ -84,13 +84,13 @@ class PlaneStation(Station):
     walls on the robot, averaged over the control step [N], and ``contact_force`` (1,) its norm. ``saturation`` (2,) is
     the force of each joint beyond its limit [N]. ``query`` is the scene graph's, for cameras.
 
-    `walls` and `robot_radius` of the world are simulated; `goal`, `goal_radius`, `zone_x`, `obstacle`,
+    `walls` and `robot_radius` of the workcell are simulated; `goal`, `goal_radius`, `zone_x`, `obstacle`,
     `obstacle_radius`, `obstacles` and `obstacles_move` are only drawn; they act through the constraints,
     terminations and rewards of a task.
     """
 
     def __init__(
-        self, world: PassageGeometry, config: PlaneConfig = PlaneConfig(), control_period: float | None = None
+        self, passage: PassageGeometry, config: PlaneConfig = PlaneConfig(), control_period: float | None = None
     ):
         """Construct the station from the geometry of walls, goal and obstacles.
 
@@ -104,7 +104,7 @@ class PlaneStation(Station):
             exact = whole_multiple(control_period, config.plant_period)
             config = replace(config, substeps=round(exact / config.plant_period))
         builder = DiagramBuilder()
-        self.world, self.config = world, config
+        self.passage, self.config = passage, config
         self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
         # updates of the same instant, so a system that samples the pose would get that of the next plant step.
@@ -116,10 +116,10 @@ class PlaneStation(Station):
         )
         self.plant, self.scene_graph = AddMultibodyPlant(plant_config, builder)
         self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
-        self._robot = _add_robot(self.plant, world, config)
-        _add_walls(self.plant, world, config)
-        _add_markings(self.plant, world)
-        self._obstacle_frames = _add_moving_obstacles(self.plant, world) if world.obstacles_move else []
+        self._robot = _add_robot(self.plant, passage, config)
+        _add_walls(self.plant, passage, config)
+        _add_markings(self.plant, passage)
+        self._obstacle_frames = _add_moving_obstacles(self.plant, passage) if passage.obstacles_move else []
         self.plant.Finalize()
 
         # F = clip(k (x_d - x), ±F_max), against the joints' viscous friction.
@@ -172,65 +172,65 @@ class PlaneStation(Station):
         )
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
-        """Put the obstacles at (n, 2) [m], in a world with moving obstacles; `context` is the root context."""
+        """Put the obstacles at (n, 2) [m], in a workcell with moving obstacles; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         for frame, (x, y) in zip(self._obstacle_frames, obstacles, strict=True):
             frame.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))
 
 
-def _add_robot(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> ModelInstanceIndex:
+def _add_robot(plant: MultibodyPlant, passage: PassageGeometry, config: PlaneConfig) -> ModelInstanceIndex:
     robot = plant.AddModelInstance("robot")
     # The carriage between the joints is nearly massless, so both joints move the same mass.
     carriage = plant.AddRigidBody("carriage", robot, SpatialInertia.SolidSphereWithMass(1e-3 * config.mass, 0.01))
-    ball = plant.AddRigidBody("ball", robot, SpatialInertia.SolidSphereWithMass(config.mass, world.robot_radius))
+    ball = plant.AddRigidBody("ball", robot, SpatialInertia.SolidSphereWithMass(config.mass, passage.robot_radius))
     x = PrismaticJoint("x", plant.world_frame(), carriage.body_frame(), [1, 0, 0], damping=config.damping)
     y = PrismaticJoint("y", carriage.body_frame(), ball.body_frame(), [0, 1, 0], damping=config.damping)
     for joint in (plant.AddJoint(x), plant.AddJoint(y)):
         plant.AddJointActuator(joint.name(), joint, config.max_force)
-    shape = Sphere(world.robot_radius)
+    shape = Sphere(passage.robot_radius)
     plant.RegisterCollisionGeometry(ball, RigidTransform(), shape, "ball", _contact(config))
     plant.RegisterVisualGeometry(ball, RigidTransform(), shape, "ball_visual", np.array([0.1, 0.35, 0.8, 1.0]))
     return robot
 
 
-def _add_walls(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> None:
+def _add_walls(plant: MultibodyPlant, passage: PassageGeometry, config: PlaneConfig) -> None:
     # `walls` bound the robot's center, so they are larger than the real walls by the robot's radius.
-    for name, lower, upper in zip(("left_wall", "right_wall"), *world.walls, strict=True):
-        size = upper - lower - 2 * world.robot_radius
+    for name, lower, upper in zip(("left_wall", "right_wall"), *passage.walls, strict=True):
+        size = upper - lower - 2 * passage.robot_radius
         X_WG = RigidTransform([*(lower + upper) / 2, 0.0])
         shape = Box(*size, 0.1)
         plant.RegisterCollisionGeometry(plant.world_body(), X_WG, shape, name, _contact(config))
         plant.RegisterVisualGeometry(plant.world_body(), X_WG, shape, f"{name}_visual", np.array([0.4, 0.4, 0.42, 1.0]))
 
 
-def _add_markings(plant: MultibodyPlant, world: PassageGeometry) -> None:
-    """Add floor, restricted zone, obstacle and goal as visual geometry."""
+def _add_markings(plant: MultibodyPlant, passage: PassageGeometry) -> None:
+    """Add floor, restricted zone, obstacle and goal as visual passage."""
     body = plant.world_body()
 
     def mark(name: str, shape: Any, x: float, y: float, z: float, color: Any) -> None:
         plant.RegisterVisualGeometry(body, RigidTransform([x, y, z]), shape, name, np.array(color))
 
     mark("floor", Box(3.0, 3.0, 0.001), 0.4, 0.5, -0.06, [0.97, 0.97, 0.95, 1.0])
-    mark("zone", Box(1.0, 3.0, 0.001), world.zone_x + 0.5, 0.5, -0.055, [0.95, 0.72, 0.70, 1.0])
-    mark("goal", Cylinder(world.goal_radius, 0.001), *world.goal, -0.05, [0.55, 0.80, 0.55, 1.0])
-    if not world.obstacles_move:
-        mark("obstacle", _obstacle_shape(world), *world.obstacle, OBSTACLE_Z, OBSTACLE_COLOR)
+    mark("zone", Box(1.0, 3.0, 0.001), passage.zone_x + 0.5, 0.5, -0.055, [0.95, 0.72, 0.70, 1.0])
+    mark("goal", Cylinder(passage.goal_radius, 0.001), *passage.goal, -0.05, [0.55, 0.80, 0.55, 1.0])
+    if not passage.obstacles_move:
+        mark("obstacle", _obstacle_shape(passage), *passage.obstacle, OBSTACLE_Z, OBSTACLE_COLOR)
 
 
-def _add_moving_obstacles(plant: MultibodyPlant, world: PassageGeometry) -> list[FixedOffsetFrame]:
+def _add_moving_obstacles(plant: MultibodyPlant, passage: PassageGeometry) -> list[FixedOffsetFrame]:
     """Add visual obstacles, each welded to a frame that can be moved in the context; return the frames."""
     model, frames = plant.AddModelInstance("obstacles"), []
-    for number, (x, y) in enumerate(world.obstacles):
+    for number, (x, y) in enumerate(passage.obstacles):
         X_WO = RigidTransform([x, y, OBSTACLE_Z])
         frames.append(plant.AddFrame(FixedOffsetFrame(f"place_{number}", plant.world_frame(), X_WO)))
         body = plant.AddRigidBody(f"obstacle_{number}", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
         plant.WeldFrames(frames[-1], body.body_frame())
-        plant.RegisterVisualGeometry(body, RigidTransform(), _obstacle_shape(world), "disc", np.array(OBSTACLE_COLOR))
+        plant.RegisterVisualGeometry(body, RigidTransform(), _obstacle_shape(passage), "disc", np.array(OBSTACLE_COLOR))
     return frames
 
 
-def _obstacle_shape(world: PassageGeometry) -> Cylinder:
-    return Cylinder(world.obstacle_radius, 0.03)
+def _obstacle_shape(passage: PassageGeometry) -> Cylinder:
+    return Cylinder(passage.obstacle_radius, 0.03)
 
 
 def _contact(config: PlaneConfig) -> ProximityProperties:

@@ -108,7 +108,7 @@ class PouringConfig:
         return turned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])
 
 
-@register_station("pouring", world="pouring")
+@register_station("pouring", workcell_kind="pouring")
 class PouringStation(Station):
     """Arm under Cartesian position control that holds a thermos with balls, and a mug on a table.
 

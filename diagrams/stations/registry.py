@@ -20,7 +20,7 @@ class StationKind:
     Attributes:
         name: Name for `station=`.
         build: Function that builds the station from a workcell and options by name.
-        world: Kind of workcell that the station needs, such as "workcell" for a workpiece and a fixture.
+        workcell_kind: Kind of workcell that the station needs, such as "insertion" for a workpiece and a fixture.
         options: Class of the station's environment options; None if it has none.
         description: Summary in one line.
         is_simulated: True for a simulation: a reset can set its state.
@@ -28,7 +28,7 @@ class StationKind:
 
     name: str
     build: Callable[..., Station]
-    world: str
+    workcell_kind: str
     options: type[Options] | None
     description: str
     is_simulated: bool = True
@@ -43,25 +43,27 @@ STATIONS: Registry[StationKind] = Registry(
 
 
 def register_station(
-    name: str, *, world: str, options: type[Options] | None = None, is_simulated: bool = True
+    name: str, *, workcell_kind: str, options: type[Options] | None = None, is_simulated: bool = True
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
     """Return a decorator that registers a class or function that builds a station from a workcell and options.
 
     Args:
         name: Name for `station=`.
-        world: Kind of workcell that the station needs.
+        workcell_kind: Kind of workcell that the station needs.
         options: Class of the station's environment options.
         is_simulated: True for a simulation.
     """
 
     def add(build: Any) -> Any:
         lines = str(build.__doc__ or "").strip().splitlines()
-        STATIONS.register(name, StationKind(name, build, world, options, lines[0] if lines else "", is_simulated))
+        STATIONS.register(
+            name, StationKind(name, build, workcell_kind, options, lines[0] if lines else "", is_simulated)
+        )
         return build
 
     return add
 
 
-def stations_for(world: str) -> list[str]:
+def stations_for(workcell_kind: str) -> list[str]:
     """Return the names of the stations for a kind of workcell."""
-    return [name for name in STATIONS.names() if STATIONS.declared(name, "world") == world]
+    return [name for name in STATIONS.names() if STATIONS.declared(name, "workcell_kind") == workcell_kind]

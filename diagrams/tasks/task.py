@@ -116,7 +116,7 @@ class Task(ABC):
     """
 
     name: ClassVar[str] = ""
-    workcell_kind: ClassVar[str] = "workcell"
+    workcell_kind: ClassVar[str] = "insertion"
     excluded_stations: ClassVar[tuple[str, ...]] = ()
     Options: ClassVar[type[option_models.Options]] = option_models.Options
     Reset: ClassVar[type[option_models.ResetOptions]] = option_models.ResetOptions

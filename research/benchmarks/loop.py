@@ -22,8 +22,8 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.hardware.clock import set_realtime_priority
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell

@@ -132,7 +132,7 @@ def _station(name: str) -> dict[str, Any]:
     kind = STATIONS.get(name)
     return {
         "description": kind.description,
-        "world": kind.world,
+        "workcell_kind": kind.workcell_kind,
         "inputs": list(STATION_INPUTS),
         "outputs": list(STATION_OUTPUTS),
         "options": describe_options(kind.options),

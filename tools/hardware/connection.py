@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.hardware.clock import Clock, WallClock, check_rate
-from guiderail.diagrams.hardware.lcm.driver import LcmDriver
-from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
+from guiderail.diagrams.hardware.lcm import LcmDriver
+from guiderail.diagrams.hardware.lcm_simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import DEFAULT_ROBOT

@@ -15,15 +15,15 @@ from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.clock import set_realtime_priority
-from guiderail.diagrams.hardware.lcm.driver import LcmDriver
+from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, RobotConnection
 from guiderail.tools.hardware.operator import confirm, operator_keys
-from guiderail.tools.hardware.part_randomization import PartRandomizer
 from guiderail.tools.hardware.preflight import confirm_checks
 from guiderail.tools.hardware.robot_env import RobotEnv
+from guiderail.tools.hardware.sim_driver import PartRandomizer
 from guiderail.tools.learning.run_folder import RunConfig
 
 

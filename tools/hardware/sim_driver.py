@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydrake.lcm import DrakeLcm
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
 from guiderail.diagrams.hardware.driver import find_driver, safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver, open_bus
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
+from guiderail.diagrams.hardware.lcm import IiwaDriver, LcmDriver, open_bus
+from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.drake_multibody import pose_to_transform
-from guiderail.tools.hardware.part_randomization import subscribe_part_offsets
 from guiderail.tools.hardware.scenario import load_scenario
 
 DEFAULT_TASK = "BncConnector"
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # initial pose of the default task: the plug above the jack
 START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # initial pose relative to another task's start pose
 PLANT_STEPS_PER_STATUS = 5  # if not in lockstep; a real arm's own control loop has 1 kHz
+PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
 def run_sim_driver(
@@ -75,7 +78,7 @@ def run_sim_driver(
     if driver == "fci":
         if scenario is not None:
             raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
-        from guiderail.diagrams.hardware.fci.simulated import WorkcellSimulator, serve  # needs franky-sim
+        from guiderail.diagrams.hardware.fci_simulated import WorkcellSimulator, serve  # needs franky-sim
 
         fixture = RigidTransform()
         if reset is not None:
@@ -144,3 +147,29 @@ def _insertion_task(name: str) -> InsertionTask:
     if not isinstance(task, InsertionTask):
         raise InputError(f"{name} is done by no arm with a tool: name an insertion")
     return task
+
+
+class PartRandomizer:
+    """Sampler of the offsets of a task's parts, which sends them to the simulated driver."""
+
+    def __init__(self, task: InsertionTask, driver: LcmDriver, seed: int):
+        """Sample the offset of the run; it is the same as in simulation with this seed."""
+        self._task, self._driver = task, driver
+        task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
+
+    def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Move the parts to offsets sampled with the options of a reset in simulation; return the offsets by name."""
+        reset = validate_options(self._task.Reset, options, "a simulated driver")
+        fixture, workpiece = self._task.offsets.draw(rng, reset)
+        self._driver.lcm.Publish(PART_OFFSETS_CHANNEL, json.dumps([fixture.tolist(), workpiece.tolist()]).encode())
+        return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
+
+
+def subscribe_part_offsets(lcm: DrakeLcmInterface, task: InsertionTask, robot: SimulatedIiwa, context: Context) -> None:
+    """Let a simulated robot apply the offsets that a `PartRandomizer` sends; `context` is the root context."""
+
+    def apply(message: bytes) -> None:
+        fixture, workpiece = json.loads(message)
+        task.set_part_offsets(robot, context, np.array(fixture), np.array(workpiece))
+
+    lcm.Subscribe(PART_OFFSETS_CHANNEL, apply)

@@ -200,7 +200,7 @@ class DemonstrationRecorder:
         if out.suffix not in (".npz", ".csv"):
             raise InputError(f"{out} must end in .npz or .csv")
         self.task, self.out = EnvConfig.resolve(task, environment).make_task(), out
-        if self.task.workcell_kind != "workcell":
+        if self.task.workcell_kind != "insertion":
             raise InputError(f"{task} has no tool that an operator can move: demonstrate a task that inserts a part")
         kind = self.task.config.station_kind
         if not kind.is_simulated:

@@ -72,11 +72,6 @@ class GridClampDimensions:
         corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
         return np.concatenate([np.zeros((1, 2)), self.spacing * corners])
 
-    @property
-    def capture_radius(self) -> float:
-        """Largest misalignment of a peg that the chamfers alone correct."""
-        return self.hole_radius - self.peg_radius + self.hole_chamfer + self.peg_chamfer
-
 
 def _around(radius: float) -> float:
     """Return the radius of the corners of a polygon around a circle."""

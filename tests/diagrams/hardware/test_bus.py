@@ -2,7 +2,7 @@
 
 import pytest
 
-from guiderail.diagrams.hardware.lcm.driver import open_bus
+from guiderail.diagrams.hardware.lcm import open_bus
 from guiderail.models.common.errors import InputError
 
 

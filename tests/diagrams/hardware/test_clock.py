@@ -10,8 +10,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.diagrams.hardware import clock as clock_module
 from guiderail.diagrams.hardware.clock import IntervalHistogram, WallClock
 from guiderail.diagrams.hardware.driver import STATUS_PERIOD
-from guiderail.diagrams.hardware.lcm.driver import HEAD_SIZE, IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import (
+from guiderail.diagrams.hardware.lcm import HEAD_SIZE, IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import (
     ACKNOWLEDGED,
     LockstepClock,
     SimulatedIiwa,
@@ -225,7 +225,7 @@ def test_serve_ignores_a_malformed_acknowledgement():
 )
 def test_serve_in_real_time_reports_a_delay_once(monkeypatch, periods, is_reported):
     sent, wall = [], [0.0]
-    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.simulated.time.monotonic", lambda: wall[0])
+    monkeypatch.setattr("guiderail.diagrams.hardware.lcm_simulated.time.monotonic", lambda: wall[0])
 
     def attend():
         attended.append(True)

@@ -8,8 +8,8 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.fci import driver as fci
-from guiderail.diagrams.hardware.fci.driver import FORCE_THRESHOLD_SHARE, FciDriver
+from guiderail.diagrams.hardware import fci as fci
+from guiderail.diagrams.hardware.fci import FORCE_THRESHOLD_SHARE, FciDriver
 from guiderail.diagrams.hardware.pose_control import make_robot_impedance
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant

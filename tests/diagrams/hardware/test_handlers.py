@@ -1,10 +1,10 @@
 import pytest
 from pydrake.lcm import DrakeLcm
 
+from guiderail.diagrams.hardware import lcm as lcm_driver
 from guiderail.diagrams.hardware.clock import WallClock
-from guiderail.diagrams.hardware.lcm import driver as lcm_driver
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import LockstepClock, serve_in_lockstep, serve_in_real_time
+from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import LockstepClock, serve_in_lockstep, serve_in_real_time
 from guiderail.models.common.errors import InputError
 
 

@@ -5,7 +5,7 @@ import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.models.control.joint_status import Heartbeat
 
 OWN, OTHER = np.full(7, 0.5), np.full(7, -0.5)

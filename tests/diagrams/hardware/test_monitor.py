@@ -6,7 +6,7 @@ from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.driver import safety_limits, torque_tolerance
-from guiderail.diagrams.hardware.lcm.driver import HEARTBEAT_FORMAT, IiwaDriver
+from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.hardware.monitor import MAX_REPEATS, MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell

@@ -16,8 +16,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.hardware.driver import find_driver, safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import LockstepClock, SimulatedIiwa
+from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import LockstepClock, SimulatedIiwa
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation

@@ -13,8 +13,8 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell

@@ -23,7 +23,7 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm.driver import HEARTBEAT_FORMAT, IiwaDriver
+from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 

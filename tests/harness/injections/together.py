@@ -1,8 +1,8 @@
 """A simulated robot, its safety monitor and a hardware station, stepped in turn in one process."""
 
 from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
 
 

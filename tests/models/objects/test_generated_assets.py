@@ -63,6 +63,7 @@ def test_generated_clamp_and_table_have_the_given_dimensions():
     assert np.isclose(hole[:, 2], -0.3 * MM).any()
     tip = peg[(peg[:, 2] < 1e-9) & (np.hypot(*peg[:, :2].T) > 1.0 * MM)]
     np.testing.assert_allclose(np.hypot(*tip[:, :2].T) * inside, 3.8 * MM, atol=1e-8)
-    assert dimensions.capture_radius == pytest.approx(0.6 * MM)
+    clearance = dimensions.hole_radius - dimensions.peg_radius
+    assert clearance + dimensions.hole_chamfer + dimensions.peg_chamfer == pytest.approx(0.6 * MM)
     assert "<drake:mu_static>0.3<" in (folder / "grid_table.sdf").read_text()
     assert FRICTION != 0.3

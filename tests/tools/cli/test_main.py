@@ -344,7 +344,7 @@ STATION = """
 from guiderail.diagrams.stations.registry import register_station
 
 
-@register_station("desk", world="workcell", is_simulated=False)
+@register_station("desk", workcell_kind="insertion", is_simulated=False)
 def desk(world):
     raise NotImplementedError
 """

@@ -43,7 +43,7 @@ def make_executor(monkeypatch):
         lcm = DrakeLcm("memq://")
         with monkeypatch.context() as patch:
             # The skill's station opens its bus by URL, and each bus in memory is another one.
-            patch.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
+            patch.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS)
         task = EnvConfig.resolve("BncConnector", OPTIONS).make_task()
         monkeypatch.setattr(task, "num_steps", num_steps)
@@ -87,7 +87,7 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
         imported.extend(imports)
         yield
 
-    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
+    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
     monkeypatch.setattr(executing.Policy, "load", lambda folder: policy)
     monkeypatch.setattr(executing, "set_realtime_priority", lambda: True)
     monkeypatch.setattr(RobotConnection, "simulated_driver", simulated_driver)
@@ -215,7 +215,7 @@ def test_deploy_raises_first_when_out_is_not_writable(monkeypatch, tmp_path):
     def open_bus(url):
         raise AssertionError("the bus was opened")
 
-    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", open_bus)
+    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.open_bus", open_bus)
     monkeypatch.setattr(executing.Policy, "load", lambda folder: lambda observation: np.zeros(2))
     RunFolder(tmp_path / "run").write_config(configure("BncConnector", {"guidance": "kmp"}, episodes=1))
     (tmp_path / "file").write_text("")

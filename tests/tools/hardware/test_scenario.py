@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main

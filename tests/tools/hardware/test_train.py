@@ -12,7 +12,7 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
@@ -38,7 +38,7 @@ def make(patch, start, **options):
     lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
     patch.setattr(declared, "num_steps", 10)
     with patch.context() as bus:
-        bus.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
+        bus.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
         station = make_station(declared)
     task = build_task_diagram(declared, station, make_guidance(declared, station))
     clock, keys, requests = Together(declared.workcell(), lcm, start), OperatorKeys(), []
@@ -201,7 +201,7 @@ def ready(monkeypatch):
     def no_process(connection, *arguments):
         yield
 
-    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
+    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
     monkeypatch.setattr(RobotConnection, "simulated_driver", no_process)
     monkeypatch.setattr(RobotConnection, "clocks", lambda connection, station: (clock, None))
     monkeypatch.setattr("guiderail.tools.hardware.session.set_realtime_priority", lambda: True)

@@ -5,9 +5,9 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
-from guiderail.tools.hardware.part_randomization import PartRandomizer, subscribe_part_offsets
+from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
+from guiderail.tools.hardware.sim_driver import PartRandomizer, subscribe_part_offsets
 
 SEED = 30
 

@@ -18,7 +18,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem
 
 from guiderail.diagrams.hardware.clock import ReceivingStation
-from guiderail.diagrams.hardware.lcm.driver import (
+from guiderail.diagrams.hardware.lcm import (
     HEAD_FORMAT,
     HEAD_SIZE,
     MICROSECOND,

@@ -1,1 +1,0 @@
-"""Drivers of robots that speak the Franka Control Interface."""

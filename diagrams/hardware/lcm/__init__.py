@@ -1,1 +1,0 @@
-"""Drivers on LCM, Drake's message bus, and the simulated driver."""
