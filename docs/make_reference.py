@@ -375,8 +375,8 @@ def options() -> str:
         ],
     )
     page += "## Stations\n\n" + table(
-        ["name", "description", "world"],
-        [(code(n), cell(s["description"]), cell(s["world"])) for n, s in known["stations"].items()],
+        ["name", "description", "workcell kind"],
+        [(code(n), cell(s["description"]), cell(s["workcell_kind"])) for n, s in known["stations"].items()],
     )
     for name, station in known["stations"].items():
         if station["options"]:

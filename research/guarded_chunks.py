@@ -1,6 +1,6 @@
 """Guard of chunks around a base policy: guarded and unguarded rollouts on the same held-out episodes of the connector.
 
-The commands are checked by code of its own: bounds of the task, speed and jerk by differences of the recorded commands.
+Finite differences of the recorded commands are compared with the limits, independently of the code of the guard.
 
 Run it with `python -m research.guarded_chunks --out runs/guarded_chunks`.
 """
@@ -23,7 +23,7 @@ from research.command import Parser, print_result, run_program
 TASK, BASE_POLICY = "BncConnector", "connector_slow_search"
 GUARDS = ("none", "projection", "slowdown")
 MAX_SPEED, MAX_JERK = (0.03, 1.0), (5.0, 200.0)  # of the position [m/s, m/s³] and the angles [rad/s, rad/s³]
-ROUNDING = 1e-9  # share of a limit that the differences of stored numbers may miss it by
+ROUNDING = 1e-9  # relative tolerance of a limit, because stored numbers are rounded
 BLOCK = 10  # episodes of a stored file
 EXCESSES = ("bound_excess", "speed_ratio", "jerk_ratio")
 

@@ -278,14 +278,14 @@ class Task(ABC):
         return None
 
     def scene(self) -> Scene:
-        """Return what a picture shows besides the robot, and the viewpoints."""
+        """Return the contents of a picture other than the robot, and the viewpoints."""
         return Scene(to_world=in_plane)
 
     # Capabilities of the class.
 
     @classmethod
     def stations(cls) -> list[str]:
-        """Return the names of the stations that the task can be done on."""
+        """Return the names of the stations that the task supports."""
         return [name for name in stations_for(cls.workcell_kind) if name not in cls.excluded_stations]
 
     @classmethod

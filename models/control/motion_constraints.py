@@ -125,7 +125,7 @@ class MotionConstraintFilter:
     so that a safe command always exists. The flag is True if only braking is left. Without a largest acceleration,
     braking repeats the last command.
 
-    A start outside of the constraints (after a push, or because the constraints moved) is led back inside; from
+    A start outside of the constraints (after a push, or because the constraints moved) moves back inside; from
     then on every command satisfies all of them.
 
     Args:

@@ -1,4 +1,4 @@
-"""Collision geometry as convex solids, for physics engines that support nothing else."""
+"""Collision geometry as convex solids, for physics engines that support only these."""
 
 from dataclasses import dataclass, field
 

@@ -137,7 +137,7 @@ def join_bodies(surface: ContactSurface) -> Arrays:
 
 
 def make_compliant(
-    kind: str, surfaces: dict[str, ContactSurface], tolerance: float, say: Callable[[str], None]
+    kind: str, surfaces: dict[str, ContactSurface], tolerance: float, log: Callable[[str], None]
 ) -> Iterator[tuple[str, list[Piece]]]:
     """Yield the compliant geometries to try: name of the part and its pieces, the part with fewer triangles first.
 
@@ -145,7 +145,7 @@ def make_compliant(
         kind: One of `KINDS`.
         surfaces: Surfaces by name; only these parts may be compliant.
         tolerance: Largest deviation [m].
-        say: Called with a sentence on each part that does not decompose or that Drake refuses.
+        log: Function called with a sentence on each part that does not decompose or that Drake refuses.
     """
     order = sorted(surfaces, key=lambda name: surfaces[name].num_triangles)
     failure, make, seconds = {
@@ -156,11 +156,11 @@ def make_compliant(
         try:
             pieces = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
         except IsolatedError as error:
-            say(f"{name}: {failure} ({error})")
+            log(f"{name}: {failure} ({error})")
             continue
         accepted = None if pieces is None else accepted_pieces(pieces)
         if accepted is None:
-            say(f"{name}: {failure if pieces is None else 'Drake refuses a piece'}")
+            log(f"{name}: {failure if pieces is None else 'Drake refuses a piece'}")
             continue
         yield name, accepted
 

@@ -105,8 +105,8 @@ class SquaredExponential:
 class Matern52:
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
-    Use this kernel, whose functions are only twice differentiable, for motions for which the squared exponential kernel
-    is too smooth, such as motions with a contact in the middle.
+    Its functions are only twice differentiable. It suits motions for which the squared exponential kernel is too
+    smooth, such as motions with a contact in the middle.
 
     Args:
         length_scale: Length scale ℓ, in the unit of the input, positive.

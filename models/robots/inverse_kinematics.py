@@ -101,7 +101,7 @@ class _Problem:
     def _refine(self, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
         """Refine the solver's solution to the exact pose, with joints at their limits fixed; None if it fails.
 
-        The method is Levenberg-Marquardt with a damping that vanishes with the error: it converges quadratically at a
+        The method is Levenberg-Marquardt with damping proportional to the error: it converges quadratically at a
         regular pose and takes no large steps at a singular one.
         """
         is_free = (q > lower + AT_LIMIT) & (q < upper - AT_LIMIT)

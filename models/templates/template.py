@@ -154,19 +154,19 @@ class SharedControlTemplate:
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. It is also scaled down if one constraint undoes another. Constraints to stay outside of a shape are
-        linearized at the last command, so that the line to the new command is outside too. From a last command inside
-        the constraints, every command is inside. A last command outside (at the start of an episode, or after an object
-        moved) is led inside at the largest speed.
+        object. It is also scaled down if one constraint undoes another. Constraints that keep the end effector outside
+        of a shape are linearized at the last command, so that the line to the new command is outside too. From a last
+        command inside the constraints, every command is inside. A last command outside (at the start of an episode, or
+        after an object moved) moves inside at the largest speed.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
-        fraction = 1.0 / max(1.0, self._load(state, X_WLast, X_WRequest, period_s))
+        fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
         constraints = self._constraints_at(state, X_WLast, frames)
         for _ in range(BACKTRACKS):
             X_WE = between(X_WLast, X_WRequest, fraction)
             for constraint in constraints:
                 X_WE = constraint.project(X_WE, frames)
-            load = self._load(state, X_WLast, X_WE, period_s)
+            load = self._speed_ratio(state, X_WLast, X_WE, period_s)
             if load <= 1.0 and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
                 return Command(X_WE, fraction)
             fraction *= 0.98 / load if load > 1.0 else 0.5
@@ -175,7 +175,7 @@ class SharedControlTemplate:
         X_WE = X_WLast
         for constraint in constraints:
             X_WE = constraint.project(X_WE, frames)
-        load = self._load(state, X_WLast, X_WE, period_s)
+        load = self._speed_ratio(state, X_WLast, X_WE, period_s)
         return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)
 
     def _constraints_at(
@@ -193,7 +193,7 @@ class SharedControlTemplate:
     def can_enter(self, state: int, X_WLast: RigidTransform, frames: Frames, period_s: float) -> bool:
         """Return True if one period is enough to move from the last command into a state's active constraints."""
         X_WE = self.project(state, X_WLast, frames)
-        return self._load(state, X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
+        return self._speed_ratio(state, X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
 
     def _is_inside(self, state: int, X_WE: RigidTransform, frames: Frames) -> bool:
         return self.violation(state, X_WE, frames) <= INSIDE
@@ -212,7 +212,7 @@ class SharedControlTemplate:
             for state in self.states
         )
 
-    def _load(self, state: int, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
+    def _speed_ratio(self, state: int, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
         """Return the speed between two poses relative to a state's limit, the larger of translation and rotation."""
         difference = X_WE.translation() - X_WLast.translation()
         speed, angular_speed = self._max_speeds[state]

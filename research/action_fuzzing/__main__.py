@@ -23,7 +23,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--steps", type=int, help="number of control steps, instead of --episodes")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: 0)")
     parser.add_argument(
-        "--out", type=Path, help="table (.csv), of all tasks a folder; an interrupted campaign is resumed"
+        "--out", type=Path, help="table (.csv), or a folder for all tasks; an interrupted campaign is resumed"
     )
     parser.add_environment()
     parser.add_json()

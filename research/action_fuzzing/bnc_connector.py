@@ -84,8 +84,8 @@ def _distance(corners: np.ndarray, point: np.ndarray) -> float:
 ACTION_DIMS = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
 STANDING_STEPS = 5  # control steps of penetration that are no longer an impact
 _D = BncWorkcell().dimensions
-# Compliant surfaces give way in an impact. A lug whose center is inside a wall could leave it on the other side, as
-# could a barrel that is as deep in the ring as the ring is thick.
+# Compliant surfaces deform in an impact. Beyond these depths a body could leave a wall on the other side: a lug with
+# its center inside the wall, or a barrel as deep in the ring as the ring is thick.
 LIMITS = {
     "lug_impact_mm": _D.lug_radius / MM,
     "barrel_impact_mm": (_D.ring_radius - _D.bore_radius) / MM,

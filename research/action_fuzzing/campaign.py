@@ -45,7 +45,7 @@ class NonFiniteCounter(EnvCallback):
         self._count = 0
 
     def on_step(self, transition: Transition) -> None:
-        """Count those in observation and reward."""
+        """Count the values in observation and reward."""
         self._count += int(np.sum(~np.isfinite(transition.next_observation))) + (not np.isfinite(transition.reward))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -62,7 +62,7 @@ class Case:
     Attributes:
         name: Name in the table.
         environment: Options of the environment.
-        constrained: Whether no action may lead to a command that violates the constraints.
+        constrained: Whether every command must satisfy the constraints.
         options: Options of every reset.
         may_wait: Whether a fallback is allowed, because it means waiting or stopping before a wall.
         limits: Limits of columns; those of the campaign by default.
@@ -89,7 +89,7 @@ class Campaign:
         limits: Largest allowed values of columns, including those of the callback.
         make_callback: Makes a callback that adds numbers to an episode's row; a larger number is worse.
         actions: Kinds of actions, by name.
-        frames: Poses of a template's objects from what a reset sampled; None if unknown.
+        frames: Function from the values sampled at a reset to the poses of a template's objects; None if unknown.
     """
 
     task: str
@@ -177,8 +177,8 @@ def _digest(task: str, environment: Mapping[str, Any]) -> str:
 def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Aggregate episodes: counts, and the largest value of every number.
 
-    `max_commanded_violation` is of constrained cases, and the larger of the reported and the recomputed violation.
-    `disagreement` is the largest difference of the two.
+    `max_commanded_violation` is the larger of the reported and the recomputed violation in constrained cases.
+    `disagreement` is the largest difference between the two.
     """
     table = pd.DataFrame(rows)
     own = [
@@ -246,16 +246,16 @@ def fuzz(
     Args:
         task: Name of a task; one without a campaign is fuzzed as in `own_task`. "all": each of `CAMPAIGNS` gets the
             same number of control steps.
-        episodes: Number of episodes, 1000 by default; not of all tasks.
+        episodes: Number of episodes of one task, 1000 by default.
         steps: Number of control steps, instead.
         seed: Seed of the first episode of each task.
-        out: Table of one task. Of all tasks a folder with a table for each, and a folder with every control step.
+        out: Table of one task; with "all", a folder with a table of each task and a folder with every control step.
             Episodes in it are not run again.
         environment: Options that every case has besides its own.
         report: Called with a line of text after every round.
 
     Returns:
-        Outcomes in `cases` and `all`, and `failures`. Of all tasks `tasks`, `control_steps` and `failures`.
+        The entries `cases`, `all` and `failures`; with "all", the entries `tasks`, `control_steps` and `failures`.
 
     Raises:
         InputError: For an unknown task, or a number out of range.

@@ -13,12 +13,12 @@ from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.evaluation.rollout import EnvCallback
 
-# From the values sampled at a reset to the poses of a template's objects.
+# Maps the values sampled at a reset to the poses of a template's objects.
 Frames = Callable[[Mapping[str, Any]], Mapping[str, RigidTransform]]
 
 
 def nominal_frames(sampled: Mapping[str, Any]) -> Mapping[str, RigidTransform]:
-    """Return no poses: every object is where the template has it."""
+    """Return an empty mapping: every object has its nominal pose."""
     return {}
 
 

@@ -20,7 +20,7 @@ THESIS = {
     "4.6": "KGRL: no collision and no violation; residual RL: many of both; safe residual RL: none",
     "4.7": "the obstacle is avoided within 30 episodes",
     "4.8": "a real robot: a success rate of 1 in 45 episodes, with less force and shorter episodes",
-    "5.2": "KGRL's motion jumps from window to window, sKGRL's goes on smoothly",
+    "5.2": "KGRL's motion jumps from window to window, sKGRL's is smooth",
     "5.3": "as figure 4.3",
     "5.4": "after a push the robot returns as fast as the demonstrations' variance says, never into the zone",
     "5.5": "one motion of KGRL is erratic, five of sKGRL are smooth",

@@ -1,4 +1,4 @@
-"""`assembly-v3` of metaworld: a ring with a handle is put over a peg that is not where the robot believes it to be."""
+"""`assembly-v3` of metaworld: a ring with a handle is put over a peg at an unknown offset."""
 
 from typing import Any
 
@@ -19,18 +19,18 @@ from research.outside_envs.sawyer import (
 )
 from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
-OFFSETS = (0.02, 0.04)  # distance of the believed peg from the true one in y, on either side [m]
+OFFSETS = (0.02, 0.04)  # distance of the assumed peg from the true one in y, on either side [m]
 PARTS = {
     "reach": Part(30, "object_start", OPEN),
     "grasp": Part(28, "object_start", close_at_end, dwell=22),
     "lift": Part(30, "object_start", CLOSED),
-    "place": Part(40, "believed_goal", CLOSED, dwell=30),
+    "place": Part(40, "assumed_goal", CLOSED, dwell=30),
 }
 LENGTH = num_steps(PARTS)
 
 
 class HiddenPeg(HiddenGoal):
-    """Environment whose success is metaworld's."""
+    """Environment with metaworld's criterion of success."""
 
     def __init__(self, seed: int = 0, length: int = LENGTH):
         super().__init__(SawyerNutAssemblyEnvV3(), seed, length, OFFSETS, 0.0, "peg", 10.0)
@@ -44,7 +44,7 @@ class HiddenPeg(HiddenGoal):
         hand, ring = self.raw[:3], self.raw[4:7]
         command = self.unwrapped.data.mocap_pos[0]
         parts = [
-            5 * (hand - self.believed_goal), 10 * (ring - hand), 10 * (ring - self.believed_goal), [self.raw[3]],
+            5 * (hand - self.assumed_goal), 10 * (ring - hand), 10 * (ring - self.assumed_goal), [self.raw[3]],
             20 * (command - hand), 5 * (self.object_start - hand)[:2],
         ]  # fmt: skip
         return np.concatenate(parts).astype(np.float32)

@@ -1,4 +1,4 @@
-"""`NutAssemblySquare` of robosuite with a Panda: a nut is put over a peg that is not where the robot believes it.
+"""`NutAssemblySquare` of robosuite with a Panda: a nut is put over a peg at an unknown offset.
 
 Outputs are the position of the gripper and its yaw; it points downwards. The yaw is 0 where the handle that it grasps
 points along x.
@@ -20,7 +20,7 @@ from research.outside_envs.task import REWARD_SCALE, SUCCESS_REWARD, OutsideTask
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 PERIOD = 0.05  # duration of a step [s]
 STEP, TURN = 0.05, 0.5  # displacement and rotation of an action of 1 [m, rad]
-OFFSETS = (0.01, 0.02)  # distance of the believed peg from the true one in y, on either side [m]
+OFFSETS = (0.01, 0.02)  # distance of the assumed peg from the true one in y, on either side [m]
 HANDLE = 0.054  # distance of the handle from the nut's center [m]
 MAX_YAW = np.radians(110.0)  # of the gripper, because of the range of the last joint
 MAX_LAG = 0.03  # height of the gripper above its command at which the first attempt ends: the nut lies on the peg [m]
@@ -42,17 +42,17 @@ PARTS = {
     "reach": Part(20, "object_start", OPEN),
     "grasp": Part(14, "object_start", close_at_end, dwell=14),  # the gripper takes ten steps to close
     "lift": Part(14, "object_start", CLOSED),
-    "carry": Part(26, "believed_goal", CLOSED),
-    "insert": Part(16, "believed_goal", CLOSED, dwell=4, until=is_blocked),
+    "carry": Part(26, "assumed_goal", CLOSED),
+    "insert": Part(16, "assumed_goal", CLOSED, dwell=4, until=is_blocked),
     # The second attempt: the insertion backwards, and once more. The demonstrations are those of the first.
-    "retract": Part(14, "believed_goal", CLOSED, source="insert", is_reversed=True),
-    "insert again": Part(16, "believed_goal", CLOSED, dwell=14, source="insert"),
+    "retract": Part(14, "assumed_goal", CLOSED, source="insert", is_reversed=True),
+    "insert again": Part(16, "assumed_goal", CLOSED, dwell=14, source="insert"),
 }
 LENGTH = num_steps(PARTS)
 
 
 class HiddenPeg(gymnasium.Env):
-    """robosuite's environment as a Gymnasium environment whose observation has the believed position of the peg.
+    """robosuite's environment as a Gymnasium environment whose observation has the assumed position of the peg.
 
     The reward is robosuite's shaped one (privileged), scaled to be negative before success; the success is robosuite's.
 
@@ -62,10 +62,10 @@ class HiddenPeg(gymnasium.Env):
 
     Attributes:
         true_goal: Position of the handle at the peg, with height 0, and yaw (4,) [m, rad].
-        believed_goal: The same at the believed peg.
+        assumed_goal: The same at the assumed peg.
         object_start: Position of the handle at reset, with height 0, and yaw (4,) [m, rad].
         commanded: Last commanded position and yaw (4,) [m, rad].
-        side: Side of the believed peg, −1 or 1.
+        side: Side of the assumed peg, −1 or 1.
         steps: Steps since the reset.
         length: Steps after which an episode is truncated.
     """
@@ -98,7 +98,7 @@ class HiddenPeg(gymnasium.Env):
         self.object_start = np.array([handle[0], handle[1], 0.0, yaw])
         goal = peg[:2] + HANDLE * np.array([np.cos(direction), np.sin(direction)]) + [0.0, offset]
         self.true_goal = np.array([goal[0], goal[1] - offset, 0.0, goal_yaw])
-        self.believed_goal = np.array([*goal, 0.0, goal_yaw])
+        self.assumed_goal = np.array([*goal, 0.0, goal_yaw])
         self.steps, self._peak_force, self.is_success = 0, 0.0, False
         self.commanded = self.measured()
         return self.observe(), {}
@@ -135,8 +135,8 @@ class HiddenPeg(gymnasium.Env):
         here = self.measured()
         nut = self._nut()
         return np.concatenate([
-            10 * (here - self.believed_goal)[:3], [here[3] - self.believed_goal[3]], 20 * (self._handle() - here[:3]),
-            10 * (nut - self.believed_goal[:3]), 20 * (self.commanded - here), 5 * (here - self.object_start)[:3],
+            10 * (here - self.assumed_goal)[:3], [here[3] - self.assumed_goal[3]], 20 * (self._handle() - here[:3]),
+            10 * (nut - self.assumed_goal[:3]), 20 * (self.commanded - here), 5 * (here - self.object_start)[:3],
         ]).astype(np.float32)  # fmt: skip
 
     @property
@@ -262,7 +262,7 @@ def record_nut(count: int, seed: int, noise: float = 0.003) -> list[Recording]:
         # Grasp, lift, carry and insert begin with waypoints 1, 3, 4 and 5; 2 closes the gripper.
         (events,) = find_events([signal], [lambda s, k=k: s[4] >= k for k in (1, 3, 4, 5)])
         if min(np.diff([0, *events, len(signal) - 1])) >= 3:
-            origins = {"object_start": env.object_start, "believed_goal": env.believed_goal}
+            origins = {"object_start": env.object_start, "assumed_goal": env.assumed_goal}
             recordings.append(Recording(signal[:, :4], events, origins))
     return recordings
 

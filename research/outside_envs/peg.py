@@ -1,4 +1,4 @@
-"""`peg-insert-side-v3` of metaworld, with a hole that is not where the robot believes it to be."""
+"""`peg-insert-side-v3` of metaworld, with a hole at an unknown offset."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from research.outside_envs.sawyer import (
 )
 from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
-OFFSETS = (0.025, 0.05)  # distance of the believed hole from the true one in y, on either side [m]
+OFFSETS = (0.025, 0.05)  # distance of the assumed hole from the true one in y, on either side [m]
 HEIGHT_OFFSET = 0.015  # largest distance in z [m]
 MAX_LAG = 0.035  # lag of the hand behind its command at which the first attempt ends: it presses on the box [m]
 MIN_HEIGHT = 0.045  # of the hand above the table [m]
@@ -30,16 +30,16 @@ def is_blocked(env: Any, observation: Any) -> bool:
     return bool(env.unwrapped.data.mocap_pos[0][0] - env.raw[0] < -MAX_LAG)
 
 
-_FLOORS = {"object_start": MIN_HEIGHT, "believed_goal": MIN_HEIGHT - 0.13 - HEIGHT_OFFSET}  # the hole is 13 cm high
+_FLOORS = {"object_start": MIN_HEIGHT, "assumed_goal": MIN_HEIGHT - 0.13 - HEIGHT_OFFSET}  # the hole is 13 cm high
 LOWER = {name: np.array([-np.inf, -np.inf, height]) for name, height in _FLOORS.items()}
 PARTS = {
     "reach": Part(30, "object_start", OPEN, lower=LOWER["object_start"]),
     "grasp": Part(28, "object_start", close_at_end, dwell=22, lower=LOWER["object_start"]),
-    "carry": Part(34, "believed_goal", CLOSED, lower=LOWER["believed_goal"]),
-    "insert": Part(40, "believed_goal", CLOSED, dwell=10, lower=LOWER["believed_goal"], until=is_blocked),
+    "carry": Part(34, "assumed_goal", CLOSED, lower=LOWER["assumed_goal"]),
+    "insert": Part(40, "assumed_goal", CLOSED, dwell=10, lower=LOWER["assumed_goal"], until=is_blocked),
     # The second attempt: the insertion backwards, and once more. The demonstrations are those of the first.
-    "retract": Part(30, "believed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["believed_goal"]),
-    "insert again": Part(40, "believed_goal", CLOSED, dwell=40, source="insert", lower=LOWER["believed_goal"]),
+    "retract": Part(30, "assumed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["assumed_goal"]),
+    "insert again": Part(40, "assumed_goal", CLOSED, dwell=40, source="insert", lower=LOWER["assumed_goal"]),
 }
 LENGTH = num_steps(PARTS)
 
@@ -72,7 +72,7 @@ class HiddenHole(HiddenGoal):
         hand, peg, head = self.raw[:3], self.raw[4:7], env._get_site_pos("pegHead")
         axis = env.data.site("pegHead").xmat.reshape(3, 3)[:, 0]
         parts = [
-            5 * (hand - self.believed_goal), 10 * (head - self.believed_goal), 10 * (peg - hand), 5 * axis[1:],
+            5 * (hand - self.assumed_goal), 10 * (head - self.assumed_goal), 10 * (peg - hand), 5 * axis[1:],
             [self.raw[3]], 20 * (env.data.mocap_pos[0] - hand), 5 * (self.object_start - hand)[:2], [axis[0]],
             [hand[2]],
         ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Environments of metaworld whose goal is not where the robot believes it to be, and recordings in them."""
+"""Environments of metaworld with a goal at an unknown offset, and recordings in them."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -25,23 +25,23 @@ def close_at_end(phase: float, is_held: bool) -> float:
 class HiddenGoal(gymnasium.Wrapper):
     """Environment of metaworld with an observation, a reward and a success of its own.
 
-    The observation has the believed position of the goal, which lies left or right of the true one; the reward is
+    The observation has the assumed position of the goal, which lies left or right of the true one; the reward is
     metaworld's (privileged), scaled to be negative before success.
 
     Args:
         env: Environment of metaworld.
         seed: Seed of the scene and of the offset.
         length: Steps after which an episode is truncated.
-        offsets: Least and largest distance of the believed goal from the true one in y, on either side [m].
+        offsets: Least and largest distance of the assumed goal from the true one in y, on either side [m].
         height_offset: Largest distance in z [m].
         obstacle: Body whose contact force is measured.
         most: Reward of metaworld that counts as the largest one before success.
 
     Attributes:
         true_goal: Position (3,) of the goal [m].
-        believed_goal: Position (3,) at which the robot believes the goal to be [m].
+        assumed_goal: Position (3,) of the goal that the robot assumes [m].
         object_start: Position (3,) of the object at reset, on the table: its height is 0 [m].
-        side: Side of the believed goal, −1 or 1.
+        side: Side of the assumed goal, −1 or 1.
         steps: Steps since the reset.
         length: Steps after which an episode is truncated.
         raw: Observation of metaworld.
@@ -76,7 +76,7 @@ class HiddenGoal(gymnasium.Wrapper):
         self.side = float((options or {}).get("side", self._rng.choice([-1.0, 1.0])))
         distance, height = self._rng.uniform(*self._offsets), self._rng.uniform(-1, 1) * self._height_offset
         self.true_goal = np.array(env._target_pos)
-        self.believed_goal = self.true_goal + [0.0, self.side * distance, height]
+        self.assumed_goal = self.true_goal + [0.0, self.side * distance, height]
         self.object_start = self.raw[4:7] * [1, 1, 0]
         self.steps, self._peak_force, self.is_success = 0, 0.0, False
         return self.observe(), {}
@@ -158,7 +158,7 @@ def record(
         except ValueError:
             continue
         if min(np.diff([0, *events, len(rows) - 1])) >= MIN_SAMPLES:
-            origins = {"object_start": env.object_start, "believed_goal": env.believed_goal}
+            origins = {"object_start": env.object_start, "assumed_goal": env.assumed_goal}
             recordings.append(Recording(rows[:, :3], events, origins))
     return recordings
 

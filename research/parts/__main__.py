@@ -28,7 +28,7 @@ def main(arguments: list[str]) -> None:
     parser.add_out("parts_benchmark")
     parser.add_argument("--unit", default="m", help="unit of the meshes (default: m)")
     parser.add_argument("--pairs", help="names of pairs, separated by commas (default: all)")
-    parser.add_argument("--every", type=int, default=1, help="only every so many pairs of those prepared are learned")
+    parser.add_argument("--every", type=int, default=1, help="learn only one of this many prepared pairs")
     parser.add_argument("--learn", help=f"difficulties that are learned, of {', '.join(DIFFICULTIES)}; with commas")
     parser.add_argument("--episodes", type=int, default=150, help="training episodes (default: 150)")
     parser.add_argument("--held-out", type=int, default=100, help="evaluated episodes (default: 100)")

@@ -100,7 +100,7 @@ def _prepare(pair: Pair, folder: Path, log: Path) -> dict[str, Any]:
             shutil.rmtree(folder, ignore_errors=True)
             try:
                 measured = create_task(
-                    pair.plug, pair.socket, folder, unit=pair.unit, shrink=shrink, only_insert=True, say=write
+                    pair.plug, pair.socket, folder, unit=pair.unit, shrink=shrink, only_insert=True, log=write
                 )
             except OverlapError as error:
                 write(str(error))

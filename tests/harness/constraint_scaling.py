@@ -1,4 +1,4 @@
-"""Adversary against constraints in every scale: `python tests/harness/constraint_scaling.py [STEPS]`.
+"""Adversary against constraints whose rows are scaled: `python tests/harness/constraint_scaling.py [STEPS]`.
 
 Every row of G and its c is scaled by a random factor from 1e-9 to 1e9. No command, fallbacks included, may violate a
 constraint by more than 1e-9 of the norm of its row.
@@ -52,7 +52,7 @@ def half_spaces(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.nda
 
 
 def actions(rng: np.random.Generator) -> np.ndarray:
-    """Return full deflections (N, 2) that change sign never, sometimes, often or at every step."""
+    """Return actions of ±1 (N, 2) with no, few or many changes of sign, or one at every step."""
     turns = np.cumsum(rng.uniform(size=(STEPS, 2)) < rng.choice([0.0, 0.05, 0.3, 1.0]), axis=0) % 2
     return (1.0 - 2.0 * turns) * rng.choice([-1.0, 1.0], 2) * 10.0 ** rng.uniform(0.0, 5.0)
 

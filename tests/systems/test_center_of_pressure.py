@@ -5,8 +5,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.center_of_pressure import CenterOfPressure
 
 
-def lever(wrench, least_force=0.5):
-    system = CenterOfPressure(least_force)
+def compute(wrench, min_force=0.5):
+    system = CenterOfPressure(min_force)
     context = system.CreateDefaultContext()
     system.get_wrench_input_port().FixValue(context, wrench)
     return system.get_center_of_pressure_output_port().Eval(context)
@@ -16,15 +16,15 @@ def lever(wrench, least_force=0.5):
 def test_center_of_pressure_is_the_point_of_a_point_force(force):
     point = np.array([0.003, -0.004, 0.0])
     pushed = np.array([0.0, 0.0, force])
-    np.testing.assert_allclose(lever([*pushed, *np.cross(point, pushed)]), point[:2])
+    np.testing.assert_allclose(compute([*pushed, *np.cross(point, pushed)]), point[:2])
 
 
 @pytest.mark.parametrize("force", [0.49, 0.0, -5.0])
 def test_center_of_pressure_is_zero_when_the_force_is_small(force):
-    np.testing.assert_array_equal(lever([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
+    np.testing.assert_array_equal(compute([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
 
 
-@pytest.mark.parametrize("least_force", [0.0, -1.0, np.nan])
-def test_constructor_refuses_a_minimum_force_out_of_range(least_force):
+@pytest.mark.parametrize("min_force", [0.0, -1.0, np.nan])
+def test_constructor_refuses_a_minimum_force_out_of_range(min_force):
     with pytest.raises(InputError):
-        CenterOfPressure(least_force)
+        CenterOfPressure(min_force)

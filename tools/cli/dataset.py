@@ -159,6 +159,6 @@ def create_task(
         friction=friction,
         scenario=scenario or (),
         hard_episodes=hard_episodes,
-        say=(lambda text: None) if as_json else print_progress,
+        log=(lambda text: None) if as_json else print_progress,
     )
     print_result(result, as_json)

@@ -184,7 +184,7 @@ def robustness(
         axes=axes,
         baselines=_split(baselines),
         out=out,
-        say=print_message,
+        log=print_message,
         processes=processes,
         trust_policy=trust_policy,
     )

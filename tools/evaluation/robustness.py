@@ -274,7 +274,7 @@ def robustness(
     axes: str | None = None,
     baselines: Mapping[str, MakePolicy] | Sequence[str] | None = (),
     out: Path | None = None,
-    say: Callable[[str], None] = lambda sentence: None,
+    log: Callable[[str], None] = lambda sentence: None,
     processes: int | None = None,
     trust_policy: bool = False,
 ) -> dict[str, Any]:
@@ -295,7 +295,7 @@ def robustness(
             the task.
         out: Folder to write; by default `robustness/<station>` in the run. Required for several policies, and for a
             policy without a run.
-        say: Function called with a sentence on the differences between the runs and one for each point left out.
+        log: Function called with a sentence on the differences between the runs and one for each point left out.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
         trust_policy: True to read a policy file that can execute code.
 
@@ -309,7 +309,7 @@ def robustness(
         raise InputError(f"robustness needs at least one episode at each point, not {episodes}")
     check_processes(processes)
     subjects = [find_subject(policy, task, environment, trust_policy=trust_policy) for policy in policies]
-    compared = _actors(subjects, dict(environment or {}), say)
+    compared = _actors(subjects, dict(environment or {}), log)
     first, folder = compared[0], subjects[0].folder if subjects[0].is_stored else None
     if out is None and (len(policies) > 1 or folder is None):
         raise InputError("give the folder of the table and the picture of several runs, or of no run, with --out")
@@ -326,7 +326,7 @@ def robustness(
     if out is None:
         assert folder is not None
         out = folder.path / "robustness" / str(first.environment.get("station", ""))
-    jobs = _jobs(actors, select_axes(axes), say)
+    jobs = _jobs(actors, select_axes(axes), log)
     rows: list[dict[str, Any]] = []
     for number, (actor, point) in enumerate(jobs, start=1):
         progress = f"{number}/{len(jobs)} {point.axis.name} {point.value:.3g} {actor.name}"
@@ -348,7 +348,7 @@ def robustness(
     return {"table": table, "picture": picture, "rows": rows, "policies": [actor.name for actor in compared]}
 
 
-def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], say: Callable[[str], None]) -> list[_Actor]:
+def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Callable[[str], None]) -> list[_Actor]:
     """Return the policies; several are named by their guidance, or by their folders if two have the same guidance."""
     if not subjects:
         raise InputError("robustness needs the folder of a run")
@@ -371,14 +371,14 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], say: Ca
     ]
     keys = sorted({key for one in settings for key in one})
     if differing := [key for key in keys if any(one.get(key) != settings[0].get(key) for one in settings)]:
-        say(f"the runs differ in {', '.join(differing)}")
+        log(f"the runs differ in {', '.join(differing)}")
     return [
         _Actor(name, subject.make_policy, config, options, subject.digest)
         for name, subject, config, options in zip(names, subjects, configs, changed, strict=True)
     ]
 
 
-def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], say: Callable[[str], None]) -> list[tuple[_Actor, Point]]:
+def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], log: Callable[[str], None]) -> list[tuple[_Actor, Point]]:
     """Return all pairs of policy and point, point by point, so that an incomplete table compares all policies."""
     sentences: dict[str, None] = {}
     pairs: list[tuple[_Actor, Point]] = []
@@ -387,7 +387,7 @@ def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], say: Callable[[str], N
         pairs += [(actor, point) for point in result]
         sentences |= dict.fromkeys(left_out)
     for sentence in sentences:
-        say(sentence)
+        log(sentence)
     order = {(axis.name, value): i for i, (axis, value) in enumerate((a, v) for a in axes for v in a.values)}
     return sorted(pairs, key=lambda pair: order[pair[1].axis.name, pair[1].value])
 

@@ -106,7 +106,7 @@ def choose_contact(
     make_file: MakeFile,
     tolerance: float,
     clearance: float,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> Choice:
     """Return the best contact by `rank`, and write its files into the folder.
 
@@ -116,7 +116,7 @@ def choose_contact(
         make_file: See `MakeFile`.
         tolerance: Largest deviation of the pieces from the surfaces [m].
         clearance: Clearance between the walls [m].
-        say: Called with a sentence on each result.
+        log: Function called with a sentence on each result.
 
     Raises:
         InputError: If no part can be made compliant, or Drake accepts none of the geometries.
@@ -129,7 +129,7 @@ def choose_contact(
 
     def report(reason: str) -> None:
         reasons.append(reason)
-        say(reason)
+        log(reason)
 
     seconds, start = 0.0, _cpu_time()
     for kind in KINDS:
@@ -142,7 +142,7 @@ def choose_contact(
             if refusal:
                 report(f"{name}: Drake refuses its contact geometry ({refusal})")
             else:
-                choices += _adapt_settings(folder, contact, surfaces, make_file, allowed, say)
+                choices += _adapt_settings(folder, contact, surfaces, make_file, allowed, log)
                 if all(rank(max(choices, key=lambda one: rank(one, allowed)), allowed)[:3]):
                     break
             start = _cpu_time()
@@ -197,7 +197,7 @@ def _adapt_settings(
     surfaces: dict[str, ContactSurface],
     make_file: MakeFile,
     allowed: float,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> list[Choice]:
     """Return the choices tried, each with settings derived from the penetration measured with the previous ones.
 
@@ -211,7 +211,7 @@ def _adapt_settings(
         choices.append(choice)
         trials = (choice.aligned, *choice.misaligned)
         resting = max(trial.resting_penetration for trial in trials)
-        say(
+        log(
             f"{contact.describe()}: {'seats' if choice.aligned.success else 'does not seat'}, "
             f"{choice.aligned.peak_force:.1f} N, penetration {1e3 * choice.deepest:.3f} mm, {choice.speed:.1f} × real "
             "time"

@@ -119,7 +119,7 @@ def create_task(
     scenario: Sequence[Path] = (),
     hard_episodes: int = 10,
     only_insert: bool = False,
-    say: Callable[[str], None] = lambda sentence: None,
+    log: Callable[[str], None] = lambda sentence: None,
 ) -> dict[str, Any]:
     """Create a task folder and return its measured properties.
 
@@ -140,7 +140,7 @@ def create_task(
         hard_episodes: Number of episodes of each baseline policy for each setting in the calibration of
             `difficulty=hard`; 0: no calibration.
         only_insert: Stop after the scripted insertions and leave no folder; for benchmarks.
-        say: Called with a sentence on each intermediate result.
+        log: Function called with a sentence on each intermediate result.
 
     Raises:
         InputError: If the parts cannot be used; no folder is left then.
@@ -151,24 +151,24 @@ def create_task(
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     for part in parts:
         if str(part.repair):
-            say(f"{part.path.name}: {part.repair}")
+            log(f"{part.path.name}: {part.repair}")
     if shrink:
         parts = shrink_part(parts[0], shrink), parts[1]
-        say(f"{plug.name}: its surface is moved inwards by {1e3 * shrink:g} mm (--shrink)")
+        log(f"{plug.name}: its surface is moved inwards by {1e3 * shrink:g} mm (--shrink)")
     check_target(*parts)
     path = plan_motion(*parts, turn * DEGREE, CLEAR)
     clearance = measure_side_clearance(*parts)
-    say(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
-    say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
+    log(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
+    log(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
     tolerance = choose_tolerance(clearance)
     (lean_plug, first), (lean_socket, second) = (decimate(part, tolerance) for part in parts)
     snapping = _snapping(lean_plug, lean_socket, path, first + second)
     both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, max(first, second), snapping)
     surfaces = dict(zip(("plug", "socket"), both, strict=True))
     deviation = max(surface.deviation for surface in both)
-    say(_describe_surfaces(parts, both, deviation, clearance))
+    log(_describe_surfaces(parts, both, deviation, clearance))
     sides = find_symmetries(lean_plug, lean_socket, path)
-    say(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
+    log(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
     prepared = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
         "deviation_mm": round(1e3 * deviation, 4),
@@ -186,16 +186,16 @@ def create_task(
         def make_file(contact: Contact, push: float) -> PartTaskFile:
             return _task_file(parts, surfaces, contact, push, values, [file.name for file in scenario])
 
-        choice = choose_contact(folder, surfaces, make_file, tolerance, clearance, say)
+        choice = choose_contact(folder, surfaces, make_file, tolerance, clearance, log)
         task = make_file(choice.contact, choice.push)
-        measured, search = _measure(folder, task, choice, prepared, clock, say)
+        measured, search = _measure(folder, task, choice, prepared, clock, log)
         if not only_insert:
             task = task.model_copy(update={"search": search})
             from guiderail.tools.parts.trial import add_convex_pieces
 
             if not (scenario or choice.contact.snapping):
-                task = add_convex_pieces(folder, task, surfaces, tolerance, say)
-            measured = _write_task(folder, task, choice, measured, hard_episodes, clock, say)
+                task = add_convex_pieces(folder, task, surfaces, tolerance, log)
+            measured = _write_task(folder, task, choice, measured, hard_episodes, clock, log)
     if only_insert:
         shutil.rmtree(out)
         return measured
@@ -290,7 +290,7 @@ def _measure(
     choice: Choice,
     prepared: dict[str, Any],
     clock: Stopwatch,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> tuple[dict[str, Any], SearchNumbers]:
     """Return the measurements of the chosen contact, and those that the scripted search uses."""
     from guiderail.diagrams.tasks.part.file import SearchNumbers
@@ -302,10 +302,10 @@ def _measure(
     )
     trials = (aligned, *misaligned)
     is_blocked = not any(trial.success for trial in misaligned)
-    say(f"misaligned by 1.5 mm: {'blocked (as required)' if is_blocked else 'seated, but must be blocked'}")
+    log(f"misaligned by 1.5 mm: {'blocked (as required)' if is_blocked else 'seated, but must be blocked'}")
     penetration, clearance = 1e3 * max(trial.penetration for trial in trials), prepared["clearance_mm"]
     if clearance is not None and penetration > 0.5 * clearance:
-        say(f"penetration of {penetration:.3f} mm is more than half the clearance ({0.5 * clearance:.3f} mm)")
+        log(f"penetration of {penetration:.3f} mm is more than half the clearance ({0.5 * clearance:.3f} mm)")
     measured = {
         **prepared,
         "preparation_s": round(prepared["preparation_s"] + choice.seconds, 2),
@@ -333,14 +333,14 @@ def _write_task(
     measured: dict[str, Any],
     hard_episodes: int,
     clock: Stopwatch,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> dict[str, Any]:
     """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
     from guiderail.diagrams.tasks.part.file import write_task_file
     from guiderail.tools.parts.difficulty import calibrate
     from guiderail.tools.parts.trial import demonstrate, demonstration_time, triangles_of, write_preview
 
-    say(f"recording demonstrations: about {5.0 * demonstration_time(file) / measured['real_time_factor']:.0f} s")
+    log(f"recording demonstrations: about {5.0 * demonstration_time(file) / measured['real_time_factor']:.0f} s")
     succeeded = demonstrate(folder, file)
     if not succeeded:
         raise InputError(
@@ -353,7 +353,7 @@ def _write_task(
     write_task_file(folder, file)
     if hard_episodes:
         radius = float(np.hypot(*triangles_of(folder / file.plug.visual).reshape(-1, 3)[:, :2].T).max())
-        file = calibrate(folder, file, radius, hard_episodes, say)
+        file = calibrate(folder, file, radius, hard_episodes, log)
         if "hard" in file.measured:
             file.measured["hard"]["seconds"] = round(clock.read() - measured["total_s"], 2)
         write_task_file(folder, file)

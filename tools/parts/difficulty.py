@@ -230,7 +230,7 @@ def turn_of(clearance: float | None, radius: float) -> float:
 
 
 def calibrate(
-    folder: Path, file: PartTaskFile, radius: float, episodes: int, say: Callable[[str], None]
+    folder: Path, file: PartTaskFile, radius: float, episodes: int, log: Callable[[str], None]
 ) -> PartTaskFile:
     """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
 
@@ -239,7 +239,7 @@ def calibrate(
         file: Task file, as written to the folder.
         radius: Largest distance of the plug from the axis [m].
         episodes: Largest number of episodes of each policy for each setting.
-        say: Called with a sentence on the result.
+        log: Function called with a sentence on the result.
     """
     clearance = file.measured.get("clearance_mm")
     force_limit = force_limit_of(file, float(file.measured["force"]))
@@ -250,7 +250,7 @@ def calibrate(
             _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
         )
     except (IsolatedError, InputError) as error:
-        say(f"difficulty=hard is not calibrated: {error}")
+        log(f"difficulty=hard is not calibrated: {error}")
         return file
     demonstrations = Demonstrations.load(folder / file.demonstrations.file)
     seconds = float(np.mean([times[-1] - times[0] for times in demonstrations.times]))
@@ -265,7 +265,7 @@ def calibrate(
         "scripted": f"{score.scripted} of {score.scripted_episodes}",
         "calibrated": is_hard,
     }
-    say(
+    log(
         f"difficulty=hard: socket {nearest / MM:.2f} to {farthest / MM:.2f} mm off, turned by up to {turn:g}°, force "
         f"limit {force_limit:g} N, {seconds:.1f} s: {score}"
         + ("" if is_hard else f"; no setting has at most {MAX_RANDOM:.0%} and at least {MIN_SCRIPTED:.0%}")

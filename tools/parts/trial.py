@@ -327,7 +327,7 @@ def add_convex_pieces(
     file: PartTaskFile,
     surfaces: dict[str, ContactSurface],
     tolerance: float,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> PartTaskFile:
     """Write convex pieces of both parts, and return the task file with their names; unchanged if they do not work.
 
@@ -336,7 +336,7 @@ def add_convex_pieces(
         file: Task file.
         surfaces: Contact surfaces of plug and socket.
         tolerance: Largest deviation of pieces [m].
-        say: Called with a sentence on the result.
+        log: Function called with a sentence on the result.
     """
     written: list[Path] = []
     changes: dict[str, PartModel] = {}
@@ -357,11 +357,11 @@ def add_convex_pieces(
         if not aligned or blocked:
             raise IsolatedError("an aligned plug does not seat" if not aligned else "a misaligned plug is not blocked")
     except IsolatedError as error:
-        say(f"station=mujoco is not offered: {error}")
+        log(f"station=mujoco is not offered: {error}")
         for path in written:
             path.unlink(missing_ok=True)
         return file
-    say(f"station=mujoco: inserted ({' + '.join(str(len(model.convex)) for model in changes.values())} convex pieces)")
+    log(f"station=mujoco: inserted ({' + '.join(str(len(model.convex)) for model in changes.values())} convex pieces)")
     return changed
 
 

@@ -27,7 +27,7 @@ FRICTION = 0.2  # metal on metal
 # fast sliding is decelerated by more than friction, depending on the step (`python -m research.benchmarks engines`).
 MARGIN = 0.1 * MM
 # Stiffness of brass. A softer barrel distributes the load of a rim, which results in a torque on a misaligned plug that
-# metal parts do not have (docs/experiments.md, "Where a plug on the rim feels its force").
+# metal parts do not have (docs/experiments.md, "Center of pressure on the rim").
 BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM, margin=MARGIN)
 LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket: a spring with little friction

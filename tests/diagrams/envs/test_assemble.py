@@ -16,7 +16,7 @@ from guiderail.models.primitives import ReferenceTrajectory
 PERIOD = 0.02
 
 
-def known(turn, station, period=PERIOD):
+def make_prior(turn, station, period=PERIOD):
     """Return the prior knowledge of a motion that turns by `turn` [rad] about z."""
     means = np.zeros((30, 6))
     means[:, 3] = np.linspace(0.0, turn, 30)
@@ -38,7 +38,7 @@ def known(turn, station, period=PERIOD):
 @pytest.mark.parametrize("period", [0.01, 0.1])
 def test_motion_of_another_period_is_refused(period):
     with pytest.raises(InputError, match="has another speed than was demonstrated"):
-        known(1.0, GantryStation, period)
+        make_prior(1.0, GantryStation, period)
 
 
 def test_a_clock_that_is_disturbed_is_no_other_demonstration():
@@ -49,11 +49,11 @@ def test_a_clock_that_is_disturbed_is_no_other_demonstration():
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
 def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
     """From −180° to 180° a measured angle jumps by a full turn, and a history of it would lead all the way round."""
-    assert known(turn, GantryStation).demonstrations is not None
+    assert make_prior(turn, GantryStation).demonstrations is not None
     for station in (ArmStation, HardwareStation):
         with pytest.raises(InputError, match="jumps by a full turn at 180°"):
-            known(turn, station)
-        assert known(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
+            make_prior(turn, station)
+        assert make_prior(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
 
 
 def test_making_an_environment_logs_nothing_of_drake(forks, tmp_path):

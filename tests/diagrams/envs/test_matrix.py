@@ -1,4 +1,4 @@
-"""Every task with every guidance: what has all it needs runs an episode, the rest names what is missing."""
+"""Every task with every guidance: an episode runs, or the error names the missing requirement."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_resolved_options_resolve_to_themselves(task):
 
 
 @pytest.mark.parametrize("task", OWN)
-def test_every_task_can_be_held_out(task):
+def test_every_task_has_held_out_conditions(task):
     env = make_env(task)
     drawn = []
     for options in ({}, {"held_out": True}, {"held_out": True}):

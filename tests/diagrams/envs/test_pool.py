@@ -88,7 +88,7 @@ def test_a_closed_environment_stays_closed():
 def test_memory_does_not_grow_with_environments(close, render_mode):
     process, after = psutil.Process(), []
     make_env("NarrowPassage", guidance="safe_residual").close()  # what the process starts once, and keeps
-    before = held(process)
+    before = count_resources(process)
     for index in range(6):
         env = make_env("NarrowPassage", guidance="safe_residual", render_mode=render_mode)
         env.simulator.set_target_realtime_rate(0.0)
@@ -96,17 +96,17 @@ def test_memory_does_not_grow_with_environments(close, render_mode):
         env.step(env.action_space.sample())
         if render_mode == "human":
             assert env.task.meshcat.HasPath("/drake/visualizer/robot")
-            assert held(process)[:2] > before[:2]
+            assert count_resources(process)[:2] > before[:2]
         if close:
             env.close()
         del env
         gc.collect()
-        after.append((*held(process), process.memory_info().rss / 1e6))
+        after.append((*count_resources(process), process.memory_info().rss / 1e6))
     assert {one[:3] for one in after} == {before}, "threads, descriptors and ports that are listened at"
     assert after[-1][3] - after[1][3] < 5.0, "a diagram of its own each would be 9 MB"
 
 
-def held(process):
+def count_resources(process):
     """Return the number of threads, descriptors and ports of a process."""
     listening = [one for one in process.net_connections() if one.status == psutil.CONN_LISTEN]
     return process.num_threads(), process.num_fds(), len(listening)

@@ -19,7 +19,7 @@ DECISIONS = 8
 
 
 def policy(size):
-    """Something that depends on every observed number, and on nothing else."""
+    """Depend on every observed number and on nothing else."""
     return lambda observation: np.tanh(np.outer(np.arange(1, size + 1), np.sin(observation)).sum(axis=1)).astype(float)
 
 

@@ -1,4 +1,4 @@
-"""Guidance around a base policy: its reference, constraints, and the same numbers as without one by default."""
+"""Guidance around a base policy: reference, constraints, and equality with plain guidance by default."""
 
 import numpy as np
 import pytest

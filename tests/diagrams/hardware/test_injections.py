@@ -18,7 +18,7 @@ INJECTIONS = [
     faults.resized(3, 2),
     faults.garbage(RNG, 2),
     faults.jumped("joint_velocity_estimated", 5, 5.0, 8),
-    faults.loaded(4, 120.0),
+    faults.external_load(4, 120.0),
     faults.clock_jump(-3.0),
     faults.clock_jump(1e4),
     faults.lost(COMMAND, 0.015),

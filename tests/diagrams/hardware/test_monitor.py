@@ -21,21 +21,21 @@ NAMES = lcmt_iiwa_status.__slots__[2:]
 
 
 @pytest.fixture(scope="module")
-def known():
+def arm():
     return ArmControllerPlant(BncWorkcell())
 
 
 class Bus:
     """Bus with a simulated robot, a safety monitor, and records of the monitor's commands and heartbeats."""
 
-    def __init__(self, known, velocity=MOVING):
+    def __init__(self, arm, velocity=MOVING):
         self.lcm, self.step, self.commands, self.heartbeats = DrakeLcm("memq://"), 0, [], []
-        self.plant, self.dynamics = known.plant, JointDynamics(known.plant)
+        self.plant, self.dynamics = arm.plant, JointDynamics(arm.plant)
         self.context = self.plant.CreateDefaultContext()
-        self.limits = safety_limits(known.plant, IiwaDriver)
+        self.limits = safety_limits(arm.plant, IiwaDriver)
         self.positions, self.velocities, self.torque = np.full(7, 0.2), np.array(velocity), np.zeros(7)
         self.clock = self.offset = 0.0
-        self.monitor = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits, clock=lambda: self.now)
+        self.monitor = SafetyMonitor(IiwaDriver(self.lcm), arm.plant, self.limits, clock=lambda: self.now)
         self.lcm.Subscribe("IIWA_COMMAND", self.record_command)
         self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self.heartbeats.append)
 
@@ -94,8 +94,8 @@ class Bus:
         return np.abs(self.velocities).max()
 
 
-def test_monitor_damps_then_rests_when_commands_stop(known):
-    bus = Bus(known).watch()
+def test_monitor_damps_then_rests_when_commands_stop(arm):
+    bus = Bus(arm).watch()
     bus.go(MAX_MISSED_MESSAGES)
     assert bus.commands == []
     moving = bus.speed
@@ -115,22 +115,22 @@ def test_monitor_damps_then_rests_when_commands_stop(known):
     assert len(bus.commands) == count
 
 
-def test_damping_torque_is_clipped_to_its_limits(known):
-    bus = Bus(known, velocity=5.0 * MOVING).watch()
+def test_damping_torque_is_clipped_to_its_limits(arm):
+    bus = Bus(arm, velocity=5.0 * MOVING).watch()
     bus.go(MAX_MISSED_MESSAGES + 1)
     assert (np.abs(bus.commands[-1]) <= np.array(bus.limits.torque)).all()
     assert np.isclose(np.abs(bus.commands[-1]), bus.limits.torque).any()
 
 
-def test_monitor_finishes_damping_when_commands_return(known):
-    bus = Bus(known).watch()
+def test_monitor_finishes_damping_when_commands_return(arm):
+    bus = Bus(arm).watch()
     bus.go(MAX_MISSED_MESSAGES + 1)
     bus.go(5, command=True)
     assert (bus.monitor.state, bus.is_stopping) == (MonitorState.DAMPING, True)
 
 
-def test_monitor_is_idle_without_a_torque_to_stop(known):
-    bus = Bus(known)
+def test_monitor_is_idle_without_a_torque_to_stop(arm):
+    bus = Bus(arm)
     bus.go(50)
     assert bus.monitor.state == MonitorState.IDLE
     bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.zeros(7), 0.0))
@@ -154,9 +154,9 @@ FAULTY = {
 
 
 @pytest.mark.parametrize("name", FAULTY)
-def test_monitor_stops_the_arm_when_a_status_is_wrong(known, name):
+def test_monitor_stops_the_arm_when_a_status_is_wrong(arm, name):
     """And while it stays wrong, although the commanding program goes on, it never repeats a torque."""
-    bus, (changed, fault) = Bus(known).watch(), FAULTY[name]
+    bus, (changed, fault) = Bus(arm).watch(), FAULTY[name]
     moving = bus.speed
     bus.go(1, command=True, **changed)
     assert (bus.monitor.state, bus.monitor.fault, bus.is_stopping) == (MonitorState.DAMPING, fault, True)
@@ -170,15 +170,15 @@ def test_monitor_stops_the_arm_when_a_status_is_wrong(known, name):
 
 
 @pytest.mark.parametrize("message", [bytes(range(100)), b"\x00"])
-def test_monitor_stops_the_arm_when_a_status_cannot_be_decoded(known, message):
-    bus = Bus(known).watch()
+def test_monitor_stops_the_arm_when_a_status_cannot_be_decoded(arm, message):
+    bus = Bus(arm).watch()
     bus.go(1, status=message)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.MALFORMED)
 
 
-def test_monitor_stops_the_arm_when_statuses_stop(known):
+def test_monitor_stops_the_arm_when_statuses_stop(arm):
     """By its own clock; torques are sent without any status, and become zero."""
-    bus = Bus(known).watch()
+    bus = Bus(arm).watch()
     bus.go(MAX_MISSED_MESSAGES + 1, status=False, command=True)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.STALE)
     bus.go(round(bus.limits.damping_time / PERIOD) + 1, status=False)
@@ -186,8 +186,8 @@ def test_monitor_stops_the_arm_when_statuses_stop(known):
     assert bus.speed < 0.15
 
 
-def test_monitor_ignores_commands_of_another_size(known):
-    bus = Bus(known).watch()
+def test_monitor_ignores_commands_of_another_size(arm):
+    bus = Bus(arm).watch()
     for _ in range(MAX_MISSED_MESSAGES + 1):
         bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.ones(3), bus.now))
         bus.lcm.Publish("IIWA_COMMAND", bytes(range(60)))
@@ -195,8 +195,8 @@ def test_monitor_ignores_commands_of_another_size(known):
     assert bus.monitor.state == MonitorState.DAMPING
 
 
-def test_monitor_drops_reordered_statuses(known):
-    bus = Bus(known).watch()
+def test_monitor_drops_reordered_statuses(arm):
+    bus = Bus(arm).watch()
     old = round((100.0 + (bus.step - 1) * PERIOD) * 1e6)
     bus.go(1, command=True, utime=old)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
@@ -212,8 +212,8 @@ def contend(bus, steps, torque, clock=0.0):
 
 @pytest.mark.parametrize("torque", [0.001 * PUSH, -PUSH], ids=["small", "negated"])
 @pytest.mark.parametrize("clock", [0.0, -5.0, 300.0])
-def test_monitor_stops_the_arm_when_two_programs_command(known, torque, clock):
-    bus = Bus(known).watch()
+def test_monitor_stops_the_arm_when_two_programs_command(arm, torque, clock):
+    bus = Bus(arm).watch()
     contend(bus, 3, torque, clock)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.SECOND_COMMANDER)
     contend(bus, 20, torque, clock)
@@ -225,10 +225,10 @@ def test_monitor_stops_the_arm_when_two_programs_command(known, torque, clock):
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
 
 
-def test_two_monitors_stop_the_arm_and_go_on(known):
+def test_two_monitors_stop_the_arm_and_go_on(arm):
     """Each one repeats its torque after a command, but not after the other one's without end."""
-    bus = Bus(known)
-    other = SafetyMonitor(IiwaDriver(bus.lcm), known.plant, bus.limits, clock=lambda: bus.now)
+    bus = Bus(arm)
+    other = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: bus.now)
 
     def go(steps, command=True, **changed):
         for _ in range(steps):
@@ -247,16 +247,16 @@ def test_two_monitors_stop_the_arm_and_go_on(known):
     assert go(200) == [(MonitorState.WATCHING, Fault.NONE)] * 2
 
 
-def test_monitor_announces_its_commands_by_a_heartbeat(known):
-    bus, order = Bus(known).watch(), []
+def test_monitor_announces_its_commands_by_a_heartbeat(arm):
+    bus, order = Bus(arm).watch(), []
     bus.lcm.Subscribe("IIWA_COMMAND", lambda message: order.append("command"))
     bus.lcm.Subscribe(IiwaDriver.heartbeat_channel(), lambda message: order.append(bus.is_stopping))
     bus.go(MAX_MISSED_MESSAGES + 1)
     assert order[-2:] == [True, "command"]
 
 
-def test_monitors_heartbeats_have_its_number(known):
-    first, second = Bus(known), Bus(known)
+def test_monitors_heartbeats_have_its_number(arm):
+    first, second = Bus(arm), Bus(arm)
     first.go(3)
     second.go(1)
     sent = [HEARTBEAT_FORMAT.unpack(message) for message in first.heartbeats]
@@ -265,8 +265,8 @@ def test_monitors_heartbeats_have_its_number(known):
     assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
 
 
-def test_monitor_checks_once_per_period_without_a_new_status(known):
-    bus = Bus(known)
+def test_monitor_checks_once_per_period_without_a_new_status(arm):
+    bus = Bus(arm)
     bus.go(1)
     bus.monitor.receive()
     bus.settle()
@@ -275,7 +275,7 @@ def test_monitor_checks_once_per_period_without_a_new_status(known):
     assert len(bus.heartbeats) == 2
 
 
-def test_monitor_asks_the_driver_to_hold_after_a_status_fault(known):
+def test_monitor_asks_the_driver_to_hold_after_a_status_fault(arm):
     held = []
 
     class Holding(IiwaDriver):
@@ -284,7 +284,7 @@ def test_monitor_asks_the_driver_to_hold_after_a_status_fault(known):
         def hold(self):
             held.append(True)
 
-    bus = Bus(known)
+    bus = Bus(arm)
     bus.monitor = SafetyMonitor(Holding(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
     bus.watch()
     bus.go(3, joint_velocity_estimated=[np.nan] * 7)
@@ -296,6 +296,6 @@ def test_monitor_asks_the_driver_to_hold_after_a_status_fault(known):
     assert (len(held) <= 3 + round(0.5 / PERIOD), len(bus.commands)) == (True, 2)
 
 
-def test_torque_tolerances_are_a_share_of_the_limits(known):
-    limits = safety_limits(known.plant, IiwaDriver)
+def test_torque_tolerances_are_a_share_of_the_limits(arm):
+    limits = safety_limits(arm.plant, IiwaDriver)
     np.testing.assert_allclose(torque_tolerance(limits), 0.02 * np.array(limits.torque))

@@ -11,14 +11,17 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 
-def drawn(uncertain, count, seed=0):
+def sample_offsets(uncertain, count, seed=0):
     rng = np.random.default_rng(seed)
     return [np.concatenate(uncertain.draw(rng, InsertionReset())) for _ in range(count)]
 
 
 @pytest.mark.parametrize("kind", ["per_run", "per_episode", "none"])
 def test_tilt_is_sampled_within_bounds_without_side_effects(kind):
-    straight, tilted = drawn(BncUncertainty(kind), 50), drawn(BncUncertainty(kind, grasp_angle=1.0), 50)
+    straight, tilted = (
+        sample_offsets(BncUncertainty(kind), 50),
+        sample_offsets(BncUncertainty(kind, grasp_angle=1.0), 50),
+    )
     assert np.shape(straight) == (50, 4)
     angles = np.linalg.norm(np.array(tilted)[:, 4:], axis=1)
     assert 0.8 < np.rad2deg(angles.max()) <= 1.0

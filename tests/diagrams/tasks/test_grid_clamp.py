@@ -50,7 +50,7 @@ def env():
 
 
 @pytest.fixture(scope="module")
-def known():
+def env_without_offsets():
     return make_env("GridClamp", fixture_offset="none")
 
 
@@ -64,10 +64,10 @@ def arm():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_straight_descent_inserts_without_offsets(known, seed):
-    info, total, terms = play(known, lambda _: DOWN, seed=seed)
+def test_straight_descent_inserts_without_offsets(env_without_offsets, seed):
+    info, total, terms = play(env_without_offsets, lambda _: DOWN, seed=seed)
     assert info["termination"] == "success"
-    assert known.trace.statistics()["peak_force"] <= 10.0
+    assert env_without_offsets.trace.statistics()["peak_force"] <= 10.0
     assert total == pytest.approx(sum(terms.values()))
     assert terms["terminal_reward"] == 50.0
     # What it came down is what it is paid for, 300 a meter, from 15 to 18 mm.
@@ -133,10 +133,10 @@ def test_without_the_cuboid_a_push_is_a_collision():
     assert info["contact_force"] > COLLISION_FORCE
 
 
-def test_force_costs_unless_it_is_left_out(known):
+def test_force_costs_unless_it_is_left_out(env_without_offsets):
     """The same episode, with and without: the difference is the cost of force."""
     without = make_env("GridClamp", fixture_offset="none", reward="no_force")
-    _, with_cost, terms = play(known, lambda _: DOWN, seed=1)
+    _, with_cost, terms = play(env_without_offsets, lambda _: DOWN, seed=1)
     _, without_cost, _ = play(without, lambda _: DOWN, seed=1)
     assert terms["force_cost"] < -0.5
     assert with_cost - without_cost == pytest.approx(terms["force_cost"])

@@ -1,4 +1,4 @@
-"""Pouring where the mug is not where the template believes it is."""
+"""Pouring with a mug at an offset that the template does not contain."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Files with code in them: whatever a command reads, nothing in it is executed.
+"""Files with code in them: no command executes them.
 
 Each input is a valid file with code in some places: as a name to import, a tag, an expression, a format, or a pickled
 object. Executed code would touch a file. An audit hook of the interpreter also reports unpickled objects, started
@@ -201,7 +201,7 @@ CSV = b"time,x [m],y [m],z [m]\n0,0,0,0\n0.1,1,2,3\n0.2,2,3,4\n"
 BOX = b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\nmtllib m.mtl\n"
 
 
-def written(folder, files):
+def write_files(folder, files):
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
@@ -327,7 +327,7 @@ def kind(request, tmp_path_factory):
     folder.mkdir()
     files, read = KINDS[request.param]
     files = files(folder) if callable(files) else files
-    written(folder, files)
+    write_files(folder, files)
     read(folder)  # imports what reading needs
     return folder, files, read
 
@@ -336,12 +336,12 @@ def kind(request, tmp_path_factory):
 def test_no_file_of_a_folder_is_executed(kind, canary, data):
     folder, files, read = kind
     name = data.draw(st.sampled_from(sorted(files)))
-    written(folder, {name: data.draw(with_code(files[name], canary))})
+    write_files(folder, {name: data.draw(with_code(files[name], canary))})
     try:
         with watched(canary):
             read(folder)
     finally:
-        written(folder, {name: files[name]})
+        write_files(folder, {name: files[name]})
 
 
 @given(st.data())

@@ -42,7 +42,7 @@ def passes(message: bytes) -> list[bytes]:
 class Observation:
     """Effect of a fault, observed on the robot's side."""
 
-    detected: float | None = None  # time from the fault's begin to its detection [s]
+    detected: float | None = None  # time from the beginning of the fault to its detection [s]
     fault: str = ""
     fastest: float = 0.0  # speed of the fastest joint at the detection [rad/s]
     after: float = 0.0  # largest speed from `STOPPED_WITHIN` after the detection [rad/s]
@@ -186,7 +186,7 @@ class Bus:
             self._send(self.near_robot, IiwaDriver.command_channel, self.on_command(message))
 
     def desired(self) -> np.ndarray:
-        """Return the desired pose: on a circle, turning to and fro."""
+        """Return the desired pose: on a circle, with an oscillating rotation."""
         phase = 2.0 * np.pi * FREQUENCY * self.step * PERIOD
         return START + [RADIUS * np.cos(phase), RADIUS * np.sin(phase), 0.0, TURN * np.sin(phase), 0.0, 0.0]
 
@@ -248,7 +248,7 @@ class Bus:
     def watch(
         self, seconds: float, repair: Callable[[], None], duration: float, standstill: float = STANDSTILL
     ) -> Observation:
-        """Observe the effect of a fault that has just begin.
+        """Observe the effect of a fault that has just begun.
 
         Args:
             seconds: Time to observe [s].
@@ -288,7 +288,7 @@ class Bus:
         return observation
 
 
-def changed(message: bytes, **fields: object) -> bytes:
+def with_fields(message: bytes, **fields: object) -> bytes:
     """Return a status with other values."""
     status = lcmt_iiwa_status.decode(message)
     for name, value in fields.items():

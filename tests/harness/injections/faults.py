@@ -12,7 +12,7 @@ from drake import lcmt_iiwa_status
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
 
 from . import bus as buses
-from .bus import PERIOD, Bus, changed, passes
+from .bus import PERIOD, Bus, passes, with_fields
 
 TOLERATED, STOPS = (
     (MAX_MISSED_MESSAGES - 2) * PERIOD,
@@ -139,7 +139,7 @@ def not_finite(field: str, joints: list[int], value: float, messages: int) -> In
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
         for joint in joints:
             values[joint] = value
-        return changed(message, **{field: values})
+        return with_fields(message, **{field: values})
 
     return replaced("status NaN", f"{value} in {field}{joints}", change, messages)
 
@@ -148,7 +148,7 @@ def resized(joints: int, messages: int) -> Injection:
     """Change the number of joints."""
 
     def change(message: bytes) -> bytes:
-        return changed(message, num_joints=joints, **{name: [0.0] * joints for name in JOINT_FIELDS})
+        return with_fields(message, num_joints=joints, **{name: [0.0] * joints for name in JOINT_FIELDS})
 
     return replaced("status wrong size", f"{joints} joints", change, messages)
 
@@ -174,18 +174,18 @@ def jumped(field: str, joint: int, by: float, messages: int) -> Injection:
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
         values[joint] += by
-        return changed(message, **{field: values})
+        return with_fields(message, **{field: values})
 
     return replaced("status jumped", f"{field}[{joint}] by {by:.2f}", change, messages)
 
 
-def loaded(joint: int, torque: float) -> Injection:
+def external_load(joint: int, torque: float) -> Injection:
     """Load a joint with more than its limit."""
 
     def change(message: bytes) -> bytes:
         values = list(lcmt_iiwa_status.decode(message).joint_torque_external)
         values[joint] += torque
-        return changed(message, joint_torque_external=values)
+        return with_fields(message, joint_torque_external=values)
 
     return replaced("external torque", f"{torque:.0f} Nm on joint {joint}", change, 1)
 
@@ -196,7 +196,7 @@ def clock_jump(seconds: float) -> Injection:
     def relay(message: bytes) -> list[bytes]:
         if not message:
             return [message]
-        return [changed(message, utime=lcmt_iiwa_status.decode(message).utime + round(seconds * 1e6))]
+        return [with_fields(message, utime=lcmt_iiwa_status.decode(message).utime + round(seconds * 1e6))]
 
     stops = True if abs(seconds) >= STOPS else None
     return Injection("clock jump", f"{seconds} s", _at("on_status", relay), _repair, 0.3, stops)
@@ -270,7 +270,7 @@ def all_kinds(rng: np.random.Generator) -> Iterator[Injection]:
     yield jumped(
         "joint_velocity_estimated", int(rng.integers(7)), float(rng.choice([-1, 1]) * rng.uniform(1.8, 9)), few()
     )
-    yield loaded(int(rng.integers(7)), float(rng.uniform(50.0, 200.0)))
+    yield external_load(int(rng.integers(7)), float(rng.uniform(50.0, 200.0)))
     yield clock_jump(float(rng.choice([-1, 1])) * float(np.exp(rng.uniform(np.log(0.01), np.log(1e5)))))
     yield controller_held_up(duration(2.0))
     yield controller_killed(duration(1.0) + STOPS)

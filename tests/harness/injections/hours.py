@@ -33,7 +33,7 @@ def stops(rng: np.random.Generator) -> Iterator[faults.Injection]:
     while True:
         yield faults.lost("on_status", 0.2)
         yield faults.not_finite("joint_position_measured", [int(rng.integers(7))], np.nan, 3)
-        yield faults.loaded(int(rng.integers(7)), 150.0)
+        yield faults.external_load(int(rng.integers(7)), 150.0)
         yield faults.lost("on_command", 0.2)
         yield faults.controller_held_up(0.2)
         yield faults.controller_killed(0.1)

@@ -117,7 +117,7 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str) -> N
 
 
 def _grafted(before: tuple | None, after: tuple | None) -> tuple | None:
-    """Return defaults of which the numbers are those of a mutant."""
+    """Return defaults with the numbers of a mutant."""
     if before is None or after is None or len(before) != len(after):
         return after
     return tuple(b if isinstance(b, int | float) else a for a, b in zip(before, after, strict=True))
@@ -161,7 +161,7 @@ class _Coverage:
 
 
 class _Session:
-    """Pytest plugin that works with the collected tests in place of running them."""
+    """Pytest plugin that passes the collected tests to a function and does not run them."""
 
     def __init__(self, work: Callable[[dict[str, Any]], None]):
         self.work = work
@@ -174,7 +174,7 @@ class _Session:
 
 
 def with_tests(tests: list[str], work: Callable[[dict[str, Any]], None], plugins: list[Any]) -> None:
-    """Collect tests and work with them, by name."""
+    """Collect tests and call `work` with them, by name."""
     quiet = ["-q", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-p", "no:xdist", "-W", "ignore"]
     if pytest.main([*quiet, *tests], plugins=[_Session(work), *plugins]) != 0:
         raise SystemExit(f"{' '.join(tests)} cannot be collected")

@@ -95,7 +95,7 @@ def executed(made, actions, start):
 
 
 def adversaries(rng, number):
-    """Yield sequences of full deflections that change sign never, sometimes, often or at every step."""
+    """Yield sequences of ±1 with no, few or many changes of sign, or one at every step."""
     for i in range(number):
         turns = np.cumsum(rng.uniform(size=STEPS) < (0.0, 0.05, 0.3, 1.0)[i % 4]) % 2
         yield (2.0 * turns - 1.0) * rng.choice([-1.0, 1.0])
@@ -333,7 +333,7 @@ TAMPERED = {
     "an unknown claim": lambda c: signed(c, peak_force=lambda _: 1.0),
     "an unknown claim of a regime": lambda c: signed(c, always__jerk=lambda _: [[0.0, 0.0]] * STEPS),
     "a regime, left out": lambda c: signed(c, free=lambda _: DROPPED),
-    "a budget from nowhere": lambda c: signed(c, budgeted=lambda _: {"excess": [[0.0], [0.0]]}),
+    "a budget without a claim": lambda c: signed(c, budgeted=lambda _: {"excess": [[0.0], [0.0]]}),
     "a number as text": lambda c: signed(c, period=lambda period: str(period)),
     "numbers as text": lambda c: signed(c, always__upper=lambda rows: [[str(x) for x in row] for row in rows]),
     "a number as a bool": lambda c: signed(c, always__upper=lambda rows: [[True, *rows[0][1:]], *rows[1:]]),
@@ -357,7 +357,7 @@ TAMPERED = {
     "a row of zeros": lambda c: signed(altered(c, "constraints.npz", G=np.zeros_like)),
     "the clock": lambda c: signed(altered(c, "primitive.npz", clock=lambda clock: 1e-14 * clock)),
     "an uneven clock": lambda c: signed(altered(c, "primitive.npz", clock=lambda clock: clock * np.arange(STEPS))),
-    "a clock that stands": lambda c: signed(altered(c, "primitive.npz", clock=np.zeros_like)),
+    "a clock without progress": lambda c: signed(altered(c, "primitive.npz", clock=np.zeros_like)),
     "an unknown array": lambda c: signed(altered(c, "primitive.npz", inputs=lambda _: np.arange(STEPS + 10.0))),
     "a history in fractions": lambda c: signed(altered(c, "primitive.npz", history=lambda h: h + 0.5)),
     "a covariance that is not symmetric": lambda c: signed(
@@ -386,11 +386,11 @@ TAMPERED = {
     "a mean that is no number": lambda c: signed(altered(c, "primitive.npz", means=at((30, 0), factor=np.nan))),
     "a start below zero": lambda c: signed(altered(c, "primitive.npz", start_within=lambda within: -within)),
     "the period, and the speeds with it": lambda c: faster(c, 2.0),
-    "a period without end": lambda c: faster(c, np.inf),
-    "that anything is assumed": lambda c: signed(c, assumes=lambda sentences: []),
+    "an infinite period": lambda c: faster(c, np.inf),
+    "no list of assumptions": lambda c: signed(c, assumes=lambda sentences: []),
     "a sentence that is assumed": lambda c: signed(c, assumes=lambda sentences: sentences[:-1]),
     "the words of a sentence": lambda c: signed(c, assumes=lambda them: [them[0].replace("-1", "-2"), *them[1:]]),
-    "a sentence too many": lambda c: signed(c, assumes=lambda sentences: [*sentences, OTHER_CLOCK]),
+    "an added sentence": lambda c: signed(c, assumes=lambda sentences: [*sentences, OTHER_CLOCK]),
     "a file, unsigned": lambda c: altered(c, "primitive.npz", gains=lambda gains: 1.0 * gains + 1e-9),
 }
 
@@ -556,7 +556,7 @@ def test_certificate_states_a_period_unlike_the_clock(tmp_path):
         checker.check(write(tmp_path, faster(contents, 1.0, OTHER_CLOCK)))
 
 
-def told(folder, capsys, monkeypatch):
+def run_checker(folder, capsys, monkeypatch):
     """Return the exit code and the output of the checker as a program."""
     monkeypatch.setattr(sys, "argv", ["checker.py", str(folder)])
     try:
@@ -584,8 +584,8 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("what", MALFORMED)
-def test_checker_rejects_content_that_is_not_a_certificates(honest, what, tmp_path, capsys, monkeypatch):
-    code, out = told(write(tmp_path, MALFORMED[what](honest)), capsys, monkeypatch)
+def test_checker_rejects_invalid_content(honest, what, tmp_path, capsys, monkeypatch):
+    code, out = run_checker(write(tmp_path, MALFORMED[what](honest)), capsys, monkeypatch)
     assert code == 1
     assert out.startswith("no: ")
     assert out.count("\n") == 1
@@ -593,15 +593,15 @@ def test_checker_rejects_content_that_is_not_a_certificates(honest, what, tmp_pa
 
 @pytest.mark.parametrize("what", NONE)
 def test_checker_reports_unreadable_files_with_exit_code_2(honest, what, tmp_path, capsys, monkeypatch):
-    code, out = told(write(tmp_path, NONE[what](honest)), capsys, monkeypatch)
+    code, out = run_checker(write(tmp_path, NONE[what](honest)), capsys, monkeypatch)
     assert code == 2
     assert out.startswith("no: the files make no sense")
     assert out.count("\n") == 1
 
 
 def test_checker_exits_with_0_or_1(honest, tmp_path, capsys, monkeypatch):
-    assert told(write(tmp_path, honest), capsys, monkeypatch) == (0, "yes\n")
-    code, out = told(write(tmp_path, TAMPERED["a speed"](honest)), capsys, monkeypatch)
+    assert run_checker(write(tmp_path, honest), capsys, monkeypatch) == (0, "yes\n")
+    code, out = run_checker(write(tmp_path, TAMPERED["a speed"](honest)), capsys, monkeypatch)
     assert code == 1
     assert out.startswith("no: step 20: always speed of output 0 is ")
 

@@ -10,17 +10,17 @@ from guiderail.models.primitives.reference import information_criteria
 from oracles.handwriting import LETTERS, correlated, write
 
 
-def share_of_what_was_shown(demonstrations, motion):
+def share_within_deviation(demonstrations, motion):
     """Compute the share of steps with all outputs within one standard deviation of the demonstrations' mean."""
     outputs = np.stack(demonstrations.outputs)
     return float((np.abs(motion - outputs.mean(axis=0)) <= outputs.std(axis=0, ddof=1)).all(axis=1).mean())
 
 
-# In meters and near zero, or in millimeters and far from it: neither may matter.
+# The unit and the origin of the coordinates must not affect the fit.
 PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 
-# `letters.py` beside this file writes down what was chosen for longer ones, and why.
+# `letters.py` in this folder records the selection for longer letters.
 @pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
 def test_fitted_letter_stays_within_the_demonstrations(letter, page):
     selection = fit(write(letter, count=4, steps=60, **page))
@@ -31,26 +31,26 @@ def test_fitted_letter_stays_within_the_demonstrations(letter, page):
 
 def test_fitted_letter_with_corners_stays_within_the_deviation():
     shown = write("B", count=5, steps=100)
-    assert share_of_what_was_shown(shown, motion_without_actions(fit(shown).primitive())) >= MIN_SHARE
+    assert share_within_deviation(shown, motion_without_actions(fit(shown).primitive())) >= MIN_SHARE
 
 
 @pytest.fixture(scope="module")
-def together():
+def demonstrations():
     return correlated(count=4, steps=80)
 
 
 @pytest.fixture(scope="module")
-def selection(together):
-    return fit(together)
+def selection(demonstrations):
+    return fit(demonstrations)
 
 
-def test_fit_reproduces_correlated_outputs(together, selection):
-    """At a correlation of 0.98, the standard deviation across is a seventh of that along."""
-    outputs = np.stack(together.outputs)
+def test_fit_reproduces_correlated_outputs(demonstrations, selection):
+    """At a correlation of 0.98, the standard deviation across the main direction is a seventh of that along it."""
+    outputs = np.stack(demonstrations.outputs)
     apart = outputs - outputs.mean(axis=0)
     assert np.corrcoef(apart.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
     assert selection.is_within_spread
-    assert share_of_what_was_shown(together, motion_without_actions(selection.primitive())) >= MIN_SHARE
+    assert share_within_deviation(demonstrations, motion_without_actions(selection.primitive())) >= MIN_SHARE
 
 
 def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
@@ -69,9 +69,9 @@ def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
         assert str(number) in selection.why
 
 
-def test_fit_is_invariant_to_the_unit_of_length(together, selection):
+def test_fit_is_invariant_to_the_unit_of_length(demonstrations, selection):
     """Outputs scaled by 100 scale the motion by 100 and λ by the inverse square."""
-    larger = fit(Demonstrations(together.times, [100 * y for y in together.outputs]))
+    larger = fit(Demonstrations(demonstrations.times, [100 * y for y in demonstrations.outputs]))
     assert larger.components == selection.components
     assert larger.length_scale == selection.length_scale
     assert larger.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
@@ -80,8 +80,8 @@ def test_fit_is_invariant_to_the_unit_of_length(together, selection):
     )
 
 
-def test_unit_of_time_scales_only_the_length_scale(together, selection):
-    slower = fit(Demonstrations([10 * t for t in together.times], together.outputs))
+def test_unit_of_time_scales_only_the_length_scale(demonstrations, selection):
+    slower = fit(Demonstrations([10 * t for t in demonstrations.times], demonstrations.outputs))
     assert slower.components == selection.components
     assert slower.length_scale == pytest.approx(10 * selection.length_scale, rel=1e-9)
     assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
@@ -160,6 +160,6 @@ def test_fit_refuses_too_few_demonstrations():
 
 
 @pytest.mark.parametrize("components", [0, 41, 1000])
-def test_fit_refuses_too_many_components(components, together):
+def test_fit_refuses_too_many_components(components, demonstrations):
     with pytest.raises(InputError, match="components must be between 1 and half the number of steps, 40"):
-        fit(together, components=components)
+        fit(demonstrations, components=components)

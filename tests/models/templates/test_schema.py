@@ -17,7 +17,7 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register
 TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
 
 
-def changed(change):
+def edit_template(change):
     data = yaml.safe_load(TEMPLATE)
     change(data)
     return yaml.safe_dump(data, sort_keys=False)
@@ -43,7 +43,7 @@ def test_parse_evaluates_expressions_of_parameters():
 def test_parse_returns_limits_of_a_state():
     assert [state.limits_wrench for state in parse_template(TEMPLATE).states] == [False, False]
     limits = {"max_force_n": "200 * rim_m", "max_torque_nm": 0.5, "max_speed_m_per_s": 0.2, "max_speed_rad_per_s": 1.0}
-    far, near = parse_template(changed(lambda data: data["states"]["far"].update(limits))).states
+    far, near = parse_template(edit_template(lambda data: data["states"]["far"].update(limits))).states
     assert (far.max_force_n, far.max_torque_nm) == (10.0, 0.5)
     assert (far.max_speed_m_per_s, far.max_speed_rad_per_s) == (0.2, 1.0)
     assert far.limits_wrench
@@ -70,7 +70,7 @@ def test_register_adds_a_kind_with_one_decorator():
                 {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
             ]
 
-        template = parse_template(changed(use))
+        template = parse_template(edit_template(use))
         X_WP = template.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
         np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
         with pytest.raises(ValueError, match="already registered"):
@@ -194,7 +194,7 @@ TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
 )
 def test_parse_names_fault_and_place_in_one_sentence(change, message):
     with pytest.raises(InputError) as refused:
-        parse_template(changed(change))
+        parse_template(edit_template(change))
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 500

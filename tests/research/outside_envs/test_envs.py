@@ -40,14 +40,14 @@ def test_scene_is_the_same_when_the_seed_is(name):
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_believed_goal_is_on_the_side_that_was_chosen(name):
+def test_assumed_goal_is_on_the_side_that_was_chosen(name):
     task = load(name)
     env = task.make_env(0)
     least, most = import_module(f"research.outside_envs.{name}").OFFSETS
     for side in (-1.0, 1.0):
         env.reset(seed=5, options={"side": side})
         true = env.true_goal
-        assert least <= side * (env.believed_goal - true)[1] <= most
+        assert least <= side * (env.assumed_goal - true)[1] <= most
 
 
 def test_scheduled_attempts_insert_the_peg_on_both_sides():

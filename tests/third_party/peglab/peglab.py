@@ -1,4 +1,4 @@
-"""Package of a lab: task, guidance, kernel, a learner with its own settings, and an environment of other origin."""
+"""Package of a lab: task, guidance, kernel, a learner with its own settings, and an environment without guiderail."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -69,7 +69,7 @@ class Slot(gr.Task):
 class OffsetOptions(gr.Options):
     """Options of the guidance."""
 
-    reach: float = Field(0.05, gt=0, description="how far a full action leads from where the robot is [m]")
+    reach: float = Field(0.05, gt=0, description="distance from the measured pose that an action of 1 commands [m]")
 
 
 @gr.register_guidance("peglab_offset", label="offset", options=OffsetOptions)

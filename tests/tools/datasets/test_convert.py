@@ -1,4 +1,4 @@
-"""Tests of import and export: numbers are kept, and missing units and signals are asked for."""
+"""Tests of import and export: numbers are kept, and an error names a missing unit or signal."""
 
 import json
 
@@ -14,7 +14,7 @@ from guiderail.tools.datasets.validate import fit_bounds
 NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 
 
-def shown(count=3, steps=40, period=0.02):
+def make_demonstrations(count=3, steps=40, period=0.02):
     rng = np.random.default_rng(0)
     times = [period * np.arange(steps + m) for m in range(count)]
     outputs = [0.2 * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / len(t) for t in times]
@@ -23,8 +23,8 @@ def shown(count=3, steps=40, period=0.02):
 
 @pytest.fixture
 def file(tmp_path):
-    shown().save(tmp_path / "shown.npz")
-    return tmp_path / "shown.npz"
+    make_demonstrations().save(tmp_path / "demonstrations.npz")
+    return tmp_path / "demonstrations.npz"
 
 
 @pytest.mark.parametrize(("kind", "tolerance", "library"), [("lerobot", 1e-6, "pyarrow"), ("mcap", 1e-15, "rosbags")])
@@ -33,7 +33,7 @@ def test_export_and_import_return_the_demonstrations(kind, tolerance, library, f
     export_demonstrations(file, tmp_path / kind, kind)
     signal = "action" if kind == "lerobot" else None
     result = import_recording(tmp_path / kind, tmp_path / "back.npz", signal=signal)
-    loaded, there = Demonstrations.load(tmp_path / "back.npz"), shown()
+    loaded, there = Demonstrations.load(tmp_path / "back.npz"), make_demonstrations()
     assert result["demonstrations"] == 3
     assert loaded.names == there.names
     for one, other in zip((*loaded.outputs, *loaded.times), (*there.outputs, *there.times), strict=True):
@@ -75,7 +75,7 @@ LAYOUTS = {
 }
 
 
-def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, beside=None):
+def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, other_topics=None):
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -84,8 +84,8 @@ def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, 
     with Writer(path, version=8) as writer:
         for topic, frame in topics.items():
             connection = writer.add_connection(topic, kind, typestore=store)
-            if beside is not None:
-                writer.add_connection(topic, beside, typestore=store)
+            if other_topics is not None:
+                writer.add_connection(topic, other_topics, typestore=store)
             for n in range(5):
                 stamp = types["Time"](sec=10 if stamped else 0, nanosec=10_000_000 * n if stamped else 0)
                 x, y, z, w = Rotation.from_euler("z", 10.0 * n, degrees=True).as_quat()
@@ -202,7 +202,7 @@ def test_lerobot_feature_of_one_number_is_an_output(tmp_path):
 
 def test_import_refuses_two_publishers_on_a_topic(tmp_path):
     pytest.importorskip("rosbags")
-    write_bag(tmp_path / "bag", {"/a/pose": "base"}, beside="geometry_msgs/msg/Pose")
+    write_bag(tmp_path / "bag", {"/a/pose": "base"}, other_topics="geometry_msgs/msg/Pose")
     with pytest.raises(InputError, match="2 publishers on /a/pose"):
         import_recording(tmp_path / "bag", tmp_path / "x.npz")
 

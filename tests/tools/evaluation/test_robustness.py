@@ -41,7 +41,7 @@ def test_robustness_evaluates_each_point_once(run, capsys):
     how = {
         "episodes": 3,
         "baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)},
-        "say": sentences.append,
+        "log": sentences.append,
     }
     first = robustness([run], **how)
     assert {row["policy"] for row in first["rows"]} == {"policy", "demonstration", "uniform_random"}
@@ -96,7 +96,7 @@ def test_robustness_compares_several_runs(run, bead_config, tmp_path, capsys):
     capsys.readouterr()
     with pytest.raises(InputError, match="--out"):
         robustness([run, tmp_path / "other"], episodes=2)
-    result = robustness([run, tmp_path / "other"], episodes=2, out=out, say=sentences.append)
+    result = robustness([run, tmp_path / "other"], episodes=2, out=out, log=sentences.append)
     said = capsys.readouterr().err
     assert result["policies"] == ["sKGRL", "demonstration alone"]
     assert sentences == ["the runs differ in guidance"]

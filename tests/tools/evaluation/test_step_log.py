@@ -14,7 +14,7 @@ def act(env, seed=0):
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def logged(tmp_path_factory):
     folder = tmp_path_factory.mktemp("steps")
     env = make_environment("NarrowPassage", {"guidance": "kgrl", "action_repeat": 5})
     rows = [rollout(env, act(env, index), StepLog(env, folder), index=index, seed=index) for index in range(2)]
@@ -22,8 +22,8 @@ def written(tmp_path_factory):
     return folder, rows, trace
 
 
-def test_step_log_has_every_step_and_agrees_with_the_rows(written):
-    folder, rows, trace = written
+def test_step_log_has_every_step_and_agrees_with_the_rows(logged):
+    folder, rows, trace = logged
     step_log = read_step_log(folder)
     assert [len(group) for _, group in step_log.groupby("episode")] == [row["steps"] for row in rows]
     for row, (_, steps) in zip(rows, step_log.groupby("episode"), strict=True):
@@ -43,8 +43,8 @@ def test_step_log_has_every_step_and_agrees_with_the_rows(written):
     np.testing.assert_allclose(step_log["commanded_violation"], step_log["desired_pose_0"] - 0.6, atol=1e-12)
 
 
-def test_every_step_log_column_has_a_meaning(written):
-    for name in read_step_log(written[0]).columns:
+def test_every_step_log_column_has_a_meaning(logged):
+    for name in read_step_log(logged[0]).columns:
         stem, _, end = name.rpartition("_")
         assert (f"{stem}_i" if end.isdigit() else name) in MEANINGS
 
@@ -58,7 +58,7 @@ def test_step_log_has_collisions_and_wrenches(tmp_path):
     assert np.linalg.norm(step_log.loc[step_log["collision"], ["wrench_0", "wrench_1"]], axis=1).max() > 0
 
 
-def test_step_log_is_refused_when_absent_or_damaged(written, tmp_path):
+def test_step_log_is_refused_when_absent_or_damaged(logged, tmp_path):
     with pytest.raises(InputError, match="holds no step log"):
         read_step_log(tmp_path)
     step_log_file(tmp_path, 0).write_bytes(b"PAR1 and not much more")

@@ -57,7 +57,7 @@ def without_clock(rows):
     return rows.drop(columns=["folder", "training_wall_time"]).to_dict("records")
 
 
-def written(folder):
+def modification_times(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
@@ -80,9 +80,9 @@ def test_study_has_a_row_per_method_seed_number_and_eval_set(tmp_path):
 def test_interrupted_study_resumes_to_the_same_rows(tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     expected = run(study(), whole)
-    before = written(whole)
+    before = modification_times(whole)
     assert without_clock(run(study(), whole)) == without_clock(expected)
-    assert written(whole) == before
+    assert modification_times(whole) == before
     run(study(after_episodes=[2], seeds=[5]), parts)
     assert without_clock(run(study(), parts)) == without_clock(expected)
 
@@ -171,13 +171,13 @@ def test_studies_in_one_folder_are_kept_apart(tmp_path):
     assert len(list((out / "anything").glob("held_out-0-*.csv"))) == 3
     named = {"eval_set": [{"episodes": 3, "file": "held_out.csv"}]}
     run(study(**uniform_random, **named), out)
-    before = written(out)
+    before = modification_times(out)
     run(study(**uniform_random, **named), out)
-    assert written(out) == before
+    assert modification_times(out) == before
     for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"eval_set": [{"episodes": 4, "file": "held_out.csv"}]}):
         with pytest.raises(InputError, match="episodes of another study"):
             run(study(**(uniform_random | named | changed)), out)
-    assert written(out) == before
+    assert modification_times(out) == before
 
 
 def test_differences_are_grouped_by_method():
@@ -205,14 +205,14 @@ def test_breaking_point_is_interpolated():
 
 def test_study_refuses_a_folder_with_another_run(tmp_path):
     run(study(seeds=[5], after_episodes=[2]), tmp_path)
-    before = written(tmp_path)
+    before = modification_times(tmp_path)
     with pytest.raises(InputError, match="another learner"):
         run(study(learner={"settings": SETTINGS | {"batch_size": 8}}), tmp_path)
     (tmp_path / "learner-6").mkdir()
     (tmp_path / "learner-6" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="already exists"):
         run(study(seeds=[6]), tmp_path)
-    assert before.items() <= written(tmp_path).items()
+    assert before.items() <= modification_times(tmp_path).items()
 
 
 def test_best_constant_is_the_best_of_its_grid(tmp_path):

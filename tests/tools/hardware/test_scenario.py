@@ -17,18 +17,18 @@ BUS = "lcm_buses: {bus: {lcm_url: 'udpm://239.255.76.67:7668?ttl=0'}}\n"
 
 
 @pytest.fixture
-def written(tmp_path):
-    def written(text):
+def write(tmp_path):
+    def write(text):
         path = tmp_path / "scenario.yaml"
         path.write_text(text)
         return path
 
-    return written
+    return write
 
 
-def test_scenario_selects_simulated_or_real_robot(written):
+def test_scenario_selects_simulated_or_real_robot(write):
     simulated, real = (
-        RobotConnection.from_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
+        RobotConnection.from_scenario(write(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
     )
     assert (simulated.sim, real.sim) == (True, False)
     assert (simulated.robot, real.robot) == ("iiwa14", "iiwa14")
@@ -39,7 +39,7 @@ def test_scenario_selects_simulated_or_real_robot(written):
         RobotConnection(sim=True, robot_url="udpm://239.255.76.67:7667")
     assert RobotConnection.from_scenario(None, robot="panda").robot == "panda"
     assert (
-        RobotConnection.from_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot
+        RobotConnection.from_scenario(write("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot
         == "panda"
     )
 
@@ -68,9 +68,9 @@ def test_shipped_scenario_has_a_simulated_driver():
         (BUS + OF_BUS % "desired_kp_gains: [1, 2]", "desired_kp_gains"),
     ],
 )
-def test_load_raises_one_sentence_when_invalid(written, text, message):
+def test_load_raises_one_sentence_when_invalid(write, text, message):
     with pytest.raises(InputError, match=message) as refused:
-        load_scenario(written(text))
+        load_scenario(write(text))
     assert "\n" not in str(refused.value)
 
 
@@ -78,16 +78,16 @@ def test_load_raises_one_sentence_when_invalid(written, text, message):
     ("given", "message"),
     [({"robot": "panda"}, "--robot panda"), ({"robot_url": "udpm://239.255.76.67:7777?ttl=0"}, "--robot-url udpm")],
 )
-def test_connection_raises_when_options_contradict_the_file(written, given, message):
-    file = written(f"station: hardware\n{BUS}{DRIVER}")
+def test_connection_raises_when_options_contradict_the_file(write, given, message):
+    file = write(f"station: hardware\n{BUS}{DRIVER}")
     with pytest.raises(InputError, match=message):
         RobotConnection.from_scenario(file, **given)
     same = RobotConnection.from_scenario(file, robot="iiwa14", robot_url="udpm://239.255.76.67:7668?ttl=0")
     assert same == RobotConnection.from_scenario(file)
 
 
-def test_deploy_uses_robot_of_scenario_and_refuses_another(written, capsys):
-    file = written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")
+def test_deploy_uses_robot_of_scenario_and_refuses_another(write, capsys):
+    file = write("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")
     for more, message in (([], "not a run"), (["--robot", "iiwa14"], "--robot iiwa14")):
         with pytest.raises(SystemExit) as end:
             main(["deploy", str(file.parent), "--scenario", str(file), *more])
@@ -95,7 +95,7 @@ def test_deploy_uses_robot_of_scenario_and_refuses_another(written, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_directives_add_surroundings_to_simulated_robot(written, tmp_path):
+def test_directives_add_surroundings_to_simulated_robot(write, tmp_path):
     box = tmp_path / "box.sdf"
     box.write_text(
         "<sdf version='1.9'><model name='box'><link name='box'><collision name='c'><geometry><box><size>1 1 1</size>"
@@ -106,14 +106,12 @@ directives:
 - add_model: {{name: box, file: 'file://{box}'}}
 - add_weld: {{parent: world, child: 'box::box'}}
 """
-    scenario = load_scenario(written(BUS + DRIVER + directives))
+    scenario = load_scenario(write(BUS + DRIVER + directives))
     robot = SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=scenario.directives)
     assert robot.plant.HasModelInstanceNamed("box")
-    lost = load_scenario(
-        written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'file:///nowhere.sdf'}}]\n")
-    )
+    lost = load_scenario(write(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'file:///nowhere.sdf'}}]\n"))
     remote = load_scenario(
-        written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'package://drake_models/box.sdf'}}]\n")
+        write(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'package://drake_models/box.sdf'}}]\n")
     )
     with pytest.raises(InputError, match="unknown package"):
         SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=remote.directives)

@@ -13,7 +13,7 @@ from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.pipelined import PipelinedLearner, _write
 
 
-def made(**more):
+def make_learner(**more):
     """Return a pipelined learner with two actions, and its acting learner."""
     space = gymnasium.Env()
     space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -41,24 +41,24 @@ def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
 
 def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
     (tmp_path / "file").write_text("")
-    student, _ = made()
-    student.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))
+    learner, _ = make_learner()
+    learner.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))
     with pytest.raises(InputError, match="cannot be written"):
-        student.finish()
+        learner.finish()
 
 
 def test_pipelined_learner_learns_episodes_two_later(forkserver):
-    student, acting = made(excluded=("stopped",))
+    learner, acting = make_learner(excluded=("stopped",))
     before = acting.actor().state_dict()["mu.weight"].clone()
     rng, last = np.random.default_rng(0), {"success": False}
     for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
-        student.on_episode_start()
+        learner.on_episode_start()
         for _ in range(6):
-            observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
-            student.on_step(Transition(observation, action, 0.0, observation, False, False, {}))
-        assert (student.known, student.late) == (known, 0)
-        student.on_episode_end({"termination": termination, **last})
-        student.submit_episode()
-    student.finish()
-    assert (student.known, acting.transitions, acting.episodes) == (4, 24, 4)
+            observation, action = rng.uniform(-1, 1, 3).astype(np.float32), learner.act(np.zeros(3, np.float32))
+            learner.on_step(Transition(observation, action, 0.0, observation, False, False, {}))
+        assert (learner.known, learner.late) == (known, 0)
+        learner.on_episode_end({"termination": termination, **last})
+        learner.submit_episode()
+    learner.finish()
+    assert (learner.known, acting.transitions, acting.episodes) == (4, 24, 4)
     assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])

@@ -56,7 +56,7 @@ def step_log_bytes(folder):
     return {path.name: path.read_bytes() for path in folder.steps.iterdir()}
 
 
-def shown(config, number):
+def with_demonstrations(config, number):
     return replace(config, learner=replace(config.learner, demonstration_episodes=number))
 
 
@@ -76,13 +76,13 @@ def test_demonstrator_acts_in_the_first_episodes(bead_config, tmp_path):
 
         return act
 
-    rows = run_training(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
+    rows = run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 2), demonstrator=watched)
     assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first call checks the compatibility
     assert len(rows) > 2
 
 
 def test_demonstrated_run_resumes_bit_for_bit(bead_config, tmp_path):
-    config = shown(bead_config, 2)
+    config = with_demonstrations(bead_config, 2)
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
     run_training(undisturbed, config, demonstrator=always_left)
     run_training(stopped, replace(config, episodes=1), demonstrator=always_left)
@@ -95,19 +95,21 @@ def test_demonstrator_of_other_observations_is_refused(bead_config, tmp_path):
         return lambda seen: env.action_space.low if seen[0] < 0.5 else env.action_space.low * seen[99]
 
     with pytest.raises(InputError, match="observations or actions of Bead's scripted policy"):
-        run_training(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=later)
+        run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 1), demonstrator=later)
 
 
 def test_run_is_refused_when_a_demonstrator_is_missing(bead_config, tmp_path):
     with pytest.raises(InputError, match="demonstration_episodes"):
-        run_training(RunFolder(tmp_path / "run"), shown(bead_config, 1))
+        run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 1))
     assert not (tmp_path / "run").exists()
 
 
 def test_demonstrator_of_other_actions_is_refused(bead_config, tmp_path):
     with pytest.raises(InputError, match="actions of Bead's scripted policy differ"):
         run_training(
-            RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=lambda env: lambda seen: np.zeros(7)
+            RunFolder(tmp_path / "run"),
+            with_demonstrations(bead_config, 1),
+            demonstrator=lambda env: lambda seen: np.zeros(7),
         )
     assert not (tmp_path / "run").exists()
 
@@ -281,14 +283,18 @@ def test_folder_is_removed_when_the_first_episode_is_refused(bead_config, tmp_pa
     (there / ".of_somebody").write_text("")
     for path, is_left in ((tmp_path / "new", []), (there, [".of_somebody"])):
         with pytest.raises(InputError, match="this is wrong"):
-            run_training(RunFolder(path), shown(bead_config, 3), demonstrator=refused_in(0))
+            run_training(RunFolder(path), with_demonstrations(bead_config, 3), demonstrator=refused_in(0))
         assert path.exists() is bool(is_left)
         assert [one.name for one in path.glob("*")] == is_left
     run_training(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
 
 
 def test_folder_is_kept_when_a_later_episode_is_refused(bead_config, tmp_path):
-    config, later, begun = shown(bead_config, 3), RunFolder(tmp_path / "later"), RunFolder(tmp_path / "begun")
+    config, later, begun = (
+        with_demonstrations(bead_config, 3),
+        RunFolder(tmp_path / "later"),
+        RunFolder(tmp_path / "begun"),
+    )
     with pytest.raises(InputError, match="this is wrong"):
         run_training(later, config, demonstrator=refused_in(1))
     assert len(later.episodes()) == 1
@@ -427,7 +433,7 @@ def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
 
 
 def test_demonstrated_episodes_are_marked(bead_config, tmp_path):
-    rows = run_training(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
+    rows = run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 2), demonstrator=always_left)
     assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
 
 
