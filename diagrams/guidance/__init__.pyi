@@ -1,4 +1,4 @@
-from .function import FunctionGuidance as FunctionGuidance
+from .guidance import FunctionGuidance as FunctionGuidance
 from .guidance import Guidance as Guidance
 from .primitive_config import PrimitiveConfig as PrimitiveConfig
 from .prior import PlacedTemplate as PlacedTemplate

@@ -1,4 +1,4 @@
-"""Contract of all guidance: the ports between a policy's action and the commanded pose.
+"""Contract of all guidance, the ports between a policy's action and the commanded pose; guidance by a function.
 
 =================  =====  ==========================================================================================
 input              size   meaning
@@ -26,9 +26,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.models.common.errors import InputError
+from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, GuidanceFunction
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 INPUTS = ("action", "pose", "wrench")
@@ -72,6 +75,37 @@ class Guidance(Diagram):
     get_fallback_output_port = output_getter(
         "fallback", "flag, 1 if a safe pose is commanded instead of the requested one, (1,)"
     )
+
+
+class FunctionGuidance(Guidance):
+    """Guidance that commands law(action, pose, wrench) once per control step; see `FunctionGuidanceSystem`.
+
+    The command is not constrained; ``constraint_violation`` is the command's violation of the task's constraints.
+    """
+
+    def __init__(self, prior: PriorKnowledge, law: GuidanceFunction, action_size: int):
+        """Construct the guidance.
+
+        Args:
+            prior: Prior knowledge, for the control period, the station's sizes and the task's constraints.
+            law: Pure function from an action (A,), the measured pose (O,) and wrench (W,) to a desired pose (O,).
+            action_size: A, at least 1.
+
+        Raises:
+            InputError: If a size or the period is out of range.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        system = FunctionGuidanceSystem(law, action_size, prior.pose_size, prior.wrench_size, prior.period)
+        builder.AddNamedSystem("law", system)
+        violation = builder.AddNamedSystem("violation", ConstraintViolation(prior.constraints, prior.period))
+        builder.Connect(system.get_desired_pose_output_port(), violation.get_pose_input_port())
+        for name in ("action", "pose", "wrench"):
+            builder.ExportInput(system.GetInputPort(name), name)
+        for name in ("desired_pose", "held_action", "fallback"):
+            builder.ExportOutput(system.GetOutputPort(name), name)
+        builder.ExportOutput(violation.get_violation_output_port(), "constraint_violation")
+        builder.BuildInto(self)
 
 
 def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, kind: str = "") -> None:

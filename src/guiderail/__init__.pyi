@@ -9,7 +9,7 @@ from .diagrams.envs.options import Options as Options
 from .diagrams.envs.options import ResetOptions as ResetOptions
 from .diagrams.envs.task_diagram import TaskDiagram as TaskDiagram
 from .diagrams.envs.task_diagram import round_period as round_period
-from .diagrams.guidance.function import FunctionGuidance as FunctionGuidance
+from .diagrams.guidance.guidance import FunctionGuidance as FunctionGuidance
 from .diagrams.guidance.guidance import Guidance as Guidance
 from .diagrams.guidance.primitive_config import PrimitiveConfig as PrimitiveConfig
 from .diagrams.guidance.prior import PlacedTemplate as PlacedTemplate

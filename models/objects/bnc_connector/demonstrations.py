@@ -96,12 +96,6 @@ def load() -> Demonstrations:
     return Demonstrations.load(PATH)
 
 
-def load_all() -> dict[str, np.ndarray]:
-    """Load the whole file: `times` (N,), `outputs` and `measured` (M, N, 6), `wrench` (M, N, 6), and metadata."""
-    with np.load(PATH, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
 def random_curves(rng: np.random.Generator, times: np.ndarray, correlations: Sequence[float], count: int) -> np.ndarray:
     """Return random curves (count, N, O) of unit variance, one correlation time [s] for each of the O outputs."""
     return np.stack([np.stack([correlated(rng, times, one) for one in correlations], axis=1) for _ in range(count)])

@@ -6,8 +6,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.guidance.function import FunctionGuidance
-from guiderail.diagrams.guidance.guidance import Guidance
+from guiderail.diagrams.guidance.guidance import FunctionGuidance, Guidance
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.models.common.errors import InputError
 

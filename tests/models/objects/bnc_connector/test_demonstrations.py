@@ -18,7 +18,7 @@ def test_load_returns_five_times_400_poses():
 
 
 def test_file_holds_measured_poses_and_wrenches():
-    everything = demonstrations.load_all()
+    everything = np.load(demonstrations.PATH)
     shape = (NUM_DEMONSTRATIONS, NUM_STEPS)
     assert everything["measured"].shape == everything["wrench"].shape == (*shape, 6)
     assert everything["contact_force"].shape == shape
@@ -27,14 +27,14 @@ def test_file_holds_measured_poses_and_wrenches():
 
 def test_demonstrations_end_locked():
     """The measured poses end at the locked frame's origin."""
-    final = demonstrations.load_all()["measured"][:, -1]
+    final = np.load(demonstrations.PATH)["measured"][:, -1]
     assert np.abs(final[:, 2]).max() < 0.6 * MM
     assert np.abs(np.rad2deg(final[:, 3])).max() < 4.0
 
 
 def test_push_is_the_difference_of_command_and_measurement():
     """While the plug is turned, the stiffness times commanded minus measured is the force along z."""
-    everything = demonstrations.load_all()
+    everything = np.load(demonstrations.PATH)
     turning = slice(260, 320)
     command, measured = everything["outputs"][:, turning, 2], everything["measured"][:, turning, 2]
     push = everything["stiffness"][2] * (measured - command)
@@ -63,7 +63,7 @@ def test_mean_of_the_motions_has_no_search_offset():
 
 def test_recording_again_reproduces_the_file():
     """Rounding may differ between machines, and contact amplifies it."""
-    everything = demonstrations.load_all()
+    everything = np.load(demonstrations.PATH)
     recording, is_locked = record_one(demonstrator_motions(int(everything["seed"]), TIMES_RECORDED)[0])
     assert is_locked
     np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
