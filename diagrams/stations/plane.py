@@ -204,7 +204,7 @@ def _add_walls(plant: MultibodyPlant, passage: PassageGeometry, config: PlaneCon
 
 
 def _add_markings(plant: MultibodyPlant, passage: PassageGeometry) -> None:
-    """Add floor, restricted zone, obstacle and goal as visual passage."""
+    """Add floor, restricted zone, obstacle and goal as visual geometry."""
     body = plant.world_body()
 
     def mark(name: str, shape: Any, x: float, y: float, z: float, color: Any) -> None:

@@ -191,7 +191,7 @@ def run(items: list[Any]) -> int:
 
 
 def _forked(work: Callable[[], Any], cpu_seconds: float, default: Any) -> Any:
-    """Run `work` in a silent child process with limits; return its result, the default if it is ended."""
+    """Run `work` in a silent child process with limits; return its result, or the default if the process is killed."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
