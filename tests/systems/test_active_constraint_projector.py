@@ -138,7 +138,7 @@ def test_command_waits_when_the_tracking_error_is_too_large():
         desired, fallback = rig.step(np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0]), measured=START)
     assert fallback == 1.0
     assert 0.02 < desired[0] < 0.02 + 2 * 0.5 * PERIOD
-    # What asks for no more than the last command brings the robot no nearer either.
+    # A request within the last command brings the robot no nearer either.
     assert rig.step(desired)[1] == 1.0
     # It may always come back.
     desired, fallback = rig.step(START)

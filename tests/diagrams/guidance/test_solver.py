@@ -10,7 +10,7 @@ from guiderail.tools.environments import check_environment
 
 
 def commands(**options):
-    """Whatever is asked for, towards the zone: the constraint is active."""
+    """Return commands and violations for actions towards the zone, where the constraint is active."""
     env = make_env("NarrowPassage", guidance="skgrl", action_scale=3.0, **options)
     env.reset(seed=0)
     violations = []

@@ -1,4 +1,4 @@
-"""Pouring that asks for some of several balls."""
+"""Pouring with several balls, some of which must fall into the mug."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CONFIG = PouringConfig(ball=Ball(diameter=0.026), num_balls=6)
 IN, FALLEN, KEPT = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]  # in the frame of the mug's tip
 
 
-def judged(in_mug, fallen):
+def outcome(in_mug, fallen):
     """Return success and spill if five of six balls are needed; the others are in the thermos."""
     places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
     balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
@@ -35,7 +35,7 @@ def judged(in_mug, fallen):
     ],
 )
 def test_five_of_six_are_enough_and_two_that_fell_are_too_many(in_mug, fallen, expected):
-    assert judged(in_mug, fallen) == expected
+    assert outcome(in_mug, fallen) == expected
 
 
 @pytest.mark.parametrize(("number", "diameter"), [(2, 0.04), (3, 0.04), (6, 0.026), (8, 0.02)])

@@ -43,7 +43,7 @@ def test_different_arguments_make_another_primitive(other):
 def test_shared_primitive_predicts_as_its_own():
     shared = get_shared_primitive(reference(), box(), KERNEL, history=2)
     past, action = np.array([[0.0, 0.0], [0.01, 0.01]]), np.array([3.0, -2.0])
-    shared.predict(7, -action, past)  # what was asked before does not matter
+    shared.predict(7, -action, past)  # earlier steps do not matter
     own = LcNsKmp(reference(), kernel=KERNEL, constraints=box(), history=2)
     np.testing.assert_array_equal(shared.predict(5, action, past).output, own.predict(5, action, past).output)
 

@@ -174,7 +174,7 @@ def test_tilt_limits(seed, turns_along):
     off = (math.degrees(tilt) - least + 1e-6) % 360
     assert off <= most - least + 2e-6
     assert constraint.violation(X_WP, frames) < 1e-7
-    # No allowed tilt is nearer to what was asked for.
+    # No allowed tilt is nearer to the requested one.
     towards = -p_FE[:2] / np.linalg.norm(p_FE[:2])
     axis = np.array([-towards[1], towards[0], 0.0])
     base = Rotation.from_rotvec(-tilt * axis) * Rotation.from_matrix(R_FP.matrix())

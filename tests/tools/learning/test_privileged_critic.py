@@ -148,7 +148,7 @@ def test_insertion_declares_pose_and_exact_wrench():
     env = make_env("BncConnector", sensing="robot", difficulty="hard", guidance="kgrl")
     assert env.privileged_space.shape == (9,)
     env.reset(seed=0)
-    assert env.privileged is None  # not evaluated unless a learner asks for it
+    assert env.privileged is None  # evaluated only if a learner uses it
     env.observes_privileged = True
     observation, info = env.reset(seed=0)
     assert env.observation_space.contains(observation)

@@ -25,7 +25,7 @@ from guiderail.tools.parts.difficulty import (
 
 
 def scores(random, scripted):
-    """Scores of ten episodes for each setting, and the list of settings that were asked for."""
+    """Scores of ten episodes for each setting, and the list of requested settings."""
     requests = []
 
     def score(setting):

@@ -127,7 +127,7 @@ def test_undo_takes_back_one_second(session):
     lead(session, "x [mm]", 1.0, 60)
     before = [command.copy() for command in session.recording.commands]
     lead(session, "x [mm]", -3.0, 50)
-    session.undo()  # to the begin of the last motion
+    session.undo()  # to the beginning of the last motion
     assert session.steps == 60
     np.testing.assert_array_equal(session.recording.commands, before)
     assert session.panel.meshcat.sliders["x [mm]"] == pytest.approx(1.0)
