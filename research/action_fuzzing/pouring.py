@@ -1,4 +1,4 @@
-"""Fuzzing of pouring: careless, random and adversarial inputs.
+"""Fuzzing of pouring: noisy, random and adversarial inputs.
 
 Collisions are counted at every plant step. The thermos must not be commanded to tilt before the template allows it.
 """
@@ -56,7 +56,7 @@ def random_walk(rng: np.random.Generator) -> PolicyFn:
     return act
 
 
-def rammer(rng: np.random.Generator) -> PolicyFn:
+def noisy_approach(rng: np.random.Generator) -> PolicyFn:
     """Return noisy inputs towards the mug, from everywhere."""
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def rammer(rng: np.random.Generator) -> PolicyFn:
     return act
 
 
-def presser(rng: np.random.Generator) -> PolicyFn:
+def noisy_press(rng: np.random.Generator) -> PolicyFn:
     """Return inputs that press down on the table, and sideways."""
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -78,8 +78,8 @@ def presser(rng: np.random.Generator) -> PolicyFn:
 ADVERSARIES: dict[str, PolicyMaker] = {
     "noisy_pour": noisy_pour,
     "random_walk": random_walk,
-    "rammer": rammer,
-    "presser": presser,
+    "noisy_approach": noisy_approach,
+    "noisy_press": noisy_press,
     "uniform_random": lambda rng: uniform_random(rng, 3),
 }
 

@@ -48,7 +48,7 @@ def test_a_clock_that_is_disturbed_is_no_other_demonstration():
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
 def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
-    """From −180° to 180° a measured angle jumps by a full turn, and a history of it would lead all the way round."""
+    """A measured angle jumps by a full turn at ±180°, so a history of it would command a full turn."""
     assert make_prior(turn, GantryStation).demonstrations is not None
     for station in (ArmStation, HardwareStation):
         with pytest.raises(InputError, match="jumps by a full turn at 180°"):
