@@ -17,7 +17,7 @@ import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.diagrams.stations.disturbances import Disturbances
+from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import QUANTITIES, Adversary, AttackResult

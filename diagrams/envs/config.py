@@ -113,7 +113,7 @@ def option_models(task: type[Task], guidance: str, station: str) -> dict[str, ty
     kind = check_guidance(guidance, task.provides(), task.name)
     disturbances: type[Options] = Options
     if task.workcell_kind == "insertion":
-        from guiderail.diagrams.stations.disturbances import Disturbances
+        from guiderail.diagrams.stations.options import Disturbances
 
         disturbances = Disturbances
     return {

@@ -52,7 +52,8 @@ def make_station(task: Task) -> Station:
         arguments["control_period"] = task.control_period
     build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
     if task.workcell_kind == "insertion":
-        from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
+        from guiderail.diagrams.stations.disturbances import disturbed
+        from guiderail.diagrams.stations.options import Disturbances
 
         assert isinstance(disturbances, Disturbances)
         station = disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())

@@ -13,9 +13,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, OutputPort
 
 from guiderail.diagrams.envs.scene import View
-from guiderail.models.common.errors import InputError
-
-_GRID = 2.0**-40
+from guiderail.models.common.arrays import round_period as round_period
 
 PORTS = (
     "observation",
@@ -29,25 +27,6 @@ PORTS = (
     "fallback",
 )
 """Output ports of every task diagram, in addition to one per reward term."""
-
-
-def round_period(seconds: float) -> float:
-    """Round a period by at most a picosecond, so that its multiples are exact in double precision.
-
-    Drake triggers two events together only if their times are equal, and the floating-point numbers 10 k · 0.002,
-    0.02 + k · 0.02 and k · 0.02 often differ in the last bit: the plant would then step once more or once less between
-    two control steps, or a history would be updated after the command that it should include. Round the plant's period,
-    and use an integer multiple of it as the control period.
-
-    Args:
-        seconds: Period [s], positive.
-
-    Raises:
-        InputError: If `seconds` is not positive and finite.
-    """
-    if not (np.isfinite(seconds) and seconds > _GRID):
-        raise InputError(f"a period must be positive, not {seconds} s")
-    return round(seconds / _GRID) * _GRID
 
 
 def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
+from guiderail.diagrams.guidance.options import BasePolicyOptions, GuardOptions
 from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
@@ -19,55 +17,11 @@ from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.chunk_guard import ChunkGuard
-from guiderail.models.policy import BASE_POLICIES, find_base_policy
+from guiderail.models.policy import find_base_policy
 from guiderail.systems.chunk_reference import ChunkReference
 from guiderail.systems.chunk_safety_limiter import ChunkSafetyLimiter
 
 LIMIT_FACTOR = 2.0  # default limits of a guard, relative to the largest speed and jerk of the demonstrations
-
-
-class BasePolicyOptions(Options):
-    """Options of guidance around a base policy."""
-
-    base_policy: str = Field(
-        "",
-        description="base policy: folder of a run of the learner chunk, or a registered name; default: the "
-        "demonstrations, as without a base policy",
-    )
-    replan_steps: Integer = Field(5, ge=1, le=1000, description="control steps between two chunks")
-    covariance_floor: Number = Field(
-        1.0, gt=0, description="share of the demonstrations' covariance that is added to the spread of the chunks"
-    )
-
-    @field_validator("base_policy")
-    @classmethod
-    def _check_source(cls, value: str) -> str:
-        if not value:
-            return value
-        find_base_policy(value)
-        # A relative path would be wrong if the run is resumed from another folder.
-        return value if value in BASE_POLICIES.names() else str(Path(value).resolve())
-
-
-class GuardOptions(BasePolicyOptions):
-    """Options of `base_policy`, which executes the chunks."""
-
-    guard: Literal["none", "projection", "slowdown"] = Field(
-        "projection",
-        description="filter of the chunks to the bounds, max_speed and max_jerk: the nearest chunk, a slower one on "
-        "the same path, or none",
-    )
-    max_jerk: Numbers = Field(
-        (),
-        description="largest jerk of a guarded command, like max_speed; default of both: twice the demonstrations'",
-    )
-
-    @field_validator("max_jerk")
-    @classmethod
-    def _check_positive(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        if not all(value > 0.0 for value in values):
-            raise ValueError("give positive numbers")
-        return values
 
 
 def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> tuple[np.ndarray, np.ndarray]:

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, PassThrough, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.guidance.guidance import Guidance
+from guiderail.diagrams.guidance.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, primitive_config_of
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.diagrams.guidance.prior import PriorKnowledge
@@ -132,14 +131,6 @@ def safe_residual(prior: PriorKnowledge) -> Diagram:
     return ResidualGuidance(prior, lambda config, keep_out: SafetyFilter(keep_out, config.control_period))
 
 
-class BarrierOptions(Options):
-    """Options of `residual_cbf`."""
-
-    barrier_decay: Number = Field(
-        0.2, gt=0, le=1, description="γ, largest fraction by which a command may approach a constraint per step"
-    )
-
-
 @register_guidance(
     "residual_cbf",
     needs=(("demonstrations", "keep_out"),),
@@ -154,16 +145,6 @@ def residual_cbf(prior: PriorKnowledge) -> Diagram:
     decay = prior.options["barrier_decay"]
     return ResidualGuidance(
         prior, lambda config, keep_out: CommandFilter(BarrierFilter(keep_out, decay), config.control_period)
-    )
-
-
-class TangentOptions(Options):
-    """Options of `residual_tangent`."""
-
-    slack_width: Number = Field(
-        0.5,
-        gt=0,
-        description="slack at which half of a motion towards a constraint remains, in displacements by an action of 1",
     )
 
 

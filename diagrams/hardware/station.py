@@ -5,19 +5,18 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.hardware.driver import Driver, PoseDriver, find_driver, safety_limits, torque_tolerance
 from guiderail.diagrams.hardware.driver import status_limits as default_status_limits
 from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_rate_limiter, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.impedance_control import add_controller, add_energy_tank
+from guiderail.diagrams.stations.options import HardwareOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
@@ -41,16 +40,6 @@ from guiderail.systems.support.declarations import output_getter
 from guiderail.systems.torque_publisher import TorquePublisher
 from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
 from guiderail.systems.wrench_tare import WrenchTare
-
-
-class HardwareOptions(Options):
-    """Options of a station with a real arm."""
-
-    robot: str = Field(DEFAULT_ROBOT, description="which arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
-    driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
-    robot_url: str = Field("", description="address of the robot: LCM's URL, or a host; default: LCM's own")
-    robot_timeout: Number = Field(10.0, gt=0, description="how long to wait for the robot's first status [s]")
 
 
 @register_station("hardware", workcell_kind="insertion", options=HardwareOptions, is_simulated=False)

@@ -7,19 +7,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, JointActuator, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.stations.impedance_control import add_impedance_control
+from guiderail.diagrams.stations.options import ArmOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.sensing import JointTorqueAccuracy
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
-    ContactOptions,
     ControllerPlant,
     Impedance,
     Station,
@@ -168,13 +167,6 @@ def add_gripper_control(
     builder.Connect(command.get_desired_state_output_port(), plant.get_desired_state_input_port(arm.tool_model))
     builder.Connect(plant.get_state_output_port(arm.tool_model), state.get_input_port())
     return command.get_position_input_port(), state.get_output_port()
-
-
-class ArmOptions(ContactOptions):
-    """Options of the arm station."""
-
-    robot: str = Field(DEFAULT_ROBOT, description="which arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
 
 
 @register_station("arm", workcell_kind="insertion", options=ArmOptions)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, ConstantVectorSource
 
-from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
-from guiderail.diagrams.stations.sensing import SENSING, Sensing, SensorErrors
+from guiderail.diagrams.stations.options import Disturbances
+from guiderail.diagrams.stations.sensing import SENSING, SensorErrors
 from guiderail.diagrams.stations.station import (
     OUTPUTS,
     PLANT_PERIOD,
@@ -28,130 +27,6 @@ from guiderail.models.control.motion_constraints import StateConstraints
 from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance
 from guiderail.systems.wrench_tare import WrenchTare
-
-MAX_FACTOR = 100.0
-"""Largest factor of a disturbance; its inverse is the smallest."""
-MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; a larger one is probably in millimetres or degrees
-
-
-def _factors(quantity: str) -> Any:
-    return Field((1.0, 1.0), min_length=2, max_length=2, description=f"smallest and largest factor of {quantity}")
-
-
-def _magnitudes(description: str) -> Any:
-    return Field(None, min_length=2, max_length=2, description=f"{description}; default: that of sensing")
-
-
-class Disturbances(Options):
-    """Options of environments with a workcell: constant disturbances, and ranges that every episode samples from.
-
-    A policy can be trained with one range and evaluated with another. `sensing` sets all errors of the sensors by one
-    name; an error that is given as well replaces that of the name.
-    """
-
-    sensing: Sensing = Field(
-        "exact",
-        description="errors of the sensors: exact has none, wrist is a force-torque sensor at the wrist, robot "
-        "estimates the wrench from joint torques; both are tared",
-    )
-    friction_factor: Numbers = _factors("all friction, sampled every episode")
-    modulus_factor: Numbers = _factors("the contact's stiffness, sampled every episode")
-    wrench_scale: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="smallest and largest factor of the measured wrench, sampled every episode; default: that of "
-        "sensing",
-    )
-    wrench_bias: Numbers | None = _magnitudes(
-        "largest offset of the measured wrench, sampled every episode: force [N], torque [Nm]"
-    )
-    wrench_drift: Numbers | None = _magnitudes(
-        "standard deviation after 10 s of a random walk of the measured wrench: force [N], torque [Nm]"
-    )
-    wrench_noise: Numbers | None = _magnitudes("standard deviation of the measured wrench: force [N], torque [Nm]")
-    wrench_delay: Integer | None = Field(
-        None, ge=0, le=50, description="delay of the measured wrench in control steps; default: that of sensing"
-    )
-    calibration_error: Numbers | None = _magnitudes(
-        "largest error of the robot's kinematics, sampled every episode: position [m], orientation [rad]"
-    )
-    tare: bool | None = Field(
-        None, description="subtract the wrench measured at the start, in free motion; default: that of sensing"
-    )
-    pose_bias: Number = Field(
-        0.0, ge=0, le=0.01, description="largest offset of measured x, y, z, sampled every episode [m]"
-    )
-    lost_commands: Number = Field(0.0, ge=0, lt=1, description="probability that a command is lost")
-    late_commands: Integer = Field(0, ge=0, le=50, description="delay of a command in control steps")
-    clock_factor: Number = Field(
-        1.0, gt=0, le=MAX_FACTOR, description="factor of the control period; the motion is slower by this factor"
-    )
-    stiffness_factor: Number = Field(1.0, gt=0, le=MAX_FACTOR, description="factor of the impedance's stiffness")
-    payload: Number = Field(
-        0.0, ge=0, le=5, description="mass at an arm's tool that its controller does not model [kg]"
-    )
-
-    @field_validator("friction_factor", "modulus_factor", "wrench_scale")
-    @classmethod
-    def _check_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not 1.0 / MAX_FACTOR <= value[0] <= value[1] <= MAX_FACTOR:
-            raise ValueError(f"give two factors from {1.0 / MAX_FACTOR} to {MAX_FACTOR}, the smaller one first")
-        return value
-
-    @field_validator("wrench_bias", "wrench_drift", "wrench_noise", "calibration_error")
-    @classmethod
-    def _check_magnitudes(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and min(value) < 0.0:
-            raise ValueError("give two numbers, none negative")
-        return value
-
-    @field_validator("calibration_error")
-    @classmethod
-    def _check_calibration(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and max(value) > MAX_CALIBRATION_ERROR:
-            raise ValueError(f"give a position in metres and an angle in radians, at most {MAX_CALIBRATION_ERROR}")
-        return value
-
-    @property
-    def errors(self) -> SensorErrors:
-        """Errors of the sensors: those of `sensing`, with the given ones in their place.
-
-        Joint torques have their own errors: a given scale replaces their gain, a bias their offset and the errors of
-        the arm's model, a drift and a noise their own.
-        """
-        errors = SENSING[self.sensing]
-        given: dict[str, Any] = {
-            field.name: getattr(self, field.name)
-            for field in fields(SensorErrors)
-            if getattr(self, field.name, None) is not None
-        }
-        joint_torque = errors.joint_torque
-        if joint_torque is not None:
-            none = {
-                "wrench_scale": {"gain": 0.0},
-                "wrench_bias": {"offset": 0.0, "mass": 0.0, "center": 0.0, "payload": 0.0},
-                "wrench_drift": {"drift": 0.0, "friction": 0.0},
-                "wrench_noise": {"noise": 0.0},
-            }
-            for name, replaced in none.items():
-                joint_torque = replace(joint_torque, **(replaced if name in given else {}))
-        if "wrench_delay" in given:
-            given["wrench_delay"] = (given["wrench_delay"],) * 2
-        return replace(errors, **given, joint_torque=joint_torque)
-
-    @property
-    def is_named_only(self) -> bool:
-        """True if nothing but `sensing` and `tare` is given."""
-        return self == type(self).model_validate({"sensing": self.sensing, "tare": self.tare})
-
-    @property
-    def any(self) -> bool:
-        """True if any disturbance is on."""
-        undisturbed = type(self).model_validate({})
-        given = {field.name: None for field in fields(SensorErrors) if field.name in type(self).model_fields}
-        return self.errors != undisturbed.errors or self.model_copy(update=given) != undisturbed
-
 
 SIMULATION_PORTS = ("query", "body_poses")
 EXACT_WRENCH = "exact_wrench"

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
-from pydantic import Field
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
@@ -22,11 +19,11 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import LinearSystem, MatrixGain
 
 from guiderail.diagrams.stations.impedance_control import add_impedance_control, add_joint_impedance
+from guiderail.diagrams.stations.options import GantryOptions, ImpedanceControl
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
-    ContactOptions,
     ControllerPlant,
     Impedance,
     Station,
@@ -53,7 +50,6 @@ CARRIAGE_MASS, CARRIAGE_INERTIA = 1.5, 2e-3
 # Mass [kg] and radius [m] of a link between two joints; massless links would make the plant's mass matrix singular.
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
-ImpedanceControl = Literal["joint", "cartesian"]
 # Time step of the plant with a Cartesian controller [s]. The controller's forces are constant within a step; forces of
 # the joint springs are not. With this step, Cartesian control is as accurate as joint springs with `PLANT_PERIOD`: see
 # `python -m research.benchmarks impedance`.
@@ -64,16 +60,6 @@ def damping(impedance: Impedance) -> np.ndarray:
     """Return the damping of the joints for an impedance, (6,) [N s/m, Nm s/rad]."""
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
     return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
-
-
-class GantryOptions(ContactOptions):
-    """Options of the gantry station."""
-
-    impedance_control: ImpedanceControl = Field(
-        "joint",
-        description="joint: springs and dampers of the joints, solved with the contact; cartesian: the controller of "
-        "an arm",
-    )
 
 
 @register_station("gantry", workcell_kind="insertion", options=GantryOptions)

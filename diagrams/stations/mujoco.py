@@ -14,11 +14,11 @@ from pydrake.systems.framework import Context, DiagramBuilder
 
 from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, damping
 from guiderail.diagrams.stations.impedance_control import add_joint_impedance
+from guiderail.diagrams.stations.options import ContactOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
-    ContactOptions,
     Impedance,
     Station,
     check_pose,

@@ -38,14 +38,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, field_validator
 from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
-from guiderail.diagrams.envs.options import Number, Options
-from guiderail.diagrams.envs.task_diagram import round_period
+from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -62,38 +60,14 @@ INPUTS = ("desired_pose", "command_time")
 OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 """Output ports of every station; `INPUTS` are the input ports."""
 
-CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
-MAX_HALVINGS = 7
 TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
 COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; two control periods if that is longer
 
 # Force limits along x, y and z as fractions of the limit of the norm; the box of these limits lies inside the ball.
 FORCE_SHARES = (0.45, 0.45, 0.75)
 CONTACT_STIFFNESS = 1e5  # stiffness of workpiece, grasp and fixture in series during an impact [N/m]
-
-
-class ContactOptions(Options):
-    """Options of a station that simulates the contact of an insertion."""
-
-    time_step: Number | None = Field(
-        None, gt=0, description="time step of the plant [s]: the control period, or half, a quarter, an eighth … of it"
-    )
-
-    @field_validator("time_step")
-    @classmethod
-    def _part_of_control_period(cls, value: float | None) -> float | None:
-        if value is None:
-            return None
-        halvings = np.log2(CONTROL_PERIOD / value)
-        if abs(halvings - round(halvings)) > 1e-6 or not 0 <= round(halvings) <= MAX_HALVINGS:
-            raise ValueError(
-                f"it is the control period, {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} "
-                "times halved"
-            )
-        # Multiples of this value are exact: see `round_period`.
-        return CONTROL_PERIOD / 2 ** round(halvings)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
-from guiderail.diagrams.envs.options import Number, Numbers, Options, ResetOptions
+from guiderail.diagrams.envs.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
-from guiderail.models.objects.insertion import COLLISION_FORCE, MIN_CONTACT_FORCE
+from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -28,45 +28,9 @@ from guiderail.systems.relative_poses import RelativePoses
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimeters
 
 
-FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]
 # Center and scale of an observed force limit [N]; they do not depend on `force_limit_range`, so that a policy can be
 # evaluated with another range.
 LIMIT_CENTER, LIMIT_SCALE = 20.0, 10.0
-
-
-class ForceOptions(Options):
-    """Options of a task with a force limit."""
-
-    force_limit: Number = Field(
-        COLLISION_FORCE,
-        ge=FORCE_LIMITS[0],
-        le=FORCE_LIMITS[1],
-        description="force that ends an episode as a collision [N]",
-    )
-    force_limit_range: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="sample the force limit of every episode between these two, and let the policy observe it [N]; "
-        "default: force_limit",
-    )
-    bounded_force: bool = Field(
-        True, description="limit the impedance, so that its force cannot pass force_limit; without it: 40 N per axis"
-    )
-
-    @field_validator("force_limit_range")
-    @classmethod
-    def _check_limits(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not FORCE_LIMITS[0] <= value[0] <= value[1] <= FORCE_LIMITS[1]:
-            raise ValueError(
-                f"give two forces from {FORCE_LIMITS[0]:g} to {FORCE_LIMITS[1]:g} N, the smaller one first"
-            )
-        return value
-
-    @property
-    def largest_force_limit(self) -> float:
-        """Largest force limit of an episode [N]."""
-        return self.force_limit if self.force_limit_range is None else self.force_limit_range[1]
 
 
 HIDDEN_OFFSET_SCALE = (2.0 * MM, 2.0 * MM, 0.1)

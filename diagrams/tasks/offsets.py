@@ -5,61 +5,14 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.options import Numbers, Options
-from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.stations.options import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import MM, POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
-from guiderail.models.primitives.reference import interpolate_prior
-
-LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
-
-
-class FixtureOffsetOptions(Options):
-    """Options of a task with a fixture that is offset from its nominal position."""
-
-    fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
-        "per_run", description="offset of the fixture: sampled per run, per episode, or none"
-    )
-    offset_range: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="least and greatest offset of the fixture [m]; default: that of fixture_offset",
-    )
-
-    @field_validator("offset_range")
-    @classmethod
-    def _check_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
-            raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
-        return value
-
-
-MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # larger ones are probably in mm or degrees [m], [rad]
-
-
-class PriorOptions(Options):
-    """Option of a task with demonstrations of poses that may be a single one."""
-
-    prior_std: Numbers | None = Field(
-        None,
-        description="standard deviation of a single demonstration, x y z Rz Ry Rx [m], [rad], added to its own; or "
-        "rows of a phase from 0 to 1 and these six; required for one demonstration",
-        examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
-    )
-
-    @field_validator("prior_std")
-    @classmethod
-    def _check_prior(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and (interpolate_prior(value, 101, POSE_SIZE) > MAX_PRIOR_STD).any():
-            raise ValueError(f"give meters and radians, at most {MAX_PRIOR_STD[0]:g} m and {MAX_PRIOR_STD[-1]:g} rad")
-        return value
 
 
 def reference_of_file(

@@ -92,14 +92,20 @@ class Registry(Generic[Entry]):
         return name in self._declarations
 
     def declared(self, name: str, keyword: str) -> Any:
-        """Return an entry's attribute that is a keyword argument of its decorator.
+        """Return an entry's attribute that is a keyword argument of its decorator, or an attribute of its class.
 
-        If the entry's module is not imported yet, it is only imported if that argument is missing or not a literal.
+        If the entry's module is not imported yet, it is only imported if the source of the module does not show the
+        value: neither as a literal nor as a name imported from another module, which alone is then imported.
         """
-        literals = self._declarations[name].literals if name in self._declarations else {}
-        if name not in self._entries and keyword in literals:
-            return literals[keyword]
-        return getattr(self.get(name), keyword)
+        values = self._declarations[name].values if name in self._declarations else {}
+        if name in self._entries or keyword not in values:
+            return getattr(self.get(name), keyword)
+        value = values[keyword]
+        return getattr(import_module(value.module), value.name) if isinstance(value, _ImportedName) else value
+
+    def declares(self, name: str, keyword: str) -> bool:
+        """Return True if `declared` imports at most the module that defines the value."""
+        return name in self._entries or (name in self._declarations and keyword in self._declarations[name].values)
 
     @cached_property
     def _declarations(self) -> dict[str, "_Declaration"]:
@@ -116,9 +122,9 @@ class Registry(Generic[Entry]):
                 import_module(module)
             return {}
         return {
-            name: _Declaration(module, literals)
+            name: _Declaration(module, values)
             for module, file in files.items()
-            for name, literals in _registered(file.read_text(encoding="utf-8"), self._decorator)
+            for name, values in _registered(file.read_text(encoding="utf-8"), self._decorator)
         }
 
     @cached_property
@@ -127,10 +133,17 @@ class Registry(Generic[Entry]):
 
 
 class _Declaration(NamedTuple):
-    """Module that registers an entry, and the literals among the keyword arguments of its decorator."""
+    """Module that registers an entry, and the values of the entry's attributes that its source shows."""
 
     module: str
-    literals: dict[str, Any]
+    values: dict[str, Any]
+
+
+class _ImportedName(NamedTuple):
+    """Value that a module imports from another one."""
+
+    module: str
+    name: str
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:
@@ -153,18 +166,44 @@ def _folders(package: str) -> list[Path]:
 
 
 def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Return the names and literal keyword arguments with which the source of a module calls `decorator`."""
+    """Return the names, and the values that the source shows, of the entries that it registers with `decorator`.
+
+    The values are literals and imported names among the keyword arguments and the attributes of the decorated class.
+    """
     if not re.search(rf"\b{decorator}\(\s*[\"']", source):  # faster than parsing
         return
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    imported = {
+        alias.asname or alias.name: _ImportedName(node.module, alias.name)
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level
+        for alias in node.names
+    }
+    bodies = {
+        id(call): node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for call in node.decorator_list
+    }
+    for node in ast.walk(tree):
         if isinstance(node, ast.Call) and getattr(node.func, "id", None) == decorator and node.args:
             name = node.args[0]
             if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                literals = {}
-                for argument in node.keywords:
+                shown = dict(_assignments(bodies.get(id(node), ())))
+                shown |= {str(argument.arg): argument.value for argument in node.keywords}
+                values: dict[str, Any] = {}
+                for attribute, value in shown.items():
+                    if isinstance(value, ast.Name) and value.id in imported:
+                        values[attribute] = imported[value.id]
                     with suppress(ValueError):
-                        literals[str(argument.arg)] = ast.literal_eval(argument.value)
-                yield name.value, literals
+                        values[attribute] = ast.literal_eval(value)
+                yield name.value, values
+
+
+def _assignments(body: Iterable[ast.stmt]) -> Iterator[tuple[str, ast.expr]]:
+    """Return the names and the assigned expressions of the attributes in the body of a class."""
+    for node in body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        value = getattr(node, "value", None)
+        if len(targets) == 1 and isinstance(targets[0], ast.Name) and isinstance(value, ast.expr):
+            yield targets[0].id, value
 
 
 def _origin(value: object) -> tuple[str, str]:

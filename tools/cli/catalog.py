@@ -10,7 +10,7 @@ from guiderail.diagrams.envs.options import CommonOptions, PrimitiveOptions, Tem
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
-from guiderail.diagrams.stations.disturbances import Disturbances
+from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS

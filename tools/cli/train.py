@@ -111,6 +111,7 @@ def train(
     if task is not None and not modules and not resume:
         if out is None:
             raise InputError("the run needs a folder: name one with --out RUN")
+        from guiderail.diagrams.envs.declared import check_declared_options
         from guiderail.tools.files import refuse_existing_run
         from guiderail.tools.learning.config import check_choices
         from guiderail.tools.learning.learner import check_log_formats
@@ -127,6 +128,7 @@ def train(
             episodes=episodes,
             seed=seed,
         )
+        check_declared_options(task, environment)
     if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.datasets.validate import leaves_demonstrations
 

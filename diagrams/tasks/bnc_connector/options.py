@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Integer, Number
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.diagrams.tasks.insertion import FORCE_LIMITS, ForceOptions
-from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, PriorOptions, in_ring
+from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.options import FORCE_LIMITS, FixtureOffsetOptions, ForceOptions, PriorOptions
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 from guiderail.models.objects.insertion import COLLISION_FORCE
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 
 # Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {
@@ -27,6 +29,10 @@ OFFSET_RANGES = {
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool
 LARGEST_GRASP_ANGLE = 2.0  # [degrees] largest accepted `grasp_angle`; a larger tilt would be a faulty grasp
+
+
+OBSERVATIONS = ("state", "center_of_pressure")
+REWARDS = ("sparse", "shaped", "aligned")
 
 
 class BncUncertainty(HiddenOffsets):
@@ -148,6 +154,8 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
 
     def workcell(self) -> BncWorkcell:
         """Return the workcell with these options."""
+        from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell  # imports Drake
+
         dimensions = replace(
             NOMINAL.with_bore_clearance(self.bore_clearance),
             mouth_chamfer=self.mouth_chamfer,

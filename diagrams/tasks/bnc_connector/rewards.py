@@ -14,8 +14,6 @@ from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.reward_system import RewardTerm
 
-OBSERVATIONS = ("state", "center_of_pressure")
-
 # The scale of torques is small, because 0.02 Nm at 4 N indicate on which side of the rim the plug stands.
 POSE_CENTER = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
@@ -91,8 +89,6 @@ TERMINAL = {"success": 60.0, "collision": -50.0}
 DEPTH_REWARD = 5.0
 # Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
 ALIGNMENT_REWARD = 5.0
-
-REWARDS = ("sparse", "shaped", "aligned")
 
 
 def reward_terms(reward: str, num_actions: int) -> list[RewardTerm]:

@@ -15,12 +15,10 @@ from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.options import HARD, BncOptions, BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.options import HARD, OBSERVATIONS, REWARDS, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import (
-    OBSERVATIONS,
     POSE_CENTER,
     POSE_SCALE,
-    REWARDS,
     half_turn,
     observation_terms,
     reward_terms,

@@ -13,8 +13,9 @@ import yaml
 from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
-from guiderail.diagrams.stations.station import ContactOptions
-from guiderail.diagrams.tasks.offsets import PriorOptions, reference_of_file
+from guiderail.diagrams.stations.options import ContactOptions
+from guiderail.diagrams.tasks.offsets import reference_of_file
+from guiderail.diagrams.tasks.options import PriorOptions
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean

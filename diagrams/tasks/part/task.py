@@ -16,16 +16,14 @@ from guiderail.diagrams.envs.options import STANDARD, Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.options import OBSERVATIONS, REWARDS, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import (
-    OBSERVATIONS,
-    REWARDS,
     observation_terms,
     reward_terms,
     sides_of_the_rim,
 )
-from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, ForceOptions
-from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions
+from guiderail.diagrams.tasks.insertion import DemonstratedInsertion
+from guiderail.diagrams.tasks.options import FixtureOffsetOptions, ForceOptions
 from guiderail.diagrams.tasks.part.file import AUTOMATE, Bounds, PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold

@@ -8,9 +8,9 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.grid_clamp.options import COLLISION_FORCE
 from guiderail.diagrams.tasks.grid_clamp.task import (
     CENTER,
-    COLLISION_FORCE,
     MAX_TRACKING_ERROR,
     SCALE,
     STIFFNESS,

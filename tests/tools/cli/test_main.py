@@ -262,6 +262,7 @@ from guiderail.tools.cli.main import main
 for words in (
     "", "--guidance nope", "--env guidance=nope", "--station nope", "--algorithm nope", "--preset nope", "--set nope=1",
     "--preset tqc_fast --set batch_size=0", "--episodes 0", "--seed -1", "--log nope", "--out .",
+    "--env nope=1", "--env friction=9", "--env time_step=-1", "--env slack_width=-1", "--env offset_range=1",
 ):
     try:
         main(["train", "BncConnector", *(["--out", "run"] if words else []), *words.split()])
@@ -271,7 +272,7 @@ for words in (
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    assert len(result.stderr.splitlines()) == 12, result.stderr
+    assert len(result.stderr.splitlines()) == 17, result.stderr
     assert not (tmp_path / "run").exists()
 
 

@@ -1,0 +1,77 @@
+"""Options of GridClamp, and the overrides of difficulty="hard"."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, field_validator
+
+from guiderail.diagrams.envs.options import Number, Numbers
+from guiderail.diagrams.tasks.options import FORCE_LIMITS, ForceOptions
+from guiderail.models.common.transforms import MM
+from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
+from guiderail.models.objects.grid_clamp.sdf import FRICTION
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+
+
+# Force of a collision [N]. Commands in the cuboid are at most 6 mm below the seat and 8 mm sideways; an impedance of
+# 1500 N/m then pushes with less.
+COLLISION_FORCE = 35.0
+START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
+HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
+REWARDS = ("shaped", "no_force", "sparse", "aligned")
+NOMINAL = GridClampDimensions()
+
+
+class GridClampOptions(ForceOptions):
+    """Options of GridClamp."""
+
+    fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
+        "per_run", description="offsets of table and clamp: sampled per run, per episode, or none"
+    )
+    start_height: Numbers = Field(
+        START_HEIGHT, min_length=2, max_length=2, description="least and greatest start height [m]"
+    )
+    force_limit: Number = Field(
+        COLLISION_FORCE, ge=8, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
+    )
+    seconds: Number = Field(10.0, ge=2, le=30, description="duration of an episode [s]")
+    hole_chamfer: Number = Field(NOMINAL.hole_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the holes [m]")
+    peg_chamfer: Number = Field(
+        NOMINAL.peg_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the pegs' tips [m]"
+    )
+    clearance: Number = Field(
+        NOMINAL.clearance,
+        ge=0.05 * MM,
+        le=0.15 * MM,
+        description="clearance between a peg and its hole on each side [m]",
+    )
+    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of pegs, holes and table")
+
+    @field_validator("start_height")
+    @classmethod
+    def _check_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if not HEIGHTS[0] <= value[0] <= value[1] <= HEIGHTS[1]:
+            raise ValueError(f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
+        return value
+
+    def workcell(self) -> GridClampWorkcell:
+        """Return the workcell with these options."""
+        from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell  # imports Drake
+
+        dimensions = replace(
+            NOMINAL.with_clearance(self.clearance), hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer
+        )
+        return GridClampWorkcell(dimensions, friction=self.friction)
+
+
+HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
+"""Options of difficulty="hard": little time, and a force limit of 10 N; snapping in takes 6 N.
+
+The impedance's force is bounded below the limit, so that an untrained policy fails by running out of time and not by a
+collision. On the gantry with exact sensors random actions find the holes in 10 of 14 episodes of 10 s, and in 4 of 14
+episodes of 6 s. A scripted search finds the holes in all of these episodes.
+"""

@@ -1,0 +1,63 @@
+"""Declarations of tasks, guidance and stations, compared with what these provide."""
+
+import subprocess
+import sys
+
+import pytest
+
+from guiderail.diagrams.envs.config import EnvConfig, option_models
+from guiderail.diagrams.envs.declared import check_declared_options, declared_models
+from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry
+
+TASKS_WITH_OPTIONS = [name for name in TASKS.names() if TASKS.is_packaged(name) and TASKS.declares(name, "Options")]
+
+
+@pytest.mark.parametrize(("registry", "noun"), [(TASKS, "task"), (GUIDANCE, "guidance"), (STATIONS, "station")])
+def test_declared_values_are_those_of_the_entries(registry, noun):
+    folders = {"task": ("tasks",), "guidance": ("guidance",), "station": ("stations", "hardware")}[noun]
+    packages = [f"guiderail.diagrams.{folder}" for folder in folders]
+    fresh = Registry(noun, package=packages, decorator=f"register_{noun}")  # none of its entries is imported
+    for name in fresh.names():
+        entry = registry.get(name)
+        for attribute in ("Options", "options", "rewards", "observations", "workcell_kind", "needs", "label"):
+            if fresh.declares(name, attribute):
+                assert fresh.declared(name, attribute) == getattr(entry, attribute), (name, attribute)
+
+
+def test_every_option_of_an_environment_is_declared():
+    assert {"BncConnector", "GridClamp", "NarrowPassage"} <= {*TASKS_WITH_OPTIONS}
+    for name in TASKS_WITH_OPTIONS:
+        task, declared = TASKS.get(name), declared_models(name)
+        for guidance in possible_guidance(task.provides()):
+            for station in task.stations():
+                used = {model for model in option_models(task, guidance, station).values() if model.model_fields}
+                assert used <= {*declared}, (name, guidance, station)
+
+
+@pytest.mark.parametrize("name", TASKS_WITH_OPTIONS)
+def test_check_accepts_what_an_environment_accepts(name):
+    for difficulty in TASKS.get(name).difficulties:
+        check_declared_options(name, EnvConfig.resolve(name, {"difficulty": difficulty}).options)
+
+
+@pytest.mark.parametrize("options", [{"nope": 1}, {"reward": "nope"}, {"friction": "9"}, {"kernel": "nope"}])
+def test_check_refuses_what_an_environment_refuses(options):
+    for check in (check_declared_options, EnvConfig.resolve):
+        with pytest.raises(InputError, match=next(iter(options))):
+            check("BncConnector", options)
+
+
+def test_models_of_options_import_no_drake():
+    code = """
+import sys
+from guiderail.diagrams.envs.declared import declared_models
+for name in ("BncConnector", "GridClamp", "NarrowPassage"):
+    declared_models(name)
+sys.exit(", ".join({"pydrake", "torch", "pandas"} & set(sys.modules)))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert not result.stderr.strip(), result.stderr
