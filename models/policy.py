@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -39,15 +39,22 @@ class Policy:
         layers: Weight (out, in) and bias (out,) of each layer, first to last.
         description: Content of `policy.json`: the shape of observations, the limits of actions, `activation` ("relu",
             the default, "normalized_relu" or "tanh"), `squash` ("tanh", the default, or "clip"), and for images `pool`,
-            the side of the squares of pixels that are averaged.
+            the side of the squares of pixels that are averaged. `image_shape`, (height, width, channels), declares that
+            observations are vectors [image / 255, state] (see `ImageObservation`).
+        encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution of an image, with stride 2 and a rectifier.
 
     Raises:
         ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from observation
             to action, or a number is not finite.
     """
 
-    def __init__(self, layers: list[tuple[np.ndarray, np.ndarray]], description: Mapping[str, Any]):
-        self._layers = layers
+    def __init__(
+        self,
+        layers: Sequence[tuple[np.ndarray, np.ndarray]],
+        description: Mapping[str, Any],
+        encoder: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+    ):
+        self._layers, self._encoder = list(layers), list(encoder)
         self.description = dict(description)
         activation = self.description.setdefault("activation", "relu")
         if activation not in ("relu", "normalized_relu", "tanh"):
@@ -59,6 +66,8 @@ class Policy:
         self._normalizes = activation == "normalized_relu"
         try:
             self._shape = tuple(description["observation_shape"])
+            image = description.get("image_shape", self._shape if len(self._shape) == 3 else None)
+            self._image_shape = None if image is None else tuple(image)
             self._low, self._high = (np.asarray(description[f"action_{end}"], np.float32) for end in ("low", "high"))
         except (KeyError, TypeError, OverflowError) as error:
             raise ValueError("a description has the observation's shape, and the action's limits as numbers") from error
@@ -66,26 +75,35 @@ class Policy:
 
     def _check(self) -> None:
         """Raise a ValueError if description and layers are inconsistent."""
-        if any(type(n) is not int or n < 1 for n in (*self._shape, self.description.get("pool", 1))):
+        image = self._image_shape
+        if any(type(n) is not int or n < 1 for n in (*self._shape, *(image or ()), self.description.get("pool", 1))):
             raise ValueError("a shape, and the side of a square of pixels, are positive whole numbers")
         if self._low.ndim != 1 or self._low.shape != self._high.shape or not (self._low < self._high).all():
             raise ValueError("an action has a lower limit below an upper one for each of its numbers")
-        if len(self._shape) == 3 and "pool" not in self.description:
+        if image is not None and (len(image) != 3 or math.prod(image) > math.prod(self._shape)):
+            raise ValueError("an image has height, width and channels, and is part of the observation")
+        if image is not None and "pool" not in self.description:
             raise ValueError("a policy of images needs `pool`, the side of the squares of pixels that are averaged")
         sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
         expected = [(out, into) for into, out in pairwise(sizes)]
         if not self._layers or [weight.shape for weight, _ in self._layers] != expected or sizes[-1] != len(self._low):
             raise ValueError(f"layers lead from {sizes[0]} features to {len(self._low)} actions, one after the other")
-        numbers = [self._low, self._high, *(array for layer in self._layers for array in layer)]
+        numbers = [self._low, self._high, *(array for layer in (*self._encoder, *self._layers) for array in layer)]
         if any(array.dtype != np.float32 or not np.isfinite(array).all() for array in numbers):
             raise ValueError("weights and limits are finite and of single precision")
 
     def _num_features(self) -> int:
         """Return the number of inputs of the first layer."""
-        if len(self._shape) != 3:
+        if self._image_shape is None:
+            if self._encoder:
+                raise ValueError("convolutions need an image in the observation")
             return math.prod(self._shape)
-        height, width, channels = self._shape
-        return (height // self.description["pool"]) * (width // self.description["pool"]) * channels
+        channels, sides = self._image_shape[2], [side // self.description["pool"] for side in self._image_shape[:2]]
+        for weight, bias in self._encoder:
+            if weight.shape != (len(bias), channels, 3, 3) or min(sides) < 3:
+                raise ValueError("convolutions are 3 × 3, one after the other, and fit into the image")
+            channels, sides = len(bias), [(side - 1) // 2 for side in sides]
+        return channels * math.prod(sides) + math.prod(self._shape) - math.prod(self._image_shape)
 
     @classmethod
     def load(cls, folder: Path | str) -> Policy:
@@ -109,8 +127,12 @@ class Policy:
                 raise ValueError("the format or the digest differs")
             if len(arrays) % 2:
                 raise ValueError("a layer has a weight and a bias")
-            layers = [(arrays[f"layers.{i}.weight"], arrays[f"layers.{i}.bias"]) for i in range(len(arrays) // 2)]
-            return cls(layers, values)
+            kinds = [name.split(".")[0] for name in arrays if name.endswith(".weight")]
+            layers, encoder = (
+                [(arrays[f"{kind}.{i}.weight"], arrays[f"{kind}.{i}.bias"]) for i in range(kinds.count(kind))]
+                for kind in ("layers", "encoder")
+            )
+            return cls(layers, values, encoder)
         except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"the policy in {folder} is damaged or of another version: write it again with guiderail train --resume"
@@ -120,8 +142,9 @@ class Policy:
         """Write `policy.safetensors` and `policy.json`; `write` writes one file, for example atomically."""
         folder = Path(folder)
         arrays: dict[str, np.ndarray] = {}
-        for index, (weight, bias) in enumerate(self._layers):
-            arrays |= {f"layers.{index}.weight": weight, f"layers.{index}.bias": bias}
+        for kind, stored in (("layers", self._layers), ("encoder", self._encoder)):
+            for index, (weight, bias) in enumerate(stored):
+                arrays |= {f"{kind}.{index}.weight": weight, f"{kind}.{index}.bias": bias}
         values = self.description | {"format": FORMAT}
         values["digest"] = _digest(arrays, values)
         write(folder / "policy.safetensors", save(arrays))
@@ -153,14 +176,22 @@ class Policy:
         return self._activation(features)
 
     def _features(self, observation: np.ndarray) -> np.ndarray:
-        """Return the inputs of the first layer: the observation, or an averaged image in [0, 1], channel by channel."""
-        if observation.ndim != 3:
+        """Return the inputs of the first layer: features of the image, channel by channel, and the other entries."""
+        if self._image_shape is None:
             return observation.astype(np.float32).ravel()
-        side = self.description["pool"]
-        height, width, channels = (n // side if i < 2 else n for i, n in enumerate(observation.shape))
-        image = observation[: height * side, : width * side].astype(np.float32) / np.float32(255)
-        image = image.reshape(height, side, width, side, channels).mean((1, 3), dtype=np.float32)
-        return image.transpose(2, 0, 1).ravel()
+        height, width, channels = self._image_shape
+        if observation.ndim == 3:
+            image, state = np.moveaxis(observation, -1, 0).astype(np.float32) / np.float32(255), np.empty(0, np.float32)
+        else:
+            pixels, state = np.split(observation.astype(np.float32), [math.prod(self._image_shape)])
+            image = pixels.reshape(channels, height, width)
+        if (side := self.description["pool"]) > 1:
+            image = image[:, : height // side * side, : width // side * side]
+            image = image.reshape(channels, height // side, side, width // side, side).mean((2, 4), dtype=np.float32)
+        for weight, bias in self._encoder:
+            patches = np.lib.stride_tricks.sliding_window_view(image, (3, 3), axis=(1, 2))[:, ::2, ::2]
+            image = np.maximum(np.tensordot(weight, patches, ((1, 2, 3), (0, 3, 4))) + bias[:, None, None], 0)
+        return np.concatenate([image.ravel(), state])
 
 
 def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from .gripper_command import GripperCommand as GripperCommand
 from .heartbeat_monitor import HeartbeatMonitor as HeartbeatMonitor
 from .history_buffer import HistoryBuffer as HistoryBuffer
 from .history_length_schedule import HistoryLengthSchedule as HistoryLengthSchedule
+from .image_observation import ImageObservation as ImageObservation
 from .impedance_monitor import ImpedanceMonitor as ImpedanceMonitor
 from .joint_torque_wrench import JointTorqueWrench as JointTorqueWrench
 from .lc_ns_kmp_system import LcNsKmpSystem as LcNsKmpSystem

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
@@ -12,9 +12,16 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
-from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
+from guiderail.diagrams.envs.cameras import Camera, add_meshcat, add_observation_camera, add_picture
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
-from guiderail.diagrams.envs.observation import CLOCKS, MOTION_TIME, Observation, ObservationTerm, affine
+from guiderail.diagrams.envs.observation import (
+    CLOCKS,
+    MOTION_TIME,
+    ImageAndStateSpace,
+    Observation,
+    ObservationTerm,
+    affine,
+)
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
@@ -31,6 +38,7 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.reference import pass_through
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
+from guiderail.systems.image_observation import ImageObservation
 from guiderail.systems.reward_system import RewardSystem
 
 if TYPE_CHECKING:
@@ -238,7 +246,7 @@ class Loop:
         Raises:
             InputError: If the observation is an image.
         """
-        if self.observation.get_data_type() != PortDataType.kVectorValued:
+        if self.observation.get_data_type() != PortDataType.kVectorValued or task.observation_camera() is not None:
             raise InputError(f"a base policy of {task.name} takes no images: choose another observation")
         guidance: Any = self.guidance
         reference = self.builder.AddNamedSystem("reference", guidance.make_reference(self.observation.size()))
@@ -246,13 +254,18 @@ class Loop:
         self.builder.Connect(reference.GetOutputPort("reference_window"), guidance.GetInputPort("reference_window"))
 
     def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
-        observed, station = task.observation_terms(), self.station
+        observed = task.observation_terms()
+        camera = observed if isinstance(observed, Camera) else task.observation_camera()
+        if camera is None:
+            return self.add_terms(task, cast("Sequence[ObservationTerm]", observed), "observation")
+        image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
         if isinstance(observed, Camera):
-            query = station.GetOutputPort("query")
-            image = add_camera(self.builder, station.scene_graph, query, "observation_camera", observed)
-            width, height = observed.size
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
-        return self.add_terms(task, observed, "observation")
+        space, state = self.add_terms(task, observed, "state_observation")
+        both = self.builder.AddNamedSystem("observation", ImageObservation(width, height, state.size()))
+        self.builder.Connect(image, both.get_image_input_port())
+        self.builder.Connect(state, both.get_state_input_port())
+        return ImageAndStateSpace((height, width, 3), space), both.get_observation_output_port()
 
     def add_terms(
         self, task: Task, terms: Sequence[ObservationTerm], name: str
@@ -337,7 +350,7 @@ def build_task_diagram(
     for name, port in exported.items():
         builder.ExportOutput(port, name)
     if render_mode == "rgb_array":
-        _add_picture(builder, task, station)
+        add_picture(builder, station, task.camera(), task.name)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
     displaces = GUIDANCE.get(task.config.guidance).displaces  # symmetries hold only if actions displace outputs
@@ -420,7 +433,7 @@ def build_skill_diagram(
         builder.ExportOutput(guidance.GetOutputPort(name), name)
     meshcat = add_meshcat(builder, station.GetOutputPort("query")) if render_mode == "human" else None
     if render_mode == "rgb_array":
-        _add_picture(builder, task, station)
+        add_picture(builder, station, task.camera(), task.name)
     diagram = builder.Build()
     diagram.set_name(f"{task.name.replace('/', '_')}_skill")
     return SkillDiagram(
@@ -483,16 +496,3 @@ def _push(station: Station) -> Any:
         station.set_pose(context, pose + displacement)
 
     return push
-
-
-def _add_picture(builder: DiagramBuilder, task: Task, station: Station) -> None:
-    """Add the task's camera and export its image."""
-    camera = task.camera()
-    if camera is None:
-        raise InputError(
-            f"{task.name} has no camera: leave out render_mode='rgb_array' or --image, or write its camera()"
-        )
-    picture = add_camera(
-        builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera, is_picture=True
-    )
-    builder.ExportOutput(picture, "rgb_image")

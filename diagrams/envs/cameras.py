@@ -5,6 +5,7 @@ import logging
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import (
@@ -23,6 +24,7 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
@@ -47,17 +49,19 @@ _PARAMETERS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """Fixed camera.
+    """Camera that is fixed in the world or in a frame of the plant, such as a wrist camera.
 
     Attributes:
         size: Width and height of its image [pixels].
         vertical_fov: Vertical field of view [rad].
-        X_WC: Pose of the camera; C has x to the right, y down and z into the picture.
+        X_WC: Pose of the camera in the world, or in `frame`; C has x to the right, y down and z into the picture.
+        frame: Name of the frame of the plant that carries the camera; None: the world.
     """
 
     size: tuple[int, int]
     vertical_fov: float
     X_WC: RigidTransform
+    frame: str | None = None
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return the pixel coordinates (n, 2), from the upper left corner, of points (n, 3) in the world [m]."""
@@ -86,16 +90,26 @@ def add_camera(
     name: str,
     camera: Camera,
     *,
+    plant: MultibodyPlant | None = None,
     is_picture: bool = False,
 ) -> OutputPort:
     """Add a camera and return the port of its color image, an `ImageRgba8U`.
 
-    With `is_picture` the scene is lit for a picture instead of an observation.
+    `plant` has the frame of a camera that is not fixed in the world. With `is_picture` the scene is lit for a picture
+    instead of an observation. An image is rendered only when the port is evaluated.
 
     Raises:
-        InputError: If this machine lacks the library that renders without a display.
+        InputError: If this machine lacks the library that renders without a display, or the station's plant lacks the
+            camera's frame.
     """
     check_rendering()
+    parent, X_PC = scene_graph.world_frame_id(), camera.X_WC
+    if camera.frame is not None:
+        if plant is None or not plant.HasFrameNamed(camera.frame):
+            raise InputError(f"this station has no frame {camera.frame!r} for a camera: choose another observation")
+        carrier = plant.GetFrameByName(camera.frame)
+        parent = plant.GetBodyFrameIdOrThrow(carrier.body().index())
+        X_PC = carrier.GetFixedPoseInBodyFrame() @ camera.X_WC
     # Mesa and Triton, a dependency of PyTorch with CUDA, load different versions of LLVM. If Triton's is loaded second,
     # the process ends with a segmentation fault. PyTorch imports Triton late, with its compiler.
     with suppress(ImportError):
@@ -107,14 +121,39 @@ def add_camera(
     info = CameraInfo(*camera.size, camera.vertical_fov)
     core = RenderCameraCore(renderer, info, clipping, RigidTransform())
     sensor = RgbdSensor(
-        parent_id=scene_graph.world_frame_id(),
-        X_PB=camera.X_WC,
+        parent_id=parent,
+        X_PB=X_PC,
         color_camera=ColorRenderCamera(core, show_window=False),
         depth_camera=DepthRenderCamera(core, DepthRange(0.02, 9.0)),
     )
     builder.AddNamedSystem(name, sensor)
     builder.Connect(query, sensor.query_object_input_port())
     return sensor.color_image_output_port()
+
+
+def add_observation_camera(builder: DiagramBuilder, station: Any, camera: Camera) -> OutputPort:
+    """Add the camera of an observation in a station's scene; return the port of its image.
+
+    Raises:
+        InputError: If the station renders no images, or as `add_camera`.
+    """
+    if not station.HasOutputPort("query"):
+        raise InputError("this station renders no images: choose another observation")
+    query, plant = station.GetOutputPort("query"), getattr(station, "plant", None)
+    return add_camera(builder, station.scene_graph, query, "observation_camera", camera, plant=plant)
+
+
+def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, task: str) -> None:
+    """Add the camera of the pictures of a task, given its name, and export its image.
+
+    Raises:
+        InputError: If the task has no camera, or as `add_camera`.
+    """
+    if camera is None:
+        raise InputError(f"{task} has no camera: leave out render_mode='rgb_array' or --image, or write its camera()")
+    query = station.GetOutputPort("query")
+    picture = add_camera(builder, station.scene_graph, query, "picture", camera, is_picture=True)
+    builder.ExportOutput(picture, "rgb_image")
 
 
 def check_rendering() -> None:

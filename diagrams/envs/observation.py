@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -35,6 +36,21 @@ class ObservationTerm:
     center: Sequence[float] | np.ndarray | float = 0.0
     scale: Sequence[float] | np.ndarray | float = 1.0
     entries: tuple[int, ...] | None = None
+
+
+class ImageAndStateSpace(gymnasium.spaces.Box):
+    """Space of vectors [image / 255, state] of float32, with the image channel by channel (see `ImageObservation`).
+
+    Attributes:
+        image_shape: Height, width and number of channels of the image.
+    """
+
+    def __init__(self, image_shape: tuple[int, int, int], state: gymnasium.spaces.Box):
+        """Construct the space for images of a shape (height, width, channels) and states of a space (n,)."""
+        self.image_shape = image_shape
+        pixels = np.zeros(math.prod(image_shape), np.float32)
+        low, high = np.concatenate([pixels, state.low]), np.concatenate([pixels + 1, state.high])
+        super().__init__(low, high, dtype=np.float32)
 
 
 class Observation(Diagram):

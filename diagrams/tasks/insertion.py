@@ -11,6 +11,7 @@ from pydantic import Field, field_validator
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.envs.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
@@ -193,6 +194,9 @@ class InsertionTask(Task):
         """Return the pose at which an episode starts, (6,)."""
 
 
+WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pixels]
+
+
 class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal."""
 
@@ -212,6 +216,19 @@ class DemonstratedInsertion(InsertionTask):
         system = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
         builder.Connect(station.get_wrench_output_port(), system.get_wrench_input_port())
         return {**super().signals(builder, station), "center_of_pressure": system.get_center_of_pressure_output_port()}
+
+    @property
+    def has_image(self) -> bool:
+        """True if the observation is or contains the image of the wrist camera."""
+        return self.config.observation.startswith("image")
+
+    def wrist_camera(self, length: float) -> Camera:
+        """Return a camera on the tool that looks at the workpiece's lower end and the fixture below it.
+
+        It is at a distance of about 3.5 times the `length` of the insertion [m] from the tool center.
+        """
+        eye, target = length * np.array([2.4, 0.0, 2.4]), length * np.array([0.0, 0.0, -0.3])
+        return Camera(WRIST_IMAGE_SIZE, np.deg2rad(40.0), look_at(eye, target), frame="grasp")
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return the demonstrations' start plus a sampled offset, inside the constraints."""

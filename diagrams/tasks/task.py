@@ -212,6 +212,10 @@ class Task(ABC):
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """Return the terms of the observation `config.observation`, or the camera of an image."""
 
+    def observation_camera(self) -> Camera | None:
+        """Return the camera whose image precedes the observation terms, or None; see `ImageObservation`."""
+        return None
+
     def privileged_terms(self) -> Sequence[ObservationTerm]:
         """Return the terms that only a privileged critic observes, such as hidden values; none by default.
 

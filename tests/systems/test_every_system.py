@@ -79,6 +79,7 @@ def built():
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.CenterOfPressure(0.5),
+        systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
         systems.HeartbeatMonitor(period=PERIOD, timeout=1.0),
         systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),

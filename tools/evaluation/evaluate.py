@@ -32,6 +32,7 @@ from guiderail.tools.evaluation.rollout import (
     EpisodeProgress,
     PolicyFn,
     check_seed,
+    has_image,
     is_compatible,
     rollout,
 )
@@ -92,6 +93,8 @@ def evaluate_policies(
         raise InputError(f"an evaluation needs at least one episode, not {episodes}")
     check_seed(seed)
     processes = check_processes(processes)
+    if has_image(env.observation_space):
+        processes = 1  # the renderer has threads, which a fork does not have
     names = list(policies)
 
     def run(number: int) -> tuple[dict[str, Any], Any]:

@@ -94,6 +94,11 @@ def check_seed(seed: int) -> None:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
 
 
+def has_image(space: Any) -> bool:
+    """Return True if the observations of a space are images or contain one."""
+    return len(space.shape or ()) == 3 or hasattr(space, "image_shape")
+
+
 def rollout(
     env: gymnasium.Env,
     act: PolicyFn,

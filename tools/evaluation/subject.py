@@ -37,7 +37,7 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
         environment: Options of its environment.
     """
     zero = [] if is_demonstrated(environment.get("guidance")) else ["zero"]
-    has_scripted = bool(scripted_policies(task)) and environment.get("observation") != "image"
+    has_scripted = bool(scripted_policies(task)) and not str(environment.get("observation")).startswith("image")
     return [*zero, "uniform_random", "constant", *(["scripted"] if has_scripted else [])]
 
 

@@ -21,7 +21,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.hardware.connection import Log, RobotConnection
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import robot_session
-from guiderail.tools.learning.learner import LEARNERS, learner_arguments
+from guiderail.tools.learning.learner import LEARNERS, described_observation, learner_arguments
 from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, with_defaults
@@ -104,8 +104,7 @@ def _train(
             learner.write(step_log_file(folder.steps, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
 
     def save_policy() -> None:
-        shape = list(env.observation_space.shape or ())
-        acting.policy({"task": config.task, "observation_shape": shape}).save(folder.path, write=write_atomically)
+        acting.policy({"task": config.task, **described_observation(env)}).save(folder.path, write=write_atomically)
 
     def save_learned() -> None:
         if learner.known:

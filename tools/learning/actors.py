@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import set_random_seed
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, rollout
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, has_image, rollout
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 
@@ -89,6 +89,8 @@ class ParallelLearner(Learner):
             raise InputError("only an off-policy learner has parallel actors: choose sac or tqc, or --num-envs 0")
         if not can_fork():
             raise InputError("parallel actors are forks, which this process cannot have: leave num_envs out")
+        if has_image(env.observation_space):
+            raise InputError("parallel actors are forks, which cannot render images: leave num_envs out")
         self._learner, self._env, self._num_envs, self._seed = learner, env, num_envs, seed
         self._num_episodes, self._demonstrator, self._callbacks = num_episodes, demonstrator, callbacks
         self._forks: Forks | None = None
@@ -242,7 +244,7 @@ def _modules(learner: OffPolicyLearner) -> dict[str, Any]:
 def copy_weights(learner: OffPolicyLearner) -> Weights:
     """Return a copy of the weights that a learner acts with."""
     return {
-        name: {key: value.detach().numpy().copy() for key, value in module.state_dict().items()}
+        name: {key: value.detach().cpu().numpy().copy() for key, value in module.state_dict().items()}
         for name, module in _modules(learner).items()
     }
 

@@ -13,7 +13,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import BcConfig
-from guiderail.tools.learning.learner import Learner, refuse_images
+from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.networks import export_layers
 
 
@@ -40,12 +40,7 @@ class BcLearner(Learner):
         max_transitions: int,
         symmetry: Symmetry | None = None,
     ):
-        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used.
-
-        Raises:
-            InputError: If observations are images.
-        """
-        refuse_images(env, config.algorithm)
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.config, self._space, self._seed = config, env.action_space, seed
         self._symmetry = symmetry if config.symmetry else None
         sizes = [*(env.observation_space.shape or ()), *config.net_arch, *(env.action_space.shape or ())]

@@ -7,7 +7,7 @@ setting given by `--set name=value` is validated against that class.
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -84,11 +84,16 @@ class OffPolicyConfig(LearnerConfig):
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
+    image_encoder: Literal["average_pooling", "convolutional"] = "average_pooling"  # features of observed images
+    random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of images in training [pixels] (DrQ)
+    device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Fraction = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
 
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
             raise InputError("demonstration_fraction needs demonstrations: give --set demonstration_episodes=... too")
+        if self.device == "cuda" and self.num_envs:
+            raise InputError("parallel actors are forks, which cannot use cuda: leave num_envs or device=cuda out")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -113,6 +118,8 @@ class CrossQConfig(OffPolicyConfig):
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class OnPolicyConfig(LearnerConfig):
     """Settings of an on-policy learner, by the names of Stable-Baselines3 where it has them."""
+
+    takes_images: ClassVar[bool] = False
 
     algorithm: str = "ppo"
     learning_rate: Rate = 3e-4
@@ -148,6 +155,8 @@ class TrpoConfig(OnPolicyConfig):
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class BcConfig(LearnerConfig):
     """Settings of behavior cloning (BC)."""
+
+    takes_images: ClassVar[bool] = False
 
     algorithm: str = "bc"
     demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1

@@ -22,7 +22,7 @@ from pydantic.dataclasses import dataclass
 from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Callback
+from guiderail.tools.evaluation.rollout import Callback, has_image
 
 LOG_FORMATS = ("tensorboard", "wandb", "csv", "json", "log", "stdout")
 # Columns of an episode's row that are logged, and their names in the log.
@@ -62,7 +62,10 @@ class LearnerConfig:
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
+        takes_images: Whether the learner's networks take observations with images.
     """
+
+    takes_images: ClassVar[bool] = True
 
     algorithm: str
     demonstration_episodes: NonNegative = 0
@@ -171,10 +174,11 @@ LEARNERS: Registry[Any] = Registry(
 register_learner = LEARNERS.register
 
 
-def refuse_images(env: gymnasium.Env, algorithm: str) -> None:
-    """Raise an InputError if an environment's observations are images, which an algorithm's networks do not take."""
-    if len(env.observation_space.shape or ()) != 1:
-        raise InputError(f"{algorithm} takes no images: give another --observation, or the algorithm tqc")
+def described_observation(env: gymnasium.Env) -> dict[str, Any]:
+    """Return the entries of a policy's description for an environment's observations."""
+    space = env.observation_space
+    image = getattr(space, "image_shape", None)
+    return {"observation_shape": list(space.shape or ())} | ({} if image is None else {"image_shape": list(image)})
 
 
 def divergence_error() -> InputError:
@@ -186,7 +190,13 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
     """Return the keyword arguments of a learner for the `RunConfig` and the task of a run.
 
     The symmetry is None if a supervisor or via-points correct the demonstrations: they are not symmetric then.
+
+    Raises:
+        InputError: If observations have images, and the learner's networks take none.
     """
+    if not config.learner.takes_images and has_image(task.observation_space):
+        name = config.learner.algorithm
+        raise InputError(f"{name} takes no images: give --env observation=... without one, or --algorithm tqc")
     symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
     is_corrected = config.human_in_the_loop or bool(config.environment.get("via_points"))
     return {

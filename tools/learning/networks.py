@@ -1,5 +1,7 @@
 """Networks of Stable-Baselines3 learners: images, activations, export, and critics that observe more than the actor."""
 
+import copy
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,6 +10,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from sb3_contrib.common.torch_layers import BatchRenorm
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
@@ -88,24 +91,144 @@ def with_privileged(
 
 
 IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22×28×3
+CHANNELS = (32, 32, 32)  # output channels of the convolutions, each 3×3 with stride 2
 
 
-class AveragePooledImage(BaseFeaturesExtractor):
-    """Features of an image: the averages of squares of pixels, as one vector (thesis, 4.4.1).
+def image_shape(space: Any) -> tuple[int, int, int] | None:
+    """Return the shape (height, width, channels) of the image in a space's observations; None if there is none."""
+    height_width_channels = space.shape if is_image_space(space) else getattr(space, "image_shape", None)
+    return None if height_width_channels is None else tuple(height_width_channels)
 
-    Without pooling, an image of 110×144×3 needs a first layer of twelve million weights per network, and a gradient
-    step takes most of a second on one core. The details that a task needs are larger than a pixel.
+
+def packed_space(space: spaces.Box) -> spaces.Box:
+    """Return the space of `pack_observation`: vectors of uint8."""
+    shape = image_shape(space)
+    assert shape is not None
+    size = math.prod(shape) + 4 * (0 if len(space.shape) == 3 else space.shape[0] - math.prod(shape))
+    return spaces.Box(0, 255, (size,), np.uint8)
+
+
+def pack_observation(observation: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Return an observation with an image as a vector of uint8, channel by channel, followed by the state's bytes.
+
+    A replay buffer of such vectors needs one byte per pixel. No number is rounded.
+
+    Args:
+        observation: Image (height, width, channels) of uint8, or vector [image / 255, state] of float32.
+        shape: Shape of the image.
+    """
+    if observation.ndim == 3:
+        return np.moveaxis(observation, -1, 0).ravel()
+    pixels, state = np.split(observation.astype(np.float32), [math.prod(shape)])
+    return np.concatenate([np.rint(pixels * 255).astype(np.uint8), state.view(np.uint8)])
+
+
+class ImageFeatures(BaseFeaturesExtractor):
+    """Features of a packed observation: those of its image, and its state.
+
+    The image's features are the averages of squares of pixels (thesis, 4.4.1), or the outputs of convolutions. In
+    training mode, the image of a convolutional extractor is shifted at random (DrQ; Yarats et al., 2021).
+
+    Without pooling or convolutions, an image of 110×144×3 needs a first layer of twelve million weights per network.
+
+    Attributes:
+        pool: Side of the averaged squares [pixels]; 1 for convolutions.
+        convolutions: Convolutions, each with a rectifier; empty for pooling.
     """
 
-    def __init__(self, observation_space: spaces.Box, pool: int):
-        """Construct the extractor for images (channels, height, width), with squares of side `pool` [pixels]."""
-        channels, height, width = observation_space.shape
-        super().__init__(observation_space, channels * (height // pool) * (width // pool))
-        self.pool = pool
+    def __init__(self, observation_space: spaces.Box, shape: tuple[int, int, int], encoder: str, random_shift: int):
+        """Construct the extractor.
+
+        Args:
+            observation_space: Space of packed observations.
+            shape: Height, width and channels of the image.
+            encoder: "average_pooling" or "convolutional".
+            random_shift: Largest shift in training mode [pixels].
+
+        Raises:
+            InputError: If the image is too small.
+        """
+        height, width, channels = shape
+        side_of_squares = IMAGE_POOL if encoder == "average_pooling" else 1
+        sides = [side // side_of_squares for side in (height, width)]
+        if encoder == "convolutional":
+            for _ in CHANNELS:
+                sides = [(side - 1) // 2 for side in sides]
+        if min(sides) < 1:
+            raise InputError(f"an image of {height} x {width} pixels is too small for {encoder.replace('_', ' ')}")
+        self._num_pixels = height * width * channels
+        num_state = (observation_space.shape[0] - self._num_pixels) // 4
+        maps = channels if encoder == "average_pooling" else CHANNELS[-1]
+        super().__init__(observation_space, maps * math.prod(sides) + num_state)
+        self._num_state = num_state
+        self.pool, self._shape, self._random_shift = side_of_squares, (channels, height, width), random_shift
+        inputs = [channels, *CHANNELS[:-1]]
+        pairs = zip(inputs, CHANNELS, strict=True) if encoder == "convolutional" else ()
+        self.convolutions = torch.nn.ModuleList(torch.nn.Conv2d(into, out, 3, stride=2) for into, out in pairs)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Map images (batch, channels, height, width) in [0, 1] to features (batch, features)."""
-        return torch.nn.functional.avg_pool2d(observations, self.pool).flatten(1)
+        """Map packed observations (batch, n), as numbers of any type, to features (batch, features)."""
+        image = observations[:, : self._num_pixels].float().unflatten(1, self._shape) / 255
+        state = observations[:, self._num_pixels :].to(torch.uint8).flatten().view(torch.float32)
+        if not self.convolutions:
+            features = torch.nn.functional.avg_pool2d(image, self.pool)
+        else:
+            features = self._shift(image) if self.training and self._random_shift else image
+            for convolution in self.convolutions:
+                features = torch.relu(convolution(features))
+        return torch.cat([features.flatten(1), state.view(len(image), self._num_state)], dim=1)
+
+    def _shift(self, images: torch.Tensor) -> torch.Tensor:
+        """Shift each image by whole pixels; the border repeats the outermost pixels."""
+        number, _, height, width = images.shape
+        shifts = torch.randint(-self._random_shift, self._random_shift + 1, (2, number, 1)).to(images.device)
+        rows = (torch.arange(height, device=images.device) + shifts[0]).clamp(0, height - 1)
+        columns = (torch.arange(width, device=images.device) + shifts[1]).clamp(0, width - 1)
+        chosen = torch.arange(number, device=images.device)[:, None, None]
+        return images.permute(0, 2, 3, 1)[chosen, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
+
+
+class DetachedFeatures(BaseFeaturesExtractor):
+    """Features of another extractor, without gradients: the actor uses the critic's encoder but does not train it."""
+
+    def __init__(self, observation_space: spaces.Box, features: ImageFeatures):
+        """Construct the extractor on `features`."""
+        super().__init__(observation_space, features.features_dim)
+        self.features: Any = features
+
+    @property
+    def pool(self) -> int:
+        """Side of the averaged squares of the shared extractor [pixels]."""
+        return int(self.features.pool)
+
+    @property
+    def convolutions(self) -> Any:
+        """Convolutions of the shared extractor."""
+        return self.features.convolutions
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Map observations to features."""
+        with torch.no_grad():
+            return self.features(observations)
+
+
+def share_encoder(model: Any) -> None:
+    """Make the actor of an actor-critic algorithm use the critic's encoder, which only the critic's loss trains.
+
+    This is the architecture of DrQ (Yarats et al., 2021). Target critics shift images at random as well.
+
+    Raises:
+        InputError: If the algorithm has a target actor, whose encoder would not be updated.
+    """
+    actor, critic = model.actor, model.critic
+    if getattr(model, "actor_target", None) is not None:
+        raise InputError(f"{type(model).__name__} has a target actor and no shared encoder: choose tqc, sac or crossq")
+    actor.features_extractor = DetachedFeatures(model.observation_space, critic.features_extractor)
+    trained = [value for name, value in actor.named_parameters() if not name.startswith("features_extractor.")]
+    policy = model.policy
+    actor.optimizer = policy.optimizer_class(trained, lr=model.lr_schedule(1), **policy.optimizer_kwargs)
+    if getattr(model, "critic_target", None) is not None:
+        model.critic_target.features_extractor.train()
 
 
 class NormalizedReLU(torch.nn.Module):
@@ -148,17 +271,30 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
         InputError: If the actor has other layers.
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
-    pool = getattr(actor.features_extractor, "pool", 1)
-    return export_layers(layers, actor.action_space, {"pool": pool, "squash": "tanh", **description})
+    features = actor.features_extractor
+    encoder = [_arrays(one) for one in getattr(features, "convolutions", ())]
+    pool = {"pool": getattr(features, "pool", 1)}
+    return export_layers(layers, actor.action_space, {**pool, "squash": "tanh", **description}, encoder)
 
 
-def export_layers(layers: Sequence[torch.nn.Module], space: Any, description: Mapping[str, Any]) -> Policy:
+def _arrays(layer: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies of weight and bias of a layer."""
+    return layer.weight.detach().cpu().numpy().copy(), layer.bias.detach().cpu().numpy().copy()
+
+
+def export_layers(
+    layers: Sequence[torch.nn.Module],
+    space: Any,
+    description: Mapping[str, Any],
+    encoder: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> Policy:
     """Return the policy of a network's layers; batch renormalization is merged into the next linear layer.
 
     Args:
         layers: Linear layers with one kind of activation between them.
         space: Action space.
         description: Entries of the policy's description.
+        encoder: Weight and bias of each convolution.
 
     Raises:
         InputError: If there are other layers.
@@ -166,7 +302,8 @@ def export_layers(layers: Sequence[torch.nn.Module], space: Any, description: Ma
     linear: list[tuple[torch.Tensor, torch.Tensor]] = []
     activations: list[str | None] = []
     scale, shift = torch.ones(1), torch.zeros(1)
-    for layer in layers:
+    for layer in copy.deepcopy([*layers]):
+        layer.cpu()
         if isinstance(layer, torch.nn.Linear):
             linear.append((layer.weight * scale, layer.bias + layer.weight @ shift.expand(layer.in_features)))
             scale, shift = torch.ones(1), torch.zeros(1)
@@ -191,6 +328,7 @@ def export_layers(layers: Sequence[torch.nn.Module], space: Any, description: Ma
             "activation": activations[0],
             **description,
         },
+        encoder,
     )
 
 

@@ -11,7 +11,7 @@ import copy
 import inspect
 import json
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -21,10 +21,10 @@ from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.preprocessing import is_image_space
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import CheckpointSelection
@@ -32,12 +32,15 @@ from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Co
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error
 from guiderail.tools.learning.networks import (
-    IMAGE_POOL,
-    AveragePooledImage,
+    ImageFeatures,
     NormalizedReLU,
     add_dropout,
     export_policy,
+    image_shape,
     observe_privileged,
+    pack_observation,
+    packed_space,
+    share_encoder,
     with_privileged,
 )
 from guiderail.tools.learning.sb3_state import (
@@ -85,9 +88,23 @@ class OffPolicyLearner(Learner):
         networks: dict[str, Any] = {"net_arch": list(config.net_arch), "optimizer_kwargs": {"fused": True}}
         if config.layer_norm:
             networks["activation_fn"] = NormalizedReLU
-        if is_image_space(env.observation_space):
-            networks["features_extractor_class"] = AveragePooledImage
-            networks["features_extractor_kwargs"] = {"pool": IMAGE_POOL}
+        if config.device == "cuda" and not torch.cuda.is_available():
+            raise InputError("this machine has no CUDA device that PyTorch can use: leave --set device=cuda out")
+        self._image_shape = image_shape(env.observation_space)
+        is_encoded = self._image_shape is not None and config.image_encoder == "convolutional"
+        if self._image_shape is not None:
+            if config.privileged_critic:
+                raise InputError("a privileged critic takes no images: leave the setting privileged_critic out")
+            packed = gymnasium.Env()
+            packed.observation_space = packed_space(cast(spaces.Box, env.observation_space))
+            packed.action_space = env.action_space
+            env = packed
+            networks["features_extractor_class"] = ImageFeatures
+            networks["features_extractor_kwargs"] = {
+                "shape": self._image_shape,
+                "encoder": config.image_encoder,
+                "random_shift": config.random_shift,
+            }
         self.config = config
         self.transitions = 0
         arguments = {
@@ -99,10 +116,11 @@ class OffPolicyLearner(Learner):
             "ent_coef": config.ent_coef if config.ent_coef.startswith("auto") else float(config.ent_coef),
             "policy_kwargs": networks,
             "seed": seed,
-            "device": "cpu",
+            "device": config.device,
             **self.algorithm_arguments(config),
         }
-        is_fast = config.training_step == "fast" and self.fast_algorithm is not None and not config.dropout
+        is_fast = config.training_step == "fast" and not config.dropout and not is_encoded and config.device == "cpu"
+        is_fast = is_fast and self.fast_algorithm is not None
         algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
         accepted = inspect.signature(algorithm).parameters  # not every algorithm has an entropy coefficient
         policy: Any = "MlpPolicy"
@@ -115,13 +133,15 @@ class OffPolicyLearner(Learner):
             self._copies * self.model.buffer_size,
             self.model.observation_space,
             self.model.action_space,
-            device="cpu",
+            device=config.device,
             n_envs=self._copies,
             n_steps=config.n_steps,
             gamma=self.model.gamma,
         )
         if config.demonstration_fraction:
             self.model.replay_buffer.fraction = config.demonstration_fraction
+        if is_encoded:
+            share_encoder(self.model)
         if config.dropout:
             add_dropout(self.model.critic, config.dropout)
         self.model.policy.set_training_mode(False)
@@ -205,11 +225,14 @@ class OffPolicyLearner(Learner):
             return self._uniform()
         if self._num_privileged:  # the actor ignores these entries
             observation = np.concatenate([observation, np.zeros(self._num_privileged, observation.dtype)])
+        if self._image_shape is not None:
+            observation = pack_observation(observation, self._image_shape)
         if not self.is_greedy:
             extended = self._temporally_extended()
             return self.explore(observation) if extended is None else extended
         with torch.no_grad():
-            return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
+            tensor = self.model.policy.obs_to_tensor(observation)[0]
+            return self.actor()._predict(tensor, deterministic=True)[0].cpu().numpy()
 
     def _follows_base_motion(self) -> bool:
         """Return True if this action is zero, so that the base motion has no residual (Policy Decorator).
@@ -253,8 +276,8 @@ class OffPolicyLearner(Learner):
         infos = [{"TimeLimit.truncated": transition.truncated and not transition.terminated}]
         observation, following = transition.observation, transition.next_observation
         action = self.model.policy.scale_action(np.asarray(transition.action)[None])[0]
-        if np.ndim(observation) == 3:  # an image; Stable-Baselines3 expects channels first
-            observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)
+        if self._image_shape is not None:
+            observation, following = (pack_observation(one, self._image_shape) for one in (observation, following))
         observations, actions, next_observations = [observation], [action], [following]
         if self.symmetry is not None:
             observations.extend(self.symmetry.observations @ observation)
@@ -332,11 +355,11 @@ class OffPolicyLearner(Learner):
         """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
         arrays = module_arrays(self._modules(), self._optimizers())
         if self._log_ent_coef() is not None:
-            arrays["log_ent_coef"] = self._log_ent_coef().detach().numpy()
+            arrays["log_ent_coef"] = self._log_ent_coef().detach().cpu().numpy()
         selection: dict[str, Any] = {}
         if self.selection is not None:
             actors, selection = self.selection.state()
-            arrays |= {f"selection/{key}": value.numpy() for key, value in actors.items()}
+            arrays |= {f"selection/{key}": value.cpu().numpy() for key, value in actors.items()}
         buffer = self.model.replay_buffer
         arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in _BUFFER_ARRAYS}
         generators, states = random_state()

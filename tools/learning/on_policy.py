@@ -19,7 +19,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
-from guiderail.tools.learning.learner import Learner, divergence_error, refuse_images
+from guiderail.tools.learning.learner import Learner, divergence_error
 from guiderail.tools.learning.networks import export_layers
 from guiderail.tools.learning.sb3_state import module_arrays, random_state, restore_modules, restore_random
 
@@ -50,12 +50,7 @@ class OnPolicyLearner(Learner):
         max_transitions: int,
         symmetry: Symmetry | None = None,
     ):
-        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used.
-
-        Raises:
-            InputError: If observations are images.
-        """
-        refuse_images(env, config.algorithm)
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.config = config
         algorithm: Any = self.algorithm
         self.model = algorithm(

@@ -49,10 +49,10 @@ def module_arrays(
     """Return the parameters and buffers of modules and the moments of optimizers as arrays by name."""
     arrays: dict[str, np.ndarray] = {}
     for name, module in modules.items():
-        arrays |= {f"{name}/{key}": value.numpy() for key, value in module.state_dict().items()}
+        arrays |= {f"{name}/{key}": value.cpu().numpy() for key, value in module.state_dict().items()}
     for name, optimizer in optimizers.items():
         for index, moments in optimizer.state_dict()["state"].items():
-            arrays |= {f"optimizer/{name}/{index}/{key}": value.numpy() for key, value in moments.items()}
+            arrays |= {f"optimizer/{name}/{index}/{key}": value.cpu().numpy() for key, value in moments.items()}
     return arrays
 
 
@@ -80,12 +80,16 @@ def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the states of the global random generators, which Stable-Baselines3 samples from."""
     kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     arrays = {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
+    if torch.cuda.is_initialized():  # so that a resumed run samples as an uninterrupted one
+        arrays["random/cuda"] = torch.cuda.get_rng_state().numpy()
     return arrays, {"numpy": [kind, *rest], "python": random.getstate()}
 
 
 def restore_random(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
     """Set the global random generators to what `random_state` returned."""
     torch.set_rng_state(torch.from_numpy(np.array(arrays["random/torch"])))
+    if "random/cuda" in arrays:
+        torch.cuda.set_rng_state(torch.from_numpy(np.array(arrays["random/cuda"])))
     kind, *rest = values["numpy"]
     np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002
     version, state, gauss = values["python"]

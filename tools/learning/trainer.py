@@ -15,7 +15,14 @@ from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.learner import LEARNERS, Learner, LearningLog, divergence_error, learner_arguments
+from guiderail.tools.learning.learner import (
+    LEARNERS,
+    Learner,
+    LearningLog,
+    described_observation,
+    divergence_error,
+    learner_arguments,
+)
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
 
@@ -218,7 +225,7 @@ def _train(
         if is_last:
             break
     learner.finish()
-    policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
+    policy = learner.policy({"task": config.task, **described_observation(env)})
     policy.save(folder.path, write=write_atomically)
     return rows
 

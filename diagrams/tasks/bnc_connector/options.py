@@ -31,7 +31,7 @@ GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool
 LARGEST_GRASP_ANGLE = 2.0  # [degrees] largest accepted `grasp_angle`; a larger tilt would be a faulty grasp
 
 
-OBSERVATIONS = ("state", "center_of_pressure")
+OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
 REWARDS = ("sparse", "shaped", "aligned")
 
 

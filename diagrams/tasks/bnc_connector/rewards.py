@@ -29,7 +29,7 @@ def observation_terms(
 ) -> tuple[ObservationTerm, ...]:
     """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
 
-    `duration` is the duration of an episode [s].
+    An image replaces the center of pressure. `duration` is the duration of an episode [s].
     """
     half = 0.5 * duration
     state = (
@@ -37,7 +37,7 @@ def observation_terms(
         ObservationTerm("pose", center, scale),
         ObservationTerm("wrench", 0.0, wrench_scale),
     )
-    if observation == "state":
+    if observation != "center_of_pressure":
         return state
     return (
         *state,

@@ -47,6 +47,7 @@ COMPONENTS = 16
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
+CAMERA_LENGTH = 12 * MM  # length for the distance of the wrist camera [m]
 LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
 
 
@@ -167,11 +168,20 @@ class BncConnector(DemonstratedInsertion):
         y0[[2, 5]] = size.locked_height, -size.detent_angle
         return D, y0
 
-    def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
+    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
+        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
+
+        The observation "image" is the wrist camera's image alone; "image_and_state" adds it to time, pose and wrench.
+        """
+        if self.config.observation == "image":
+            return self.wrist_camera(CAMERA_LENGTH)
         return *observation_terms(
             self.config.observation, self.num_steps * self.control_period
         ), *self.force_limit_terms()
+
+    def observation_camera(self) -> Camera | None:
+        """Return the wrist camera of the observation "image_and_state"."""
+        return self.wrist_camera(CAMERA_LENGTH) if self.config.observation == "image_and_state" else None
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
@@ -184,14 +194,18 @@ class BncConnector(DemonstratedInsertion):
             self.force_limit(),
         ]
 
-    def symmetry(self) -> Symmetry:
-        """Return half a turn about the jack's axis."""
+    def symmetry(self) -> Symmetry | None:
+        """Return half a turn about the jack's axis; None if the observation has an image, which is not transformed."""
+        if self.has_image:
+            return None
         privileged = (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH)
         signs = Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()], privileged)
         return signs.padded(len(self.force_limit_terms()))
 
-    def near_symmetry(self) -> Symmetry:
+    def near_symmetry(self) -> Symmetry | None:
         """Return the half turn, and the quarter turns and reflections that hold while the plug stands on the rim."""
+        if self.has_image:
+            return None
         sides = sides_of_the_rim(self.config.observation, self.action_dims())
         return self.symmetry() if sides is None else Symmetry(*sides).padded(len(self.force_limit_terms()))
 

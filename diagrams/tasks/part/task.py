@@ -190,8 +190,13 @@ class PartInsertion(DemonstratedInsertion):
         changes = cls.file.bounds.phases is not None
         return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
 
-    def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
+    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
+        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
+
+        The observation "image" is the wrist camera's image alone; "image_and_state" adds it to time, pose and wrench.
+        """
+        if self.config.observation == "image":
+            return self.wrist_camera(self.file.motion.travel)
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
@@ -199,6 +204,10 @@ class PartInsertion(DemonstratedInsertion):
             self.config.observation, self.num_steps * self.control_period, center, scale, WRENCH_SCALE
         )
         return *terms, *self.force_limit_terms()
+
+    def observation_camera(self) -> Camera | None:
+        """Return the wrist camera of the observation "image_and_state"."""
+        return self.wrist_camera(self.file.motion.travel) if self.config.observation == "image_and_state" else None
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return the terms of `config.reward`."""
@@ -222,7 +231,7 @@ class PartInsertion(DemonstratedInsertion):
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
         every = sides_of_the_rim(self.config.observation, self.action_dims())
         chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
-        if every is None or not chosen:
+        if every is None or not chosen or self.has_image:
             return None
         return Symmetry(*(matrices[chosen] for matrices in every)).padded(len(self.force_limit_terms()))
 

@@ -286,7 +286,7 @@ class TestUncertainty:
     [
         {"guidance": "sct"},
         {"reward": "dense"},
-        {"observation": "image"},
+        {"observation": "depth"},
         {"fixture_offset": "known"},
         {"station": "hardware"},
         {"action_dims": (0, 6)},
@@ -312,3 +312,20 @@ def test_the_near_symmetry_contains_the_exact_one(kmp):
     exact, near = kmp.task.symmetry, kmp.task.near_symmetry
     sides = [k for k in range(7) if np.array_equal(near.actions[k], exact.actions[0])]
     assert any(np.array_equal(near.observations[k], exact.observations[0]) for k in sides)
+
+
+@pytest.mark.parametrize("station", ["gantry", "arm"])
+def test_wrist_camera_shows_the_jacks_offset_when_the_pose_does_not(station):
+    images = {}
+    for name in ("image", "image_and_state"):
+        env = make_env("BncConnector", guidance="kgrl", station=station, observation=name)
+        for offset in ((0.0, 0.0), (0.0015, 0.0), (0.0, 0.0015)):
+            images[name, offset] = env.reset(seed=0, options={"offset": offset})[0]
+            assert env.observation_space.contains(images[name, offset])
+        assert env.task.symmetry is env.task.near_symmetry is None
+    seen, both = images["image", (0.0, 0.0)], images["image_and_state", (0.0, 0.0)]
+    np.testing.assert_allclose(both[:-13], np.moveaxis(seen, -1, 0).ravel() / 255, atol=1e-6)
+    for offset in ((0.0015, 0.0), (0.0, 0.0015)):
+        changed = np.abs(images["image", offset].astype(int) - seen).max(-1) > 30
+        assert changed.sum() > 20
+        np.testing.assert_allclose(images["image_and_state", offset][-13:-6], both[-13:-6], atol=1e-6)

@@ -1,6 +1,7 @@
 """Learners of further algorithms of Stable-Baselines3, demonstrations in every batch, and dropout."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -11,7 +12,7 @@ from gymnasium import spaces
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import config_values, make_config, resolve_preset
-from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.networks import DroppedNormalizedReLU
 
 OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
@@ -224,13 +225,12 @@ def test_behavior_cloning_refuses_zero_demonstrations():
         make_config("bc", {"demonstration_episodes": 0})
 
 
-@pytest.mark.parametrize("algorithm", ["bc", "ppo", "trpo"])
-def test_images_are_refused_without_networks_for_them(algorithm, monkeypatch):
-    config = make_config(algorithm, {"demonstration_episodes": 1} if algorithm == "bc" else {})
-    make(config)
-    monkeypatch.setattr(SpacesOnlyEnv, "observation_space", spaces.Box(0, 255, (8, 8, 3), np.uint8))
+@pytest.mark.parametrize("algorithm", ["bc", "ppo", "trpo", "chunk"])
+def test_images_are_refused_without_networks_for_them(algorithm):
+    learner = make_config(algorithm, {"demonstration_episodes": 1} if algorithm in ("bc", "chunk") else {})
+    task = SimpleNamespace(observation_space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
     with pytest.raises(InputError, match=f"{algorithm} takes no images"):
-        make(config)
+        learner_arguments(SimpleNamespace(learner=learner), task)
 
 
 def test_actions_become_certain_over_the_base_motion_steps():

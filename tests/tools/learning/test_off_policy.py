@@ -356,7 +356,7 @@ def test_episode_with_interventions_is_not_selected(config):
 
 def test_symmetry_is_off_when_demonstrations_are_corrected():
     task = SimpleNamespace(symmetry="both", near_symmetry="all", num_steps=10)
-    learner = SimpleNamespace(symmetry="near")
+    learner = SimpleNamespace(symmetry="near", takes_images=True)
     for pushed, environment, sides in ((False, {}, "all"), (True, {}, None), (False, {"via_points": (1.0, 2.0)}, None)):
         config = SimpleNamespace(
             episodes=1, action_repeat=1, seed=0, learner=learner, human_in_the_loop=pushed, environment=environment

@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, _digest
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.networks import export_policy
+from guiderail.tools.learning.networks import export_policy, pack_observation
 
 
 class SpacesOnlyEnv(gymnasium.Env):
@@ -47,13 +47,14 @@ def test_policy_acts_as_stable_baselines3_predicts(learner, tmp_path):
     policy.save(tmp_path)
     loaded = Policy.load(tmp_path)
     for observation in observations:
-        expected, _ = learner.model.predict(observation, deterministic=True)
+        seen = pack_observation(observation, IMAGE.shape) if observation.ndim == 3 else observation
+        expected, _ = learner.model.predict(seen, deterministic=True)
         np.testing.assert_allclose(loaded(observation), expected, atol=2e-5 * (space.high - space.low).max())
 
 
 def learner_observation(learner, seed):
     random = np.random.default_rng(seed)
-    if len(learner.model.observation_space.shape) == 3:
+    if learner.model.observation_space.dtype == np.uint8:
         return random.integers(0, 256, IMAGE.shape, dtype=np.uint8)
     return random.normal(scale=3, size=STATE.shape).astype(np.float32)
 

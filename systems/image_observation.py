@@ -1,0 +1,63 @@
+"""Observation vector of a camera image and further entries."""
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.sensors import ImageRgba8U
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems.support.declarations import input_getter, output_getter
+
+
+class ImageObservation(LeafSystem):
+    """Concatenation of an image and a vector.
+
+        observation = [image / 255, state]
+
+    The image is stored channel by channel (red, green, blue), each row by row.
+
+    .. pydrake_system::
+
+        name: ImageObservation
+        input_ports:
+        - image
+        - state
+        output_ports:
+        - observation
+
+    ``image`` is an abstract `ImageRgba8U` whose alpha channel is ignored. ``state`` is (n,). ``observation`` is
+    (3 · height · width + n,).
+
+    Args:
+        width: Width of the image, at least 1 [pixels].
+        height: Height of the image, at least 1 [pixels].
+        state_size: Size n of the state, at least 1.
+
+    Raises:
+        InputError: If a size is below 1.
+    """
+
+    def __init__(self, width: int, height: int, state_size: int):
+        super().__init__()
+        if min(width, height, state_size) < 1:
+            raise InputError(
+                f"an image observation needs at least one pixel and one number, not {width} x {height} pixels and "
+                f"{state_size} numbers"
+            )
+        self._image_port = self.DeclareAbstractInputPort("image", Value(ImageRgba8U(width, height)))
+        self._state_port = self.DeclareVectorInputPort("state", state_size)
+        self._observation_port = self.DeclareVectorOutputPort(
+            "observation",
+            3 * height * width + state_size,
+            self._calc_observation,
+            prerequisites_of_calc={self._image_port.ticket(), self._state_port.ticket()},
+        )
+
+    get_image_input_port = input_getter("image", "color image, an abstract `ImageRgba8U`")
+    get_state_input_port = input_getter("state", "further entries of the observation, (n,)")
+    get_observation_output_port = output_getter("observation", "image in [0, 1] and state, (3 · height · width + n,)")
+
+    def _calc_observation(self, context: Context, output: BasicVector) -> None:
+        image = self._image_port.Eval(context).data[:, :, :3]
+        pixels = np.moveaxis(image, -1, 0).ravel() / 255.0
+        output.SetFromVector(np.concatenate([pixels, self._state_port.Eval(context)]))
