@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import guiderail.tools.learning.learner as learner_module
+from guiderail.models.common import errors
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.learner import LearningLog, check_log_formats
 from guiderail.tools.learning.run_folder import RunFolder
@@ -55,7 +55,7 @@ def test_resumed_run_keeps_the_log_of_its_first_part(bead_config, tmp_path):
 def test_log_format_is_refused_when_unknown_or_not_installed(monkeypatch, bead_config, tmp_path):
     with pytest.raises(InputError, match="did you mean tensorboard"):
         run_training(RunFolder(tmp_path), bead_config, log=["tensorbord"])
-    monkeypatch.setattr(learner_module, "find_spec", lambda name: None)
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"guiderail\[tensorboard\]"):
         run_training(RunFolder(tmp_path), bead_config, log=["tensorboard"])
     assert list(tmp_path.iterdir()) == []
