@@ -23,7 +23,7 @@ class Vector(Env):
 
 
 class Image(Vector):
-    observation_space = spaces.Box(0, 255, (3, 10, 15), np.uint8)
+    observation_space = spaces.Box(0, 255, (10, 15, 3), np.uint8)
 
 
 class PlainSac(OffPolicyLearner):
