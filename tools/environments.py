@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +22,6 @@ from guiderail.diagrams.tasks.registry import (
 )
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.common.yaml import parse_yaml
 
 
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
@@ -171,6 +171,12 @@ def _is_like(value: Any, default: Any) -> bool:
 
 def as_value(text: str) -> Any:
     """Return a value typed on the command line, parsed as YAML; text that is not YAML is returned unchanged."""
+    if re.fullmatch(r"-?(0|[1-9][0-9]{0,14})", text):  # plain values do not need the reader, which is slow to import
+        return int(text)
+    if text not in ("null", "true", "false") and re.fullmatch(r"-?[0-9]{1,9}\.[0-9]{1,15}|[a-z_]+", text):
+        return _numbers(text)
+    from guiderail.models.common.yaml import parse_yaml
+
     try:
         return _numbers(parse_yaml(text))
     except InputError:

@@ -179,14 +179,13 @@ def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, An
         if isinstance(node, ast.ImportFrom) and node.module and not node.level
         for alias in node.names
     }
-    bodies = {
-        id(call): node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for call in node.decorator_list
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and getattr(node.func, "id", None) == decorator and node.args:
+    for statement in tree.body:
+        for node in (each for one in getattr(statement, "decorator_list", [statement]) for each in ast.walk(one)):
+            if not (isinstance(node, ast.Call) and getattr(node.func, "id", None) == decorator and node.args):
+                continue
             name = node.args[0]
             if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                shown = dict(_assignments(bodies.get(id(node), ())))
+                shown = dict(_assignments(statement.body)) if isinstance(statement, ast.ClassDef) else {}
                 shown |= {str(argument.arg): argument.value for argument in node.keywords}
                 values: dict[str, Any] = {}
                 for attribute, value in shown.items():

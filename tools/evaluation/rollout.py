@@ -6,14 +6,15 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from guiderail.models.common.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
 
@@ -213,6 +214,9 @@ class EpisodeProgress:
             window: Number of last episodes over which success and return are averaged; None for all episodes.
             console: Console; standard error by default, so that results can be piped.
         """
+        from rich.console import Console  # slow to import
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
         self._console = console or Console(stderr=True)
         self._episodes, self._name = episodes, name
         self._done, self._count, self._window = 0, 0, window

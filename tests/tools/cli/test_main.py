@@ -254,6 +254,14 @@ for words in ("--version", "--help", "study --help", "evaluate --help", "list ta
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.parametrize(
+    "text", ["0", "-7", "007", "1.50", "-0.0", "word", "nan", "inf", "true", "null", "no", "a-b", "1e-3"]
+)
+def test_as_value_reads_plain_text_as_yaml_does(text):
+    (expected,) = as_value(f"[{text}]")
+    assert repr(as_value(text)) == repr(expected)
+
+
 def test_train_refuses_mistakes_before_slow_imports(tmp_path):
     (tmp_path / "notes.txt").write_text("")  # the working directory holds files, so it is refused as a run's folder
     code = """
