@@ -121,7 +121,8 @@ def choose_setting(
     """Return a setting with its score, and whether it has the required success rates.
 
     Starting at `first`, settings are tried in the direction of the required success rates until one has them, the
-    direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned.
+    direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned, and
+    the easiest of several.
 
     Args:
         score: Returns the score of a setting.
@@ -135,7 +136,7 @@ def choose_setting(
         if result.is_too_easy == result.is_too_hard:
             break
         number += 1 if result.is_too_easy else -1
-    best = max(tried, key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin))
+    best = max(sorted(tried), key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin))
     return settings[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
 
 
