@@ -136,7 +136,9 @@ def choose_setting(
         if result.is_too_easy == result.is_too_hard:
             break
         number += 1 if result.is_too_easy else -1
-    best = max(sorted(tried), key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin))
+    best = max(
+        sorted(tried), key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin)
+    )
     return settings[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
 
 
