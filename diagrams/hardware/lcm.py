@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import secrets
 import struct
 import time as wall_time
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from ipaddress import IPv4Address
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
@@ -136,17 +138,24 @@ class LcmDriver(Driver):
         self._sequence = StatusSequence(self.period)
         self._num_contested = 0  # foreign commands after the first command of this program
         self._heartbeats: dict[int, Heartbeat] = {}  # newest heartbeat by sender, latest sender last
+        self._numbers: dict[int, int] = {}  # number of the channel of that heartbeat by sender
+        self._number = 0  # number of the channel of this program's heartbeat
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
         self._listeners: list[CommandCallback] = []
         if handlers_are_safe():
             self.lcm.Subscribe(self.command_channel, self._on_command)
-            self.lcm.Subscribe(self.heartbeat_channel(), self._on_heartbeat)
+            for number in range(MAX_SENDERS):
+                self.lcm.Subscribe(self.heartbeat_channel(number), partial(self._on_heartbeat, number))
             self.lcm.Subscribe(self.status_channel, self._on_status)
 
     @classmethod
-    def heartbeat_channel(cls) -> str:
-        """Return the channel of the safety monitor's heartbeat."""
-        return cls.command_channel + "_MONITOR"
+    def heartbeat_channel(cls, number: int = 0) -> str:
+        """Return a channel of a safety monitor's heartbeats; `number` is less than `MAX_SENDERS`.
+
+        On UDP, `DrakeLcm` keeps one unread message of a channel and drops later ones. Each monitor has a channel of its
+        own, so that the heartbeats of one do not displace those of another.
+        """
+        return cls.command_channel + ("_MONITOR" if number == 0 else f"_MONITOR_{number}")
 
     @classmethod
     def encode(cls, torque: np.ndarray, time: float) -> bytes:
@@ -204,9 +213,13 @@ class LcmDriver(Driver):
         return tuple(self._heartbeats.values())
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Send a heartbeat of the safety monitor."""
+        """Send a heartbeat of the safety monitor, on a channel on which no other monitor has been received."""
+        taken = {number for sender, number in self._numbers.items() if sender != heartbeat.sender}
+        if self._number in taken:
+            # Two monitors that see each other choose at random, because the same choice would collide again.
+            self._number = secrets.choice(sorted(set(range(MAX_SENDERS)) - taken) or [self._number])
         message = HEARTBEAT_FORMAT.pack(heartbeat.sequence, heartbeat.is_stopping, heartbeat.sender)
-        self.lcm.Publish(self.heartbeat_channel(), message)
+        self.lcm.Publish(self.heartbeat_channel(self._number), message)
 
     def __str__(self) -> str:
         """Return the URL of the bus and the channel of the statuses."""
@@ -231,13 +244,15 @@ class LcmDriver(Driver):
             for on_command in self._listeners:
                 on_command(*command)
 
-    def _on_heartbeat(self, message: bytes) -> None:
+    def _on_heartbeat(self, number: int, message: bytes) -> None:
         if len(message) == HEARTBEAT_FORMAT.size:
             heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
             self._heartbeats.pop(heartbeat.sender, None)
             self._heartbeats[heartbeat.sender] = heartbeat
+            self._numbers[heartbeat.sender] = number
             while len(self._heartbeats) > MAX_SENDERS:
-                self._heartbeats.pop(next(iter(self._heartbeats)))
+                oldest = next(iter(self._heartbeats))
+                del self._heartbeats[oldest], self._numbers[oldest]
 
 
 @register_driver("iiwa14")

@@ -31,7 +31,7 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant, ArmModel, add_ar
 from guiderail.diagrams.stations.station import add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.parsing import follow_directives
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, MAX_SENDERS
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector
 
@@ -191,7 +191,8 @@ def serve_in_lockstep(
     lcm.Subscribe(IiwaDriver.status_channel + ACKNOWLEDGED, acknowledgements.add)
     lcm.Subscribe(IiwaDriver.command_channel, commands.append)
     # A heartbeat is sent before its status, so that the other process has both when the status arrives.
-    outgoing = dict.fromkeys((IiwaDriver.heartbeat_channel(), IiwaDriver.status_channel), b"")
+    heartbeat_channels = map(IiwaDriver.heartbeat_channel, range(MAX_SENDERS))
+    outgoing = dict.fromkeys((*heartbeat_channels, IiwaDriver.status_channel), b"")
     for channel in outgoing:
         robot_lcm.Subscribe(channel, partial(outgoing.__setitem__, channel))
     period, steps, repeats = IiwaDriver.period, 0, max(1, round(command_timeout / REPEAT_INTERVAL))

@@ -82,3 +82,34 @@ def test_command_is_decoded_with_its_time():
     np.testing.assert_array_equal(torque, OWN)
     assert time == 2.5
     assert IiwaDriver.decode_command(b"nonsense") is None
+
+
+class UdpBus:
+    """Bus that keeps one unread message of a channel for each program, as `DrakeLcm` does on UDP."""
+
+    def __init__(self, programs):
+        self.programs, self.handlers, self.unread = programs, {}, {}
+        programs.append(self)
+
+    def Subscribe(self, channel, handler):
+        self.handlers[channel] = handler
+
+    def Publish(self, channel, message):
+        for program in self.programs:
+            program.unread.setdefault(channel, message)
+
+    def HandleSubscriptions(self, timeout):
+        unread, self.unread = self.unread, {}
+        for channel, message in unread.items():
+            self.handlers[channel](message)
+
+
+def test_heartbeats_of_two_monitors_do_not_displace_each_other():
+    programs = []
+    *monitors, station = [IiwaDriver(UdpBus(programs)) for _ in range(3)]
+    for sequence in range(1, 60):
+        for sender, monitor in enumerate(monitors):
+            monitor.write_heartbeat(Heartbeat(sequence, False, sender))
+        for program in programs:
+            program.HandleSubscriptions(0)
+    assert {heartbeat.sender: heartbeat.sequence for heartbeat in station.read_heartbeats()} == {0: 59, 1: 59}

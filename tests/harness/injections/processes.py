@@ -26,6 +26,7 @@ from guiderail.diagrams.hardware.driver import safety_limits
 from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.control.joint_status import MAX_SENDERS
 
 STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] of the robot's clock
 # Time by the robot's clock after which a robot that is gone is sent no command: detection, damping, zero torque [s].
@@ -50,7 +51,8 @@ class Listener:
         self.wrong: list[str] = []
         self.lcm.Subscribe(IiwaDriver.status_channel, self._status)
         self.lcm.Subscribe(IiwaDriver.command_channel, self._command)
-        self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self._heartbeat)
+        for number in range(MAX_SENDERS):
+            self.lcm.Subscribe(IiwaDriver.heartbeat_channel(number), self._heartbeat)
 
     def _status(self, message: bytes) -> None:
         status = lcmt_iiwa_status.decode(message)
