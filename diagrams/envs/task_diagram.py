@@ -13,7 +13,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, OutputPort
 
 from guiderail.diagrams.envs.scene import View
-from guiderail.models.common.arrays import round_period as round_period
 
 PORTS = (
     "observation",

@@ -137,8 +137,8 @@ class LcmDriver(Driver):
         self._status: JointStatus | None = None  # newest status
         self._sequence = StatusSequence(self.period)
         self._num_contested = 0  # foreign commands after the first command of this program
-        self._heartbeats: dict[int, Heartbeat] = {}  # newest heartbeat by sender, latest sender last
-        self._numbers: dict[int, int] = {}  # number of the channel of that heartbeat by sender
+        # Newest heartbeat and the number of its channel by sender, latest sender last.
+        self._heartbeats: dict[int, tuple[Heartbeat, int]] = {}
         self._number = 0  # number of the channel of this program's heartbeat
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
         self._listeners: list[CommandCallback] = []
@@ -210,11 +210,11 @@ class LcmDriver(Driver):
 
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
         """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`."""
-        return tuple(self._heartbeats.values())
+        return tuple(heartbeat for heartbeat, _ in self._heartbeats.values())
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat of the safety monitor, on a channel on which no other monitor has been received."""
-        taken = {number for sender, number in self._numbers.items() if sender != heartbeat.sender}
+        taken = {number for other, number in self._heartbeats.values() if other.sender != heartbeat.sender}
         if self._number in taken:
             # Two monitors that see each other choose at random, because the same choice would collide again.
             self._number = secrets.choice(sorted(set(range(MAX_SENDERS)) - taken) or [self._number])
@@ -236,7 +236,7 @@ class LcmDriver(Driver):
         if message in self._written:
             return
         # A safety monitor sends its heartbeat before its commands, which are not foreign.
-        if not any(heartbeat.is_stopping for heartbeat in self._heartbeats.values()):
+        if not any(heartbeat.is_stopping for heartbeat in self.read_heartbeats()):
             self.num_foreign_commands += 1
             self._num_contested += bool(self._written)
         command = self.decode_command(message)
@@ -247,12 +247,12 @@ class LcmDriver(Driver):
     def _on_heartbeat(self, number: int, message: bytes) -> None:
         if len(message) == HEARTBEAT_FORMAT.size:
             heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
-            self._heartbeats.pop(heartbeat.sender, None)
-            self._heartbeats[heartbeat.sender] = heartbeat
-            self._numbers[heartbeat.sender] = number
+            newest, _ = self._heartbeats.pop(heartbeat.sender, (heartbeat, number))
+            # A monitor that has changed its channel may have an older heartbeat unread on the channel before.
+            is_older = heartbeat.sequence < newest.sequence
+            self._heartbeats[heartbeat.sender] = (newest if is_older else heartbeat), number
             while len(self._heartbeats) > MAX_SENDERS:
-                oldest = next(iter(self._heartbeats))
-                del self._heartbeats[oldest], self._numbers[oldest]
+                self._heartbeats.pop(next(iter(self._heartbeats)))
 
 
 @register_driver("iiwa14")

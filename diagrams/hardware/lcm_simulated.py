@@ -32,8 +32,9 @@ from guiderail.diagrams.stations.station import add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.parsing import follow_directives
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, MAX_SENDERS
+from guiderail.models.robots import DEFAULT_END_EFFECTOR
 from guiderail.models.robots.iiwa import IIWA14
-from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector
+from guiderail.models.robots.robot import EndEffector
 
 ACKNOWLEDGED = "_TAKEN"  # suffix of the channel on which a `LockstepClock` acknowledges a status
 REPEAT_INTERVAL = 0.05  # wall clock time after which an unacknowledged status is sent again [s]

@@ -31,7 +31,8 @@ from guiderail.diagrams.stations.station import (
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, StatusLimits
-from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT, EndEffector, Robot, find_robot
+from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
+from guiderail.models.robots.robot import EndEffector, Robot, find_robot
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench

@@ -28,16 +28,10 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
+from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
 from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
-from guiderail.models.robots.robot import (
-    DEFAULT_END_EFFECTOR,
-    DEFAULT_ROBOT,
-    EndEffector,
-    Robot,
-    find_end_effector,
-    find_robot,
-)
+from guiderail.models.robots.robot import EndEffector, Robot, find_end_effector, find_robot
 from guiderail.systems.external_torque_sensor import ExternalTorqueSensor, JointTorqueErrors
 from guiderail.systems.gripper_command import GripperCommand
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench

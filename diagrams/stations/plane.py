@@ -11,7 +11,6 @@ from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, Prismat
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
-from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     Station,
@@ -20,6 +19,7 @@ from guiderail.diagrams.stations.station import (
     export_station_ports,
     whole_multiple,
 )
+from guiderail.models.common.arrays import round_period
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce

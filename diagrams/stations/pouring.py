@@ -11,13 +11,14 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, 
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
-from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import ControllerPlant, Station, export_station_ports
+from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
-from guiderail.models.robots.robot import DEFAULT_ROBOT, Robot, find_robot
+from guiderail.models.robots.robot import Robot, find_robot
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_detector import ContactDetector
 from guiderail.systems.measured_pose import MeasuredPose

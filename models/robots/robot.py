@@ -15,8 +15,6 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
-from guiderail.models.robots import DEFAULT_END_EFFECTOR as DEFAULT_END_EFFECTOR
-from guiderail.models.robots import DEFAULT_ROBOT as DEFAULT_ROBOT
 
 
 @dataclass(frozen=True)

@@ -166,17 +166,17 @@ class SharedControlTemplate:
             X_WE = between(X_WLast, X_WRequest, fraction)
             for constraint in constraints:
                 X_WE = constraint.project(X_WE, frames)
-            load = self._speed_ratio(state, X_WLast, X_WE, period_s)
-            if load <= 1.0 and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
+            ratio = self._speed_ratio(state, X_WLast, X_WE, period_s)
+            if ratio <= 1.0 and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
                 return Command(X_WE, fraction)
-            fraction *= 0.98 / load if load > 1.0 else 0.5
+            fraction *= 0.98 / ratio if ratio > 1.0 else 0.5
         if self._is_inside(state, X_WLast, frames):
             return Command(X_WLast, 0.0)
         X_WE = X_WLast
         for constraint in constraints:
             X_WE = constraint.project(X_WE, frames)
-        load = self._speed_ratio(state, X_WLast, X_WE, period_s)
-        return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)
+        ratio = self._speed_ratio(state, X_WLast, X_WE, period_s)
+        return Command(X_WE if ratio <= 1.0 else between(X_WLast, X_WE, 1.0 / ratio), 0.0)
 
     def _constraints_at(
         self, state: int, X_WLast: RigidTransform, frames: Frames

@@ -8,7 +8,6 @@ from .diagrams.envs.observation import ObservationTerm as ObservationTerm
 from .diagrams.envs.options import Options as Options
 from .diagrams.envs.options import ResetOptions as ResetOptions
 from .diagrams.envs.task_diagram import TaskDiagram as TaskDiagram
-from .diagrams.envs.task_diagram import round_period as round_period
 from .diagrams.guidance.guidance import FunctionGuidance as FunctionGuidance
 from .diagrams.guidance.guidance import Guidance as Guidance
 from .diagrams.guidance.primitive_config import PrimitiveConfig as PrimitiveConfig
@@ -22,6 +21,7 @@ from .diagrams.tasks.insertion import InsertionTask as InsertionTask
 from .diagrams.tasks.registry import register_task as register_task
 from .diagrams.tasks.task import Task as Task
 from .diagrams.tasks.task import Threshold as Threshold
+from .models.common.arrays import round_period as round_period
 from .models.common.errors import InputError as InputError
 from .models.policy import Policy as Policy
 from .models.primitives import Demonstrations as Demonstrations

@@ -11,8 +11,8 @@ from collections import Counter
 import numpy as np
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.tasks.bnc_connector.task import scripted_center_of_pressure
+from guiderail.models.common.arrays import round_period
 
 PROGRESS = {
     # The clock in episodes as long as the others: a tolerance that no robot exceeds.

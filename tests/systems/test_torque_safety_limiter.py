@@ -8,7 +8,8 @@ from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
-from guiderail.models.robots.robot import DEFAULT_ROBOT, find_robot
+from guiderail.models.robots import DEFAULT_ROBOT
+from guiderail.models.robots.robot import find_robot
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, ArmState, SafetyLimits, TorqueSafetyLimiter
 
 PERIOD = 1.0 / 256.0

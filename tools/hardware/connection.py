@@ -17,7 +17,7 @@ from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.lcm_simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
-from guiderail.models.robots.robot import DEFAULT_ROBOT
+from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.tools.hardware.scenario import load_scenario
 
 MILLISECOND = 0.001  # [s]

@@ -248,9 +248,10 @@ def _try_contact(folder: Path, contact: Contact, surfaces: dict[str, ContactSurf
             aligned = insert(folder, file, snapping=contact.snapping_pieces)
             if aligned.success and aligned.lowest < -file.tolerance.height:
                 # Nothing stops the plug at the target, and a push would move it on.
-                without = insert(folder, make_file(contact, 0.0), snapping=contact.snapping_pieces)
-                if without.success:
-                    push, file, aligned = 0.0, make_file(contact, 0.0), without
+                alternative = make_file(contact, 0.0)
+                unpushed = insert(folder, alternative, snapping=contact.snapping_pieces)
+                if unpushed.success:
+                    push, file, aligned = 0.0, alternative, unpushed
             if aligned.success:
                 # Penetration is largest on the rim, where edges meet.
                 misaligned = tuple(

@@ -14,9 +14,7 @@ from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.grid_clamp.options import HARD as HARD
-from guiderail.diagrams.tasks.grid_clamp.options import REWARDS as REWARDS
-from guiderail.diagrams.tasks.grid_clamp.options import GridClampOptions
+from guiderail.diagrams.tasks.grid_clamp.options import HARD, REWARDS, GridClampOptions
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring

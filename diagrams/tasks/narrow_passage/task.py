@@ -19,8 +19,7 @@ from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.narrow_passage.options import HARD as HARD
-from guiderail.diagrams.tasks.narrow_passage.options import NarrowPassageOptions as NarrowPassageOptions
+from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task

@@ -8,7 +8,8 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from guiderail.diagrams.envs.env import INFO_KEYS, DiagramEnv
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.envs.task_diagram import TaskDiagram, round_period
+from guiderail.diagrams.envs.task_diagram import TaskDiagram
+from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
 
 TICK = round_period(0.02)

@@ -7,9 +7,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
-from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
+from guiderail.models.common.arrays import round_period
 from guiderail.models.templates import load_template
 
 PERIOD = round_period(0.01)

@@ -5,7 +5,7 @@ import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.models.control.joint_status import Heartbeat
 
 OWN, OTHER = np.full(7, 0.5), np.full(7, -0.5)
@@ -113,3 +113,11 @@ def test_heartbeats_of_two_monitors_do_not_displace_each_other():
         for program in programs:
             program.HandleSubscriptions(0)
     assert {heartbeat.sender: heartbeat.sequence for heartbeat in station.read_heartbeats()} == {0: 59, 1: 59}
+
+
+def test_older_heartbeat_of_another_channel_does_not_replace_a_newer_one():
+    pair = Pair()
+    for number, sequence in ((1, 5), (0, 4)):
+        pair.other.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
+        pair.read()
+    assert pair.driver.read_heartbeats() == (Heartbeat(5, True, 7),)
