@@ -14,7 +14,7 @@ from guiderail.systems.support.declarations import declare_cache, declare_plant_
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
-MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad], so that no wrench overflows to infinity and, rotated, to NaN
+MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; wrenches of larger ones could overflow
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ImpedanceGains:
         posture_stiffness: Stiffness of the return to the posture [Nm/rad], not negative, finite.
         posture_damping: Decay rate of null-space motion [1/s], not negative, finite. Its torque is this rate times M v,
             which dissipates energy in every posture.
-        bound: Bound of the wrench along the axes of the stiffness frame, in place of `wrench_limits`; default: none.
+        bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
     """
 
     stiffness: np.ndarray

@@ -156,7 +156,7 @@ class CartesianPositionController(LeafSystem):
         measured = self._positions_port.Eval(context)
         if not np.isfinite(measured).all():
             raise InputError(
-                f"a joint command begins where the arm is: its measured positions must be finite, not {measured}"
+                f"the first joint command is the measured one, so measured positions must be finite, not {measured}"
             )
         discrete_state.set_value(self._command, measured)
         discrete_state.set_value(self._is_stuck, [0.0])

@@ -56,7 +56,7 @@ class ChunkSafetyLimiter(LeafSystem):
         check_period(period)
         if not 1 <= replan_steps <= num_steps or num_steps < MIN_STEPS:
             raise InputError(
-                f"a chunk has at least {MIN_STEPS} steps, 1 to all of which are executed, not {num_steps} and "
+                f"num_steps must be at least {MIN_STEPS}, and replan_steps from 1 to num_steps, not {num_steps} and "
                 f"{replan_steps}"
             )
         self._guard, self._num_steps, self._replan_steps = guard, num_steps, replan_steps

@@ -86,8 +86,8 @@ class ExternalTorqueSensor(LeafSystem):
         self._plant, self._step = plant, np.sqrt(period / DRIFT_TIME)
         self._bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
         self._nominal = [body.default_mass() for body in self._bodies]
-        own = plant.CreateDefaultContext()
-        self._centers = [body.CalcCenterOfMassInBodyFrame(own) for body in self._bodies]
+        nominal = plant.CreateDefaultContext()
+        self._centers = [body.CalcCenterOfMassInBodyFrame(nominal) for body in self._bodies]
         self._payload_index = [int(body.index()) for body in self._bodies].index(int(payload_body.index()))
         bodies = len(self._bodies)
         self._gain, self._offset, self._friction, self._mass, self._center, self._seed = (
@@ -158,8 +158,8 @@ class ExternalTorqueSensor(LeafSystem):
         masses = context.get_numeric_parameter(self._mass).value()
         centers = context.get_numeric_parameter(self._center).value().reshape(-1, 3)
         return [
-            (max(nominal + mass, 0.0), own + center)
-            for nominal, own, mass, center in zip(self._nominal, self._centers, masses, centers, strict=True)
+            (max(nominal + mass, 0.0), nominal_center + center)
+            for nominal, nominal_center, mass, center in zip(self._nominal, self._centers, masses, centers, strict=True)
         ]
 
     def _calc_actual(self, context: Context, value: AbstractValue) -> None:

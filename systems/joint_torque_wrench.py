@@ -13,7 +13,7 @@ from guiderail.systems.support.declarations import check_period, declare_plant_c
 class JointTorqueWrench(LeafSystem):
     """Estimate the wrench of the environment on a tool from external joint torques, low-pass filtered.
 
-        F = (Jᵀ)⁺ τ_external,  τ y' = F − y
+        F = (Jᵀ)⁺ τ_external,  t_f y' = F − y
 
     τ_external are the measured joint torques minus the torques of the arm's weight and inertia; the controller of an
     arm with torque sensors provides them. The pseudoinverse is damped, so that near a singular posture the estimate
@@ -38,7 +38,7 @@ class JointTorqueWrench(LeafSystem):
         target: Frame T.
         tool_center: Frame P.
         period: Sampling period [s], positive.
-        time_constant: τ of the filter [s]; 0 disables it.
+        time_constant: Time constant t_f of the filter [s]; 0 disables it.
         damping: Damping of the pseudoinverse, not negative.
 
     Raises:

@@ -155,7 +155,7 @@ class LcNsKmpSystem(LeafSystem):
             InputError: If there is only one primitive.
         """
         if self._history_length_port is None:
-            raise InputError("this system has one primitive, hence no such port: give it shorter ones")
+            raise InputError("this system has one primitive, hence no such port: give `shorter` primitives")
         return self._history_length_port
 
     get_motion_time_input_port = input_getter("motion_time", "time of the motion, (1,) [s]; optional")

@@ -138,7 +138,7 @@ class TorqueSafetyLimiter(LeafSystem):
         if len(limits.velocity) != num_joints:
             raise InputError(f"an arm of {num_joints} joints needs as many limits, not {len(limits.velocity)}")
         if limits.decay_time < 2.0 * period:
-            raise InputError(f"an arm can't come to rest within {limits.decay_time} s at a period of {period} s")
+            raise InputError(f"decay_time must be at least two periods of {period} s, not {limits.decay_time} s")
         self._plant, self._limits, self._period, self._num_joints = plant, limits, period, num_joints
         self._torque_limits, self._can_hold = np.array(limits.torque), can_hold
 

@@ -58,7 +58,7 @@ class WrenchTare(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     get_measured_wrench_input_port = input_getter("measured_wrench", "wrench with a bias, (6,)")
-    get_tared_wrench_output_port = output_getter("tared_wrench", "wrench without it, (6,)")
+    get_tared_wrench_output_port = output_getter("tared_wrench", "wrench without the bias, (6,)")
 
     def is_tared(self, context: Context) -> bool:
         """Return True if all samples of the mean have been taken; `context` is this system's."""

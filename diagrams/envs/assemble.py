@@ -44,7 +44,7 @@ from guiderail.systems.reward_system import RewardSystem
 if TYPE_CHECKING:
     from guiderail.models.primitives.progress import StateProgress
 
-HALF_TURN_MARGIN = 0.1  # smallest distance of demonstrated angles from ±180°, for turns by actions and contact [rad]
+HALF_TURN_MARGIN = 0.1  # smallest distance of demonstrated angles from ±180° [rad]; actions and contact turn further
 
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
@@ -317,9 +317,9 @@ def build_task_diagram(
     rewarded = {name: size for term in terms for name, size in term.inputs.items()}
     signals.connect(reward, rewarded, f"reward {task.config.reward!r} of {task.name}")
 
-    too_much = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
+    collision = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
     builder.Connect(
-        signals.get(task.collision.signal, f"the collision threshold of {task.name}"), too_much.get_input_port()
+        signals.get(task.collision.signal, f"the collision threshold of {task.name}"), collision.get_input_port()
     )
     force = station.get_contact_force_output_port()
     exported = {
@@ -332,7 +332,7 @@ def build_task_diagram(
         "pose": station.get_pose_output_port(),
         "wrench": station.get_wrench_output_port(),
         "saturation": station.get_saturation_output_port(),
-        "collision": too_much.get_output_port(),
+        "collision": collision.get_output_port(),
         "command_timed_out": station.get_command_timed_out_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
@@ -414,10 +414,10 @@ def build_skill_diagram(
     builder, action = loop.builder, guidance.GetInputPort("action")
     if not isinstance(policy, System):
         port = loop.observation
-        seen_as = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
+        model = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
         from guiderail.systems.policy_system import PolicySystem
 
-        policy = PolicySystem(policy, seen_as, action.size(), task.config.action_repeat * station.control_period)
+        policy = PolicySystem(policy, model, action.size(), task.config.action_repeat * station.control_period)
     builder.AddNamedSystem("policy", policy)
     observation, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
     if observation.size() != loop.observation.size() or acts.size() != action.size():
@@ -463,8 +463,8 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
             violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
     for name, port in poses.items():
         if name not in violations:
-            every = task.motion_constraints() or constraints
-            violation = builder.AddNamedSystem(name, ConstraintViolation(every, station.control_period))
+            checked = task.motion_constraints() or constraints
+            violation = builder.AddNamedSystem(name, ConstraintViolation(checked, station.control_period))
             builder.Connect(port, violation.get_pose_input_port())
             violations[name] = violation.get_violation_output_port()
     return violations
@@ -474,18 +474,18 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
     """Return `TaskDiagram.randomize`: it samples an episode's conditions and writes them into the root context."""
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
-        drawn = task.reset(
+        sampled = task.reset(
             station, guidance, context, rng, validate_options(task.Reset, options, f"a reset of {task.name}")
         )
-        if not isinstance(drawn, Mapping):
+        if not isinstance(sampled, Mapping):
             raise InputError(
-                f"reset of {task.name} must return the sampled values by name, {{}} if none, not {brief(drawn)}"
+                f"reset of {task.name} must return the sampled values by name, {{}} if none, not {brief(sampled)}"
             )
-        if taken := [name for name in drawn if name in INFO_KEYS]:
+        if taken := [name for name in sampled if name in INFO_KEYS]:
             raise InputError(
                 f"reset of {task.name} returns a value named {taken[0]!r}, which is reserved: give it another name"
             )
-        return {**drawn, **station.disturb(context, rng)}
+        return {**sampled, **station.disturb(context, rng)}
 
     return randomize
 

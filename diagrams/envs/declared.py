@@ -23,10 +23,7 @@ from guiderail.models.common.registry import did_you_mean
 
 
 def declared_models(task: str) -> list[type[Options]]:
-    """Return the models of all options that a task of this package may have, with any guidance and on any station.
-
-    Without Drake, if the modules that define the models do not import it.
-    """
+    """Return the models of all options that a task of this package may have, with any guidance and on any station."""
     declared: list[type[Options] | None] = [CommonOptions, TASKS.declared(task, "Options")]
     declared += [PrimitiveOptions, TemplateOptions]
     workcell_kind = TASKS.declared(task, "workcell_kind") if TASKS.declares(task, "workcell_kind") else "insertion"

@@ -52,8 +52,8 @@ _SIMULATION_FAILURE = re.compile(
     r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE
 )
 
-# A simulation has failed if its state exceeds these limits: largest coordinate of a position [m], and largest joint
-# speed [m/s] or [rad/s], which is three times the speed of a ball that falls for the longest episode.
+# A simulation has failed if a coordinate of the robot's position [m] or a joint speed [m/s], [rad/s] exceeds its limit.
+# A ball that falls for the longest episode reaches a third of the speed limit.
 MAX_POSITION, MAX_JOINT_SPEED = 10.0, 1e3
 
 
@@ -168,7 +168,7 @@ class DiagramEnv(DrakeGymEnv):
         self._failure: str | None = None  # message of the failed simulation
         self._violations = (-np.inf, -np.inf)
         self._closed = False
-        self._release = weakref.finalize(self, release or _do_nothing)
+        self._release = weakref.finalize(self, release or (lambda: None))
         self._release.atexit = False
 
     def close(self) -> None:
@@ -395,10 +395,6 @@ def _plants(diagram: Diagram) -> Iterator[MultibodyPlant]:
             yield from _plants(system)
         elif isinstance(system, MultibodyPlant) and system.num_velocities():
             yield system
-
-
-def _do_nothing() -> None:
-    """Do nothing; used if no `release` is given."""
 
 
 def check_render_mode(render_mode: str | None) -> None:

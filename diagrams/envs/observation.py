@@ -101,7 +101,7 @@ class Observation(Diagram):
             raise InputError(
                 f"the observation{f' of {of}' if of else ''} is empty: let observation_terms() list a signal"
             )
-        together = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
+        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
         exported: set[str] = set()
         if waits:
             motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
@@ -109,19 +109,21 @@ class Observation(Diagram):
         for index, one in enumerate(observed):
             if one.signal in CLOCKS:
                 clock = _add_clock(builder, one.signal, duration, motion_time if waits else None)
-                builder.Connect(clock, together.get_input_port(index))
+                builder.Connect(clock, multiplexer.get_input_port(index))
                 continue
             if one.signal not in exported:
                 exported.add(one.signal)
                 signal = builder.AddNamedSystem(one.signal, PassThrough(sizes[one.signal]))
                 builder.ExportInput(signal.get_input_port(), one.signal)
-            builder.Connect(builder.GetSubsystemByName(one.signal).get_output_port(0), together.get_input_port(index))
+            builder.Connect(
+                builder.GetSubsystemByName(one.signal).get_output_port(0), multiplexer.get_input_port(index)
+            )
         scale = np.concatenate([scale for _, _, scale in rows])
         center = np.concatenate([center for _, center, _ in rows])
         D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]
         scaled = builder.AddNamedSystem("scaled", affine(D, -center / scale))
         clipped = builder.AddNamedSystem("clipped", Saturation(np.full(self.size, -clip), np.full(self.size, clip)))
-        builder.Connect(together.get_output_port(), scaled.get_input_port())
+        builder.Connect(multiplexer.get_output_port(), scaled.get_input_port())
         builder.Connect(scaled.get_output_port(), clipped.get_input_port())
         builder.ExportOutput(clipped.get_output_port(), "observation")
         builder.BuildInto(self)

@@ -86,22 +86,22 @@ class PrimitiveOptions(Options):
     )
     max_speed: Numbers = Field(
         (),
-        description="largest speed of the command: along each axis of the position [m/s], and of each angle [rad/s] if "
-        "there are two numbers; or one number for each output",
+        description="largest speed of the command: one number for the position's axes [m/s], two with that of the "
+        "angles [rad/s], or one for each output",
     )
     max_acceleration: Numbers = Field((), description="largest acceleration of the command, like max_speed")
     joint_margin: Number | None = Field(
         None,
         ge=0,
         le=1,
-        description="keep the joints that a command takes this far from their limits [rad], on an arm; default: no "
+        description="smallest distance of an arm's commanded joint positions from their limits [rad]; default: no "
         "constraint",
     )
     min_singular_value: Number = Field(
         0.0, ge=0, le=0.2, description="smallest singular value of the arm's scaled Jacobian [m], with joint_margin"
     )
     progress: Literal["clock", "state"] = Field(
-        "clock", description="what advances the motion: the clock, or the robot, which the motion then waits for"
+        "clock", description="clock: the motion advances with time; state: it waits for a robot that does not follow"
     )
     progress_tolerance: Numbers = Field(
         (0.0025, 0.1),

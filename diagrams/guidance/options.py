@@ -59,7 +59,7 @@ class BarrierOptions(Options):
     """Options of `residual_cbf`."""
 
     barrier_decay: Number = Field(
-        0.2, gt=0, le=1, description="γ, largest fraction by which a command may approach a constraint per step"
+        0.2, gt=0, le=1, description="γ, largest fraction of the distance to a constraint that one step may cover"
     )
 
 
@@ -69,5 +69,5 @@ class TangentOptions(Options):
     slack_width: Number = Field(
         0.5,
         gt=0,
-        description="slack at which half of a motion towards a constraint remains, in displacements by an action of 1",
+        description="slack at which motion towards a constraint is halved, in displacements by an action of 1",
     )

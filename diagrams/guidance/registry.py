@@ -50,16 +50,16 @@ class GuidanceKind:
     displaces: bool = False
     options: type[Options] | None = None
 
-    def missing_requirements(self, known: Collection[str]) -> tuple[str, ...]:
+    def missing_requirements(self, provided: Collection[str]) -> tuple[str, ...]:
         """Return the missing requirements of the alternative with the fewest; empty if an alternative is complete.
 
-        `known` are the requirements that the task provides.
+        `provided` are the requirements that the task provides.
         """
-        return _missing_requirements(self.needs, known)
+        return _missing_requirements(self.needs, provided)
 
 
-def _missing_requirements(needs: tuple[tuple[str, ...], ...], known: Collection[str]) -> tuple[str, ...]:
-    missing = [tuple(one for one in needed if one not in known) for needed in needs]
+def _missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collection[str]) -> tuple[str, ...]:
+    missing = [tuple(one for one in needed if one not in provided) for needed in needs]
     return min(missing, key=len, default=())
 
 
@@ -101,43 +101,43 @@ def register_guidance(
     return add
 
 
-def possible_guidance(known: Collection[str]) -> list[str]:
-    """Return the names of all kinds of guidance with requirements among `known`."""
-    return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), known)]
+def possible_guidance(provided: Collection[str]) -> list[str]:
+    """Return the names of all kinds of guidance whose requirements are `provided`."""
+    return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
 
 
-def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
-    """Return the kind of guidance with a name, after a check that its requirements are among `known`.
+def check_guidance(name: str, provided: Collection[str], task: str = "this task") -> GuidanceKind:
+    """Return the kind of guidance with a name, after a check that its requirements are `provided`.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing, which the message names.
     """
     kind = GUIDANCE.get(name)
-    missing = kind.missing_requirements(known)
+    missing = kind.missing_requirements(provided)
     if missing:
         texts = " and ".join(REQUIREMENTS.get(one, one) for one in missing)
         raise InputError(
-            f"guidance '{name}' needs {texts}, which {task} doesn't have: use {', '.join(possible_guidance(known))}"
+            f"guidance '{name}' needs {texts}, which {task} doesn't have: use {', '.join(possible_guidance(provided))}"
         )
     return kind
 
 
-def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") -> Diagram:
+def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") -> Diagram:
     """Build a kind of guidance from prior knowledge.
 
     Args:
         name: Name of the kind.
-        known: Prior knowledge; options that it lacks have their defaults.
+        prior: Prior knowledge; options that it lacks have their defaults.
         task: Name of the task, for the message.
 
     Raises:
         InputError: If there is no such kind, or a requirement is missing.
     """
-    kind = check_guidance(name, [one for one in REQUIREMENTS if known.has(one)], task)
+    kind = check_guidance(name, [one for one in REQUIREMENTS if prior.has(one)], task)
     if kind.options is not None:
         declared = kind.options.model_fields.items()
         defaults = {name: field.get_default() for name, field in declared if not field.is_required()}
-        known = replace(known, options=defaults | dict(known.options))
-    guidance = kind.build(known)
+        prior = replace(prior, options=defaults | dict(prior.options))
+    guidance = kind.build(prior)
     guidance.set_name("guidance")
     return guidance

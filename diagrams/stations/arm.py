@@ -108,8 +108,8 @@ def controller_model(
     starts = [plant.GetJointByName(name, arm.model).position_start() for name in robot.joints]
     if starts != list(range(plant.num_positions())):
         raise InputError(
-            f"robot {robot.name!r}: its model must move by the joints that are named, from the base to the flange, and "
-            "by no others: make an end effector of what else moves"
+            f"the joints of robot {robot.name!r}'s model must be those of `Robot.joints`, in order from the base to "
+            "the flange: model other moving parts as an end effector"
         )
     return plant, arm
 

@@ -98,7 +98,7 @@ class DisturbedStation(Station):
     def _add_wrench(self, builder: DiagramBuilder, wrench: OutputPort, pose: OutputPort) -> OutputPort:
         """Add errors, tare and delay of the wrench; return the port of the measured wrench.
 
-        A robot tares its own sensor; the delay is that of the way to the policy.
+        A robot tares its own sensor, so the delay of the transmission to the policy follows the tare.
         """
         e, period = self._errors, self.control_period
         delay, has_gradient = e.wrench_delay[1], any(e.wrench_gradient)
@@ -159,12 +159,12 @@ class DisturbedStation(Station):
         self._pose.set_error(pose, np.ones(POSE_SIZE), pose_offset, 0)
         # A seed of its own: with the same seed both systems would use the same random numbers.
         self._commands.set_seed(commands, int(np.random.SeedSequence(seed).generate_state(1)[0]))
-        drawn = {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
+        sampled = {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
         if self._has_further_errors:
-            drawn |= self._disturb_further(context, np.random.default_rng([int(rng.integers(2**31)), seed]))
+            sampled |= self._disturb_further(context, np.random.default_rng([int(rng.integers(2**31)), seed]))
         if d.payload:  # after the inner station has sampled its own errors of the tool
             self._inner.set_payload(context, d.payload)
-        return drawn
+        return sampled
 
     @property
     def _has_further_errors(self) -> bool:
@@ -187,12 +187,12 @@ class DisturbedStation(Station):
         for source, sign in zip(self._calibration, (-1.0, 1.0), strict=False):
             own = source.GetMyMutableContextFromRoot(context)
             source.get_mutable_source_value(own).SetFromVector(sign * calibration)
-        drawn = {"wrench_delay": delay, "wrench_gradient": gradient, "calibration_error": calibration}
-        return drawn | dict(self._inner.disturb(context, rng))
+        sampled = {"wrench_delay": delay, "wrench_gradient": gradient, "calibration_error": calibration}
+        return sampled | dict(self._inner.disturb(context, rng))
 
 
 def _without_replaced_errors(disturbances: Disturbances, station: Station) -> SensorErrors:
-    """Return the errors that are added to a station's ports: not those that its joint torques have already."""
+    """Return the errors that are added to a station's ports, without those that its joint torques already have."""
     errors = disturbances.errors
     if errors.joint_torque is None:
         return errors
@@ -201,8 +201,8 @@ def _without_replaced_errors(disturbances: Disturbances, station: Station) -> Se
     given = disturbances.model_dump(exclude_none=True)
     exact = SENSING["exact"]
     replaced = ("wrench_scale", "wrench_bias", "wrench_drift", "wrench_noise")
-    mine = {name: getattr(exact, name) for name in replaced if name not in given}
-    return replace(errors, **mine, wrench_gradient=exact.wrench_gradient)
+    without_error = {name: getattr(exact, name) for name in replaced if name not in given}
+    return replace(errors, **without_error, wrench_gradient=exact.wrench_gradient)
 
 
 def disturbed(
@@ -241,7 +241,7 @@ def disturbed(
         raise InputError(f"station={name!r} is a real robot, which has disturbances of its own: leave them out")
     if disturbances.stiffness_factor != 1.0:
         if not has_impedance:
-            raise InputError(f"station={name!r} has no impedance whose stiffness could be another: leave it out")
+            raise InputError(f"station={name!r} has no impedance: leave stiffness_factor out")
         nominal = impedance or Impedance()
         stiffness = tuple(disturbances.stiffness_factor * value for value in nominal.stiffness)
         arguments["impedance"] = replace(nominal, stiffness=stiffness)

@@ -46,8 +46,8 @@ class ContactOptions(Options):
 class ArmOptions(ContactOptions):
     """Options of the arm station."""
 
-    robot: str = Field(DEFAULT_ROBOT, description="which arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
+    robot: str = Field(DEFAULT_ROBOT, description="arm")
+    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="tool on the flange")
 
 
 class GantryOptions(ContactOptions):
@@ -63,11 +63,11 @@ class GantryOptions(ContactOptions):
 class HardwareOptions(Options):
     """Options of a station with a real arm."""
 
-    robot: str = Field(DEFAULT_ROBOT, description="which arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
+    robot: str = Field(DEFAULT_ROBOT, description="arm")
+    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="tool on the flange")
     driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
     robot_url: str = Field("", description="address of the robot: LCM's URL, or a host; default: LCM's own")
-    robot_timeout: Number = Field(10.0, gt=0, description="how long to wait for the robot's first status [s]")
+    robot_timeout: Number = Field(10.0, gt=0, description="longest wait for the robot's first status [s]")
 
 
 def _factors(quantity: str) -> Any:
@@ -81,8 +81,8 @@ def _magnitudes(description: str) -> Any:
 class Disturbances(Options):
     """Options of environments with a workcell: constant disturbances, and ranges that every episode samples from.
 
-    A policy can be trained with one range and evaluated with another. `sensing` sets all errors of the sensors by one
-    name; an error that is given as well replaces that of the name.
+    A policy can be trained with one range and evaluated with another. `sensing` names a setting of all sensor errors;
+    an error that is given as well replaces that of the setting.
     """
 
     sensing: Sensing = Field(

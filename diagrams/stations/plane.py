@@ -34,8 +34,8 @@ class PlaneConfig:
 
     The robot is a light ball on two prismatic joints, each with a limited proportional force against viscous friction
     that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
-    mm, is much less than a wall's thickness. Otherwise its position control is critically damped: the
-    robot reaches a command within a control step and does not overshoot.
+    mm, is much less than a wall's thickness. Otherwise its position control is critically damped: the robot reaches a
+    command within a control step and does not overshoot.
 
     Attributes:
         plant_period: Time step of the plant [s].
@@ -106,13 +106,11 @@ class PlaneStation(Station):
         builder = DiagramBuilder()
         self.passage, self.config = passage, config
         self.control_period = config.control_period
-        # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
-        # updates of the same instant, so a system that samples the pose would get that of the next plant step.
         plant_config = MultibodyPlantConfig(
             time_step=config.plant_period,
             discrete_contact_approximation="lagged",
             contact_model="point",
-            use_sampled_output_ports=False,
+            use_sampled_output_ports=False,  # see `TaskDiagram`
         )
         self.plant, self.scene_graph = AddMultibodyPlant(plant_config, builder)
         self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))

@@ -149,14 +149,12 @@ class PouringStation(Station):
         builder = DiagramBuilder()
         self.config = config
         self.control_period = config.control_period
-        # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
-        # updates of the same instant, so a system that samples a pose would get that of the next plant step.
         plant_config = MultibodyPlantConfig(
             time_step=config.plant_period,
             contact_model="point",
             discrete_contact_approximation="lagged",
             penetration_allowance=1e-3,
-            use_sampled_output_ports=False,
+            use_sampled_output_ports=False,  # see `TaskDiagram`
         )
         self.plant, self.scene_graph = plant, _ = AddMultibodyPlant(plant_config, builder)
         self.arm, self._tip, wrist = add_arm_with_thermos(plant, config)
@@ -287,7 +285,7 @@ def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
     """
     if not ball.diameter * 1.25 <= inner_diameter <= 0.2 or not ball.diameter * 1.5 <= depth <= 0.25:
         raise InputError(
-            f"A mug of {inner_diameter} m inside and {depth} m deep doesn't take the balls or the arm; "
-            f"stay within 0.05 to 0.2 m and 0.06 to 0.25 m."
+            f"a mug of {inner_diameter} m inner diameter and {depth} m depth is too small for the balls or too large "
+            "for the arm: stay within 0.05 to 0.2 m and 0.06 to 0.25 m"
         )
     return Vessel(inner_diameter=inner_diameter, depth=depth)

@@ -290,9 +290,7 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
         contact_model="hydroelastic_with_fallback",
         discrete_contact_approximation="lagged",
         contact_surface_representation="polygon",
-        # A plant with sampled ports steps by an unrestricted update, which Drake runs *before* the discrete updates of
-        # the same instant: a new command would arrive one step late.
-        use_sampled_output_ports=False,
+        use_sampled_output_ports=False,  # see `TaskDiagram`
     )
     return AddMultibodyPlant(config, builder)
 

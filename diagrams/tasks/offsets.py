@@ -1,4 +1,4 @@
-"""Hidden offsets of fixture and workpiece, sampled for a run or for each episode, and their random streams."""
+"""Hidden offsets of fixture and workpiece with their random streams, and reference trajectories of files."""
 
 from __future__ import annotations
 

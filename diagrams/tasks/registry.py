@@ -70,7 +70,7 @@ def _check(name: str, task: type[Task]) -> None:
 
     if inspect.isabstract(task):
         missing = ", ".join(f"{method}()" for method in sorted(task.__abstractmethods__))
-        raise InputError(f"{name} lacks {missing}: write what every task needs")
+        raise InputError(f"{name} lacks {missing}: every task must define these methods")
     for attribute, kind in (("Options", Options), ("Reset", ResetOptions)):
         given = getattr(task, attribute)
         if not (isinstance(given, type) and issubclass(given, kind)):
@@ -78,7 +78,7 @@ def _check(name: str, task: type[Task]) -> None:
     for attribute in ("rewards", "observations"):
         given = getattr(task, attribute)
         if isinstance(given, str) or not given:
-            raise InputError(f"{attribute} of {name} must be some words, such as ('sparse',), not {brief(given)}")
+            raise InputError(f"{attribute} of {name} must be a tuple of names, such as ('sparse',), not {brief(given)}")
     if STANDARD not in task.difficulties:
         raise InputError(f"difficulties of {name} must have {STANDARD!r}, not only {brief(list(task.difficulties))}")
     num_steps = getattr(task, "num_steps", None)  # a constructor or a property may set it instead

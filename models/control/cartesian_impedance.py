@@ -141,7 +141,7 @@ def impedance_torques(
         posture_torque: Torque (n,) that pulls the joints to their preferred posture [Nm].
         gravity_torque: Gravity compensation (n,) [Nm].
         torque_limits: Torque limits (n,) [Nm].
-        bound: Bound of the wrench along the axes of the stiffness frame, in place of `wrench_limits`; default: none.
+        bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
 
     Raises:
         LinAlgError: If the mass matrix or the inertia at the tool is not positive definite.

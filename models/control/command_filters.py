@@ -96,7 +96,7 @@ class TangentSpaceFilter(_LastCommand):
 
     Args:
         keep_out: Boxes and constraints, with their margin. A box is replaced by its face with the most clearance.
-        width: σ, slack at which half of a motion towards a constraint remains, positive [unit of a position].
+        width: σ, slack at which motion towards a constraint is halved, positive [unit of a position].
 
     Raises:
         InputError: If σ is not positive.

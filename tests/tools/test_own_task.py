@@ -88,7 +88,7 @@ def declare(of=Own, **attributes):
         ({"num_steps": 1.5}, "num_steps of lab/Own must be a whole number of at least 1, not 1.5"),
         ({"num_steps": True}, "num_steps of lab/Own must be a whole number of at least 1, not True"),
         ({"num_steps": "80"}, "num_steps of lab/Own must be a whole number of at least 1, not '80'"),
-        ({"rewards": ()}, "rewards of lab/Own must be some words"),
+        ({"rewards": ()}, "rewards of lab/Own must be a tuple of names"),
         ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
     ],
 )
@@ -116,7 +116,9 @@ def test_task_without_a_possible_environment_is_refused(attributes, says):
 
 
 def test_task_that_lacks_methods_is_refused_with_their_names():
-    with pytest.raises(InputError, match=r"lab/Own lacks reset\(\), workcell\(\): write what every task needs"):
+    with pytest.raises(
+        InputError, match=r"lab/Own lacks reset\(\), workcell\(\): every task must define these methods"
+    ):
         declare(of=Task, observation_terms=None, reward_terms=None, termination_terms=None)
 
 

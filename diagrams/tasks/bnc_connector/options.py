@@ -27,8 +27,8 @@ OFFSET_RANGES = {
     "per_episode": (0.0, 1.5 * MM),
     "none": (0.0, 0.3 * MM),
 }
-GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool
-LARGEST_GRASP_ANGLE = 2.0  # [degrees] largest accepted `grasp_angle`; a larger tilt would be a faulty grasp
+GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
+LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a faulty grasp
 
 
 OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
@@ -39,7 +39,7 @@ class BncUncertainty(HiddenOffsets):
     """Sampler of the offsets of jack and plug; `HiddenOffsets` has the options of a reset.
 
     - "per_run": the jack is offset by 1.0 to 1.5 mm in a random direction, sampled once per run; the plug is within
-      0.3 mm of its nominal position in the tool, sampled each episode. The dissertation uses this setting.
+      0.3 mm of its nominal position in the tool, sampled each episode. The thesis uses this setting.
     - "per_episode": the jack is anywhere within 1.5 mm, sampled each episode.
     - "none": the jack is within 0.3 mm, sampled each episode.
 
@@ -133,7 +133,7 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )
     num_demonstrations: Integer | None = Field(
-        None, ge=1, description="number of demonstrations that are used, from the first on; one needs prior_std"
+        None, ge=1, description="number of demonstrations to use, from the first on; a single one needs prior_std"
     )
     time_scale: Number = Field(
         1.0,

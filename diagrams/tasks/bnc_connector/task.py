@@ -12,7 +12,7 @@ import numpy as np
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD
-from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.envs.scene import ARM_VIEW, TOOL_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD, OBSERVATIONS, REWARDS, BncOptions, BncUncertainty
@@ -43,10 +43,9 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-COMPONENTS = 16
+COMPONENTS = 16  # components of the Gaussian mixture
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
-TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 CAMERA_LENGTH = 12 * MM  # length for the distance of the wrist camera [m]
 LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
 

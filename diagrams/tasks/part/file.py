@@ -121,7 +121,7 @@ class Bounds(Options):
     def _are_numbers(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
         rows = value if value and isinstance(value[0], list | tuple) else (value,)
         if not all(_is_row(row) for row in rows):
-            raise ValueError("bounds are six finite numbers each, [x y z Rz Ry Rx], null where there is none")
+            raise ValueError("bounds are six finite numbers each, [x y z Rz Ry Rx], null for an absent bound")
         return value
 
     @field_validator("phases")
@@ -176,13 +176,13 @@ class DemonstrationFile(PriorOptions):
 
     file: str = Field("demonstrations.npz", description="file .npz or .csv of poses in the target frame")
     components: int | None = Field(
-        None, ge=1, description="components of their mixture; default: by information criterion"
+        None, ge=1, description="components of the Gaussian mixture; default: by the Bayesian information criterion"
     )
     floor: Numbers = Field(
         REPEATABILITY_STD,
         min_length=6,
         max_length=6,
-        description="standard deviation of a hand, added to theirs [m], [rad]",
+        description="standard deviation of a hand's repeatability, whose square is added to the variances [m], [rad]",
     )
 
     def reference(self, folder: Path) -> ReferenceTrajectory:
