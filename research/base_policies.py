@@ -14,7 +14,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import (
     reference_trajectory,
 )
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
+from guiderail.models.objects.insertion import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.models.policy import register_base_policy
 
 CHUNK_STEPS = 40  # K
@@ -29,7 +29,7 @@ def slow_search(observation: np.ndarray) -> np.ndarray:
     at = np.minimum(step + np.arange(CHUNK_STEPS), reference.num_steps - 1)
     chunk = reference.means[at].copy()
     searching = (reference.times[at] > MAY_PRESS) & (reference.times[at] < HOLD_UNTIL)
-    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
     length = float(np.linalg.norm(lever))
     if observation[Z] * POSE_SCALE[2] + POSE_CENTER[2] > ON_RIM and length > 0.0:
         command = command + STEP * lever / max(length, MM)

@@ -56,8 +56,8 @@ class ChunkSafetyLimiter(LeafSystem):
         check_period(period)
         if not 1 <= replan_steps <= num_steps or num_steps < MIN_STEPS:
             raise InputError(
-                f"num_steps must be at least {MIN_STEPS}, and replan_steps from 1 to num_steps, not {num_steps} and "
-                f"{replan_steps}"
+                f"num_steps of a chunk must be at least {MIN_STEPS}, and replan_steps from 1 to num_steps, not "
+                f"{num_steps} and {replan_steps}"
             )
         self._guard, self._num_steps, self._replan_steps = guard, num_steps, replan_steps
         self._outputs = guard.constraints.num_outputs

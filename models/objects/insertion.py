@@ -7,7 +7,7 @@ MIN_CONTACT_FORCE = 0.5  # smallest force of a plug in contact [N]
 
 # Scales of the observed center of pressure and of the observed command. The center of pressure, unlike the torque, does
 # not grow with the push. The command shows the effect of an action; the measured pose of a plug on a rim does not.
-LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
+CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
 # Variance ρ of the history [m², rad²]; the thesis's 1e-8, (0.1 mm)², is too large for demonstrations that vary by 1 mm.
 HISTORY_VARIANCE = 1e-11

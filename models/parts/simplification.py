@@ -65,7 +65,7 @@ def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plu
         other: The other solid at the target.
         margin: Largest distance from the nominal motion [mm].
         turn: Turn of the plug about z at the target [rad].
-        is_plug: Whether `part` is the plug.
+        is_plug: True if `part` is the plug.
     """
     manifold3d = import_extra("manifold3d")
     low, high = part.bounding_box()[2], part.bounding_box()[5]

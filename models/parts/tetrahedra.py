@@ -23,7 +23,7 @@ def tetrahedralize(
         triangles: Triangles (T, 3).
         tolerance: Largest deviation of the boundary [m].
         edge: Desired length of an edge, as a fraction of the diagonal of the bounding box.
-        optimize: Whether the shape of the tetrahedra is improved, which takes most of the time.
+        optimize: True to improve the shape of the tetrahedra, which takes most of the time.
     """
     scale = 1e3  # tolerances of fTetWild are meant for numbers around one
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))

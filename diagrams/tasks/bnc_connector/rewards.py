@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, HALF_TURN_OF_WRENCH
 from guiderail.models.common.transforms import DEGREE, MM
-from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
+from guiderail.models.objects.insertion import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.reward_system import RewardTerm
 
@@ -41,7 +41,7 @@ def observation_terms(
         return state
     return (
         *state,
-        ObservationTerm("center_of_pressure", 0.0, LEVER_SCALE),
+        ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE),
         ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)),
     )
 

@@ -35,7 +35,12 @@ from guiderail.models.objects.bnc_connector import demonstrations as inserting
 from guiderail.models.objects.bnc_connector import search_demonstrations as searching
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS, RIM
 from guiderail.models.objects.bnc_connector.search_demonstrations import HOLD_UNTIL, SEARCH
-from guiderail.models.objects.insertion import COMMAND_SCALE, HISTORY_VARIANCE, LEVER_SCALE, REPEATABILITY_STD
+from guiderail.models.objects.insertion import (
+    CENTER_OF_PRESSURE_SCALE,
+    COMMAND_SCALE,
+    HISTORY_VARIANCE,
+    REPEATABILITY_STD,
+)
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
@@ -103,7 +108,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     time = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS * CONTROL_PERIOD
     if not MAY_PRESS < time < HOLD_UNTIL:
         return np.zeros(2)
-    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
     height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTER[2], float(np.linalg.norm(lever))
     if height > ON_RIM and length > 0.0:
         command = command + STEP * lever / max(length, MM)

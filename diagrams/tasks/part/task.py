@@ -30,7 +30,7 @@ from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
-from guiderail.models.objects.insertion import HISTORY_VARIANCE, LEVER_SCALE
+from guiderail.models.objects.insertion import CENTER_OF_PRESSURE_SCALE, HISTORY_VARIANCE
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
@@ -119,7 +119,7 @@ class ScriptedSearch:
         if passed <= 0.0:
             self._action, passed = np.zeros(2), 0.0
         self._time = time
-        lever = observation[CENTER_OF_PRESSURE] * LEVER_SCALE
+        lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
         height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
         if height > self._file.motion.rim - IN_SOCKET and length > 0.0:
             search = self._file.search

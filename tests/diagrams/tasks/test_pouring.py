@@ -202,7 +202,7 @@ def test_hand_shaped_reward_is_the_thesiss():
         ({"reward": "dense"}, "hand_shaped"),
         ({"observation": "image"}, "state"),
         ({"mug_offset": 1.0}, "at most 0.04"),
-        ({"mug_inner_diameter": 0.03}, "take the balls"),
+        ({"mug_inner_diameter": 0.03}, "too small for the balls"),
         ({"input_speed": 5.0}, "at most 2"),
     ],
 )

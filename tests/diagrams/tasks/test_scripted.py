@@ -13,7 +13,7 @@ from guiderail.diagrams.tasks.grid_clamp.task import CENTER, LANE_ENDS, LANES, S
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import RIM
-from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
+from guiderail.models.objects.insertion import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 
 
 def seen_plug(**values):
@@ -51,7 +51,7 @@ def test_torque_search_stays_within_bounds():
 def seen_pressure(time=1.6, z=RIM, lever=(0.0, 0.0), command=(0.0, 0.0)):
     result = np.zeros(17)
     result[0], result[3] = time / 4.0 - 1.0, (z - POSE_CENTER[2]) / POSE_SCALE[2]
-    result[13:15], result[15:17] = np.array(lever) / LEVER_SCALE, np.array(command) / COMMAND_SCALE
+    result[13:15], result[15:17] = np.array(lever) / CENTER_OF_PRESSURE_SCALE, np.array(command) / COMMAND_SCALE
     return result
 
 
