@@ -348,7 +348,7 @@ def _kinds(function: Any) -> dict[str, str]:
 
 def options() -> str:
     """Return the page of tasks, guidance, stations, robots and learners with their options."""
-    from guiderail.tools.cli.catalog import describe_all
+    from guiderail.tools.catalog import describe_all
 
     known = describe_all()
     page = (

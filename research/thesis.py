@@ -218,7 +218,7 @@ def describe_differences(config: RunConfig, *, learns: bool = True) -> list[str]
 
     Args:
         config: Configuration of the run.
-        learns: Whether the run trains a policy. Otherwise the learner's settings are not compared.
+        learns: True if the run trains a policy; otherwise the learner's settings are not compared.
     """
     setting = THESIS.get(config.task)
     if setting is None:

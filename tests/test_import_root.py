@@ -48,3 +48,9 @@ env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="kgrl")
 print(imported, env.unwrapped.action_space.shape)
 """
     assert run_elsewhere(code, tmp_path).stdout.split() == ["set()", "(2,)"]
+
+
+def test_package_runs_as_the_command(tmp_path):
+    command = [sys.executable, "-m", "guiderail", "--version"]
+    printed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert printed == f"guiderail {guiderail.__version__}\n"

@@ -91,7 +91,7 @@ def test_missing_extra_is_named_with_the_command_that_installs_it(code, software
 
 
 def test_command_without_extras_exits_with_2_and_one_sentence():
-    printed = run_light("from guiderail.tools.cli.entry import main; main()", exit_code=2)
+    printed = run_light("from guiderail.__main__ import main; main()", exit_code=2)
     assert printed == 'guiderail: this needs typer, which is not installed: pip install "guiderail[sim]"\n'
 
 
@@ -103,7 +103,7 @@ def test_train_without_torch_exits_with_2_and_names_the_extra(tmp_path):
                 raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
     sys.meta_path[0] = Torch()
     sys.argv = ["guiderail", "train", "NarrowPassage", "--episodes", "1", "--out", {str(tmp_path / "run")!r}]
-    from guiderail.tools.cli.entry import main
+    from guiderail.__main__ import main
     main()
     """
     printed = run_light(code, exit_code=2)

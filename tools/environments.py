@@ -193,10 +193,7 @@ def _numbers(value: Any) -> Any:
 
 
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
-    """Make the environment of a task. From this call on the process computes with one thread.
-
-    Matrices are small here. If other processes use the cores, several threads that wait for each other take eighty
-    times as long (a movement primitive with a history: 78 s instead of 1 s), and sums depend on the number of threads.
+    """Make the environment of a task. From this call on the process computes with one thread; see `make_env`.
 
     Raises:
         InputError: If the task or an argument is unknown, or options are incompatible.

@@ -82,7 +82,7 @@ class DiagramEnv(DrakeGymEnv):
         task: The `TaskDiagram`.
         action_repeat: Control steps per action.
         trace: `EpisodeTrace` of the current episode.
-        drawn: Values that the task sampled for the current episode, by name.
+        sampled: Values that the task sampled for the current episode, by name.
         observes_privileged: True if `privileged` is updated with each observation; False by default.
         privileged: Privileged observation (m,) that belongs to the last observation, or None.
         privileged_space: Space of the privileged observation; None if the task has no privileged terms.
@@ -153,7 +153,7 @@ class DiagramEnv(DrakeGymEnv):
         self._pose_port = diagram.GetOutputPort("pose")
         sizes = {name: port.size() for name, port in self._recorded}
         self.trace = EpisodeTrace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
-        self.drawn: dict[str, Any] = {}
+        self.sampled: dict[str, Any] = {}
         self._privileged_port = diagram.GetOutputPort("privileged") if diagram.HasOutputPort("privileged") else None
         self.privileged_space = (
             None
@@ -205,9 +205,9 @@ class DiagramEnv(DrakeGymEnv):
         context = self.simulator.get_mutable_context()
         context.SetTimeStateAndParametersFrom(self._pristine)
         self._action_value.GetMutableData().set_value(self._neutral)
-        self.drawn, self._failure = {}, None
+        self.sampled, self._failure = {}, None
         with self._record_failure():
-            self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
+            self.sampled = self.task.randomize(context, self.np_random, dict(options or {}))
             self.simulator.Initialize()
         return self._begin_episode()
 
@@ -226,7 +226,7 @@ class DiagramEnv(DrakeGymEnv):
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
         info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
-        return self._observation, info | self.drawn
+        return self._observation, info | self.sampled
 
     @contextmanager
     def _record_failure(self) -> Iterator[None]:

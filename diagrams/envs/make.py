@@ -85,7 +85,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     """Build the environment `gymnasium.make("guiderail/<Task>-v0", ...)`.
 
     From this call on the process computes with one thread. Matrices are small here; where other processes use the
-    cores, threads that wait for each other take eighty times as long.
+    cores, threads that wait for each other take eighty times as long, and sums depend on the number of threads.
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.

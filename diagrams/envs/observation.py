@@ -70,22 +70,22 @@ class Observation(Diagram):
 
     def __init__(
         self,
-        observed: Sequence[ObservationTerm],
+        terms: Sequence[ObservationTerm],
         sizes: Mapping[str, int],
         duration: float,
         clip: float,
-        of: str = "",
+        task_name: str = "",
         *,
         waits: bool = False,
     ):
         """Construct the diagram.
 
         Args:
-            observed: Terms of the observation, at least one.
+            terms: Terms of the observation, at least one.
             sizes: Sizes of the signals by name.
             duration: Duration of an episode [s].
             clip: Largest absolute value of an entry, positive.
-            of: Name of the task, for error messages.
+            task_name: Name of the task, for error messages.
             waits: True if `CLOCKS` are computed from the input `motion_time` instead of the simulation time.
 
         Raises:
@@ -95,18 +95,17 @@ class Observation(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         sizes = {**sizes, **dict.fromkeys(CLOCKS, 1)}
-        rows = [_rows(one, sizes[one.signal], f" of {of}" if of else "") for one in observed]
+        of_task = f" of {task_name}" if task_name else ""
+        rows = [_rows(one, sizes[one.signal], of_task) for one in terms]
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
-            raise InputError(
-                f"the observation{f' of {of}' if of else ''} is empty: let observation_terms() list a signal"
-            )
-        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
+            raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
+        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in terms]))
         exported: set[str] = set()
         if waits:
             motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
             builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
-        for index, one in enumerate(observed):
+        for index, one in enumerate(terms):
             if one.signal in CLOCKS:
                 clock = _add_clock(builder, one.signal, duration, motion_time if waits else None)
                 builder.Connect(clock, multiplexer.get_input_port(index))

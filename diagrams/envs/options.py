@@ -6,7 +6,16 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic.fields import FieldInfo
 
 from guiderail.models.common.errors import InputError, brief
@@ -40,7 +49,16 @@ def _reject_bool(value: Any) -> Any:
 Integer = Annotated[int, BeforeValidator(_reject_bool)]
 Number = Annotated[float, BeforeValidator(_reject_bool)]
 Integers = Annotated[tuple[Integer, ...], BeforeValidator(_split_list)]
+
+
+def _check_positive(values: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(value > 0.0 for value in values):
+        raise ValueError("give positive numbers")
+    return values
+
+
 Numbers = Annotated[tuple[Number, ...], BeforeValidator(_split_list)]
+PositiveNumbers = Annotated[Numbers, AfterValidator(_check_positive)]
 
 
 class CommonOptions(Options):
@@ -84,12 +102,12 @@ class PrimitiveOptions(Options):
     via_points: Numbers = Field(
         (), description="points of the mean: a control step and an output each, one after another"
     )
-    max_speed: Numbers = Field(
+    max_speed: PositiveNumbers = Field(
         (),
         description="largest speed of the command: one number for the position's axes [m/s], two with that of the "
         "angles [rad/s], or one for each output",
     )
-    max_acceleration: Numbers = Field((), description="largest acceleration of the command, like max_speed")
+    max_acceleration: PositiveNumbers = Field((), description="largest acceleration of the command, like max_speed")
     joint_margin: Number | None = Field(
         None,
         ge=0,
@@ -103,7 +121,7 @@ class PrimitiveOptions(Options):
     progress: Literal["clock", "state"] = Field(
         "clock", description="clock: the motion advances with time; state: it waits for a robot that does not follow"
     )
-    progress_tolerance: Numbers = Field(
+    progress_tolerance: PositiveNumbers = Field(
         (0.0025, 0.1),
         min_length=2,
         max_length=2,
@@ -111,13 +129,6 @@ class PrimitiveOptions(Options):
     )
     max_lag: Number = Field(3.0, ge=0, le=60, description="largest time for which the motion waits in total [s]")
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
-
-    @field_validator("max_speed", "max_acceleration", "progress_tolerance")
-    @classmethod
-    def _check_positive(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        if not all(value > 0.0 for value in values):
-            raise ValueError("give positive numbers")
-        return values
 
     @field_validator("kernel_parameters")
     @classmethod

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
+from guiderail.diagrams.envs.options import Integer, Number, Options, PositiveNumbers
 from guiderail.models.policy import BASE_POLICIES, find_base_policy
 
 
@@ -42,17 +42,10 @@ class GuardOptions(BasePolicyOptions):
         description="filter of the chunks to the bounds, max_speed and max_jerk: the nearest chunk, a slower one on "
         "the same path, or none",
     )
-    max_jerk: Numbers = Field(
+    max_jerk: PositiveNumbers = Field(
         (),
         description="largest jerk of a guarded command, like max_speed; default of both: twice the demonstrations'",
     )
-
-    @field_validator("max_jerk")
-    @classmethod
-    def _check_positive(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        if not all(value > 0.0 for value in values):
-            raise ValueError("give positive numbers")
-        return values
 
 
 class BarrierOptions(Options):

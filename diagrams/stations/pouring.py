@@ -190,8 +190,8 @@ class PouringStation(Station):
         builder.AddNamedSystem("pose", measured)
         links = [plant.get_body(index) for index in plant.GetBodyIndices(self.arm)]
         period = config.plant_period
-        watch = ContactDetector(plant, [*links, thermos], [plant.world_body(), self._mug], period)
-        builder.AddNamedSystem("contact_watch", watch)
+        contact_detector = ContactDetector(plant, [*links, thermos], [plant.world_body(), self._mug], period)
+        builder.AddNamedSystem("contact_detector", contact_detector)
         axes = config.X_WT.rotation()
         sensor = WrenchSensor(plant, wrist, [thermos], self._tip, axes, config.control_period, WRENCH_TIME_CONSTANT)
         builder.AddNamedSystem("wrench_sensor", sensor)
@@ -207,14 +207,14 @@ class PouringStation(Station):
         builder.Connect(controller.get_joint_positions_output_port(), drives.get_input_port())
         builder.Connect(drives.get_output_port(), plant.get_desired_state_input_port(self.arm))
         builder.Connect(plant.get_body_poses_output_port(), measured.get_body_poses_input_port())
-        builder.Connect(plant.get_contact_results_output_port(), watch.get_contact_results_input_port())
+        builder.Connect(plant.get_contact_results_output_port(), contact_detector.get_contact_results_input_port())
         export_station_ports(
             builder,
             controller.get_desired_pose_input_port(),
             controller.get_command_time_input_port(),
             pose=measured.get_pose_output_port(),
             wrench=sensor.get_wrench_output_port(),
-            contact_force=watch.get_contact_force_output_port(),
+            contact_force=contact_detector.get_contact_force_output_port(),
             saturation=controller.get_stuck_output_port(),
             command_timed_out=controller.get_command_timed_out_output_port(),
         )
@@ -222,8 +222,8 @@ class PouringStation(Station):
             builder.AddNamedSystem(name, system)
             builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
-        builder.ExportOutput(watch.get_collision_output_port(), "collision")
-        builder.ExportOutput(watch.get_has_collided_output_port(), "touched")
+        builder.ExportOutput(contact_detector.get_collision_output_port(), "collision")
+        builder.ExportOutput(contact_detector.get_has_collided_output_port(), "touched")
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
 

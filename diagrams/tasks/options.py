@@ -43,8 +43,8 @@ class PriorOptions(Options):
 
     prior_std: Numbers | None = Field(
         None,
-        description="standard deviation of a single demonstration, x y z Rz Ry Rx [m], [rad], added to its own; or "
-        "rows of a phase from 0 to 1 and these six; required for one demonstration",
+        description="standard deviation x y z Rz Ry Rx [m], [rad] around a single demonstration, whose square is added "
+        "to its fitted variance; or rows of a phase from 0 to 1 and these six; required for one demonstration",
         examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
     )
 

@@ -62,9 +62,9 @@ class Case:
     Attributes:
         name: Name in the table.
         environment: Options of the environment.
-        constrained: Whether every command must satisfy the constraints.
+        constrained: True if every command must satisfy the constraints.
         options: Options of every reset.
-        may_wait: Whether a fallback is allowed, because it means waiting or stopping before a wall.
+        may_wait: True if a fallback is allowed, because it means waiting or stopping before a wall.
         limits: Limits of columns; those of the campaign by default.
     """
 

@@ -58,7 +58,7 @@ class RecomputedViolation(EnvCallback):
         if self._frames is None or "template" not in task.provides():
             return np.full(len(poses), -np.inf)
         placed = task.template()
-        frames = {**placed.frames, **self._frames(self.base.drawn)}
+        frames = {**placed.frames, **self._frames(self.base.sampled)}
         states = self.base.trace.signals["state"][:, 0].astype(int)
         return np.array(
             [

@@ -71,7 +71,7 @@ def measure(
 def _train(
     task: str, options: Mapping[str, Any], episodes: int, seed: int, pipelined: str, out: Path, imports: Sequence[str]
 ) -> float:
-    command = [sys.executable, "-c", "from guiderail.tools.cli.main import main; main()", "train", task, "--json"]
+    command = [sys.executable, "-m", "guiderail", "train", task, "--json"]
     command += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"pipelined={pipelined}", "--out", str(out)]
     for name, value in options.items():
         command += ["--env", f"{name}={value}"]

@@ -33,7 +33,7 @@ def figure_study(
         seeds: Number of seeds, from the study's first.
         episodes: Episodes of each run; the study's own number by default.
         methods: Methods; those of the study by default. A method that it lacks is guidance of that name.
-        evaluate: Whether its policies are evaluated.
+        evaluate: True to evaluate its policies.
         changes: Other fields of the study.
     """
     study = load_study(study_path(name))

@@ -27,7 +27,7 @@ class Part:
         extra: Discrete output, as in `Segment`.
         dwell: Control steps for which the last point is then held.
         source: Name of the part whose recording is used, if not its own.
-        is_reversed: Whether that recording is run backwards.
+        is_reversed: True to run that recording backwards.
         lower: Lower limits (O,) of the commands in the frame, where they are narrower than the demonstrated ones.
         until: (env, observation) → true to end the segment early.
     """

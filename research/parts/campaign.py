@@ -20,7 +20,7 @@ from guiderail.models.parts.assembly_check import MAX_SHRINK, OverlapError
 from guiderail.tools.parts.create_task import create_task
 from research.parts.pairs import Pair
 
-COMMAND = (sys.executable, "-c", "from guiderail.tools.cli.main import main; main()")
+COMMAND = (sys.executable, "-m", "guiderail")
 
 
 class StepError(Exception):

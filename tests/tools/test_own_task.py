@@ -18,7 +18,7 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
-from guiderail.tools.cli.catalog import describe_task_options
+from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules

@@ -44,7 +44,7 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
 
     Args:
         result: Values by name.
-        as_json: Whether one JSON object is printed instead.
+        as_json: True to print one JSON object.
         space: Replacement of an underscore in a name.
     """
     if as_json:
@@ -177,7 +177,7 @@ def _completion(choices: str | None) -> Callable[[str], list[str]] | None:
 
 Json = Annotated[bool, option("Print one JSON object.", "--json")]
 Run = Annotated[Path, argument("Folder of a run of guiderail train.", "RUN")]
-Shown = Annotated[
+Subject = Annotated[
     str,
     argument(
         "Folder of a run, or pretrained:NAME ({pretrained}); a policy of any origin, with --task; or a task, with "
@@ -364,8 +364,8 @@ def hardware_arguments(
 
     Args:
         environment: Options of the environment; `robot_url`, `robot` and `driver` are taken from it.
-        sim: Whether a simulated driver is used.
-        synchronous: Whether it runs in lockstep.
+        sim: True for a simulated driver.
+        synchronous: True if it runs in lockstep.
         rate: Speed of its clock; None for the default.
     """
     given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}

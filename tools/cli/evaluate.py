@@ -15,7 +15,7 @@ QUICK = 20  # episodes of a quick evaluation
 
 @cli.command("evaluate runs/passage --episodes 100 --json")
 def evaluate(
-    subject: cli.Shown,
+    subject: cli.Subject,
     episodes: Annotated[int | None, option("Number of held-out episodes.  [default: 100]")] = None,
     quick: Annotated[
         bool, option(f"Evaluate {QUICK} episodes: a fifth of the default, with a wider interval.", "--quick")

@@ -21,7 +21,7 @@ COMMANDS = {
     "study": ("study",),
     "hardware": ("deploy", "teleoperate", "sim-driver", "safety-monitor"),
     "dataset": ("dataset", "template", "create-task"),
-    "listing": ("list",),
+    "list": ("list",),
 }
 """Names of the commands that each module of this package registers."""
 

@@ -12,7 +12,7 @@ from guiderail.tools.cli.app import argument, option, to_json
 
 @cli.command("visualize runs/passage --html replay.html")
 def visualize(
-    subject: cli.Shown,
+    subject: cli.Subject,
     html: Annotated[
         Path | None,
         option("Page to write, .html.  [default: replay.html in the run, or none with --image or --video]"),

@@ -152,7 +152,7 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
     Args:
         file: File of demonstrations, or a folder of files.
         draw: Picture to write, with the mean, two standard deviations and the range.
-        fit: Whether a primitive is fitted to them, which takes seconds.
+        fit: True to fit a primitive to them, which takes seconds.
 
     Raises:
         InputError: If the demonstrations are invalid, or cannot be drawn or fitted.
@@ -269,7 +269,7 @@ def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
     Raises:
         InputError: If the template cannot be used.
     """
-    from guiderail.models.templates import load_template  # imports Drake, which demonstrations do not need
+    from guiderail.models.templates import load_template
     from guiderail.models.templates.drawing import draw as draw_template
     from guiderail.models.templates.schema import shipped_templates
     from guiderail.models.templates.validate import validate

@@ -65,7 +65,7 @@ def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets
     Args:
         task: Name of the task.
         environment: Options of its environment.
-        resample_offsets: Whether the hidden offset of the run is sampled again in every episode.
+        resample_offsets: True to sample the hidden offset of the run again in every episode.
 
     Raises:
         InputError: If `resample_offsets` is True and a run of the task has no hidden offset.
@@ -110,7 +110,7 @@ class Subject:
             environment is given as an object.
         make_policy: Function from an environment to the policy.
         folder: Folder of its run, or None.
-        is_stored: Whether evaluated episodes are stored in the run's folder.
+        is_stored: True if evaluated episodes are stored in the run's folder.
         digest: Digest of the policy, for the names of stored files; None for a baseline policy.
     """
 

@@ -166,11 +166,11 @@ class RobotEnv(DiagramEnv):
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
         self._return_to_start()
-        drawn = {} if self._randomize_parts is None else self._randomize_parts(self.np_random, options or {})
+        sampled = {} if self._randomize_parts is None else self._randomize_parts(self.np_random, options or {})
         simulator = Simulator(self.task.diagram)
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
         self._switch_station(simulator, self._task_station)
-        self.fault, self.drawn, self._failure = Fault.NONE, drawn, None
+        self.fault, self.sampled, self._failure = Fault.NONE, sampled, None
         return self._begin_episode()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

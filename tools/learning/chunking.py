@@ -1,7 +1,6 @@
 """Chunk cloning: an ensemble that is regressed on the commanded poses that follow an observation (ACT's objective)."""
 
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -12,7 +11,7 @@ from scipy.linalg import block_diag
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.cloning import BcLearner
+from guiderail.tools.learning.cloning import BcLearner, perceptron
 from guiderail.tools.learning.config import ChunkConfig
 
 MIN_SCALE = 1e-6  # smallest scale of an output; the spread of a constant output is zero
@@ -99,7 +98,7 @@ class ChunkLearner(BcLearner):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
             sizes = [observations.shape[1], *self.config.net_arch, chunks.shape[1]]
-            members = [_perceptron(sizes) for _ in range(self.config.members)]
+            members = [perceptron(sizes) for _ in range(self.config.members)]
         losses = []
         for index, network in enumerate(members):
             random = np.random.default_rng([self._seed, index])
@@ -178,9 +177,3 @@ class ChunkLearner(BcLearner):
         self.episodes, self._num_outputs = values["episodes"], values["num_outputs"]
         if self.episodes >= self.config.demonstration_episodes:
             self._train()
-
-
-def _perceptron(sizes: list[int]) -> torch.nn.Sequential:
-    """Return linear layers with rectifiers between them."""
-    layers = [layer for into, out in pairwise(sizes) for layer in (torch.nn.Linear(into, out), torch.nn.ReLU())]
-    return torch.nn.Sequential(*layers[:-1])

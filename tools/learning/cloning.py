@@ -46,9 +46,7 @@ class BcLearner(Learner):
         sizes = [*(env.observation_space.shape or ()), *config.net_arch, *(env.action_space.shape or ())]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            linear = [torch.nn.Linear(into, out) for into, out in pairwise(sizes)]
-        layers = [layer for pair in zip(linear, [torch.nn.ReLU() for _ in linear], strict=True) for layer in pair]
-        self.network = torch.nn.Sequential(*layers[:-1])
+            self.network = perceptron(sizes)
         self.episodes = 0
         self._observations: list[np.ndarray] = []
         self._actions: list[np.ndarray] = []
@@ -96,8 +94,9 @@ class BcLearner(Learner):
         self._loss = float(loss.detach())
 
     def metrics(self) -> Mapping[str, float]:
-        """Return the loss of the last batch."""
-        return {"train/loss": self._loss} if np.isfinite(self._loss) else {}
+        """Return the loss of the last batch, once after training."""
+        loss, self._loss = self._loss, np.nan
+        return {"train/loss": loss} if np.isfinite(loss) else {}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """Return the cloned policy; `description` holds further entries of the policy's description."""
@@ -121,3 +120,9 @@ class BcLearner(Learner):
         self._observations = [*arrays.get("observations", ())]
         self._actions = [*arrays.get("actions", ())]
         self.episodes = values["episodes"]
+
+
+def perceptron(sizes: list[int]) -> torch.nn.Sequential:
+    """Return linear layers with rectifiers between them."""
+    layers = [layer for into, out in pairwise(sizes) for layer in (torch.nn.Linear(into, out), torch.nn.ReLU())]
+    return torch.nn.Sequential(*layers[:-1])

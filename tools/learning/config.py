@@ -228,7 +228,8 @@ _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_c
 # The measurements behind each preset are in docs/experiments.md.
 PRESETS = {
     # Contact makes learning oscillate. Small batches, a moderate learning rate and normalized layers reduce that,
-    # greedy episodes tell the critic the value of the mean action, and checkpoint selection takes an actor that lasts.
+    # greedy episodes show the critics the returns of the mean action, and checkpoint selection takes an actor whose
+    # greedy episodes succeed many times in a row.
     "tqc_contact": OffPolicyConfig(
         learning_rate=3e-4,
         train_freq=4,
@@ -352,10 +353,12 @@ def check_choices(
             registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
-    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)}
+    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)} - {
+        "algorithm"
+    }
     for name in settings:
-        if name not in known - {"algorithm"}:
-            raise InputError(f"no learner has a setting {brief(name)}: {did_you_mean(name, known - {'algorithm'})}")
+        if name not in known:
+            raise InputError(f"no learner has a setting {brief(name)}: {did_you_mean(name, known)}")
     check_episodes(1 if episodes is None else episodes)
     check_seed(0 if seed is None else seed)
 

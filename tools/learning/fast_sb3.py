@@ -237,7 +237,7 @@ class FastTrainingStep(_Algorithm):
     A subclass implements `_target_value`, `_critic_gradient`, `_value_gradient` and `_critic_loss`.
 
     Attributes:
-        records_metrics: Whether losses, values and the entropy coefficient go into the algorithm's logger.
+        records_metrics: True to record losses, values and the entropy coefficient in the algorithm's logger.
     """
 
     ent_coef: Any

@@ -141,7 +141,7 @@ class ViaPointCorrections:
 
         Args:
             offsets: Offsets (A,) by control step, in units of a full action.
-            is_held: Whether a correction lasted when the episode ended; it then applies to the rest of the motion.
+            is_held: True if a correction lasted until the episode's end; it then applies to the rest of the motion.
         """
         if not offsets:
             return self.points

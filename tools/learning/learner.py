@@ -62,7 +62,7 @@ class LearnerConfig:
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
-        takes_images: Whether the learner's networks take observations with images.
+        takes_images: True if the learner's networks take observations with images.
     """
 
     takes_images: ClassVar[bool] = True
@@ -84,7 +84,7 @@ class Learner(Callback, ABC):
 
     Attributes:
         Config: Configuration class, a pydantic dataclass derived from `LearnerConfig`.
-        records_metrics: Whether `metrics` will be read; set by the training loop.
+        records_metrics: True if `metrics` will be read; set by the training loop.
     """
 
     Config: ClassVar[type[LearnerConfig]] = LearnerConfig
@@ -219,7 +219,7 @@ def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
 
 
 class LearningLog:
-    """Learning log of a run in formats of Stable-Baselines3's logger, with one entry per episode.
+    """Learning log of a run in formats of Stable-Baselines3's logger, with an entry per episode.
 
     An entry has columns of the episode's row and the learner's metrics; its step is the number of control steps so far.
     Nothing is written if no format is given.
@@ -230,11 +230,27 @@ class LearningLog:
         self._folder, self._formats = folder, check_log_formats(formats)
         self._logger: Any = None
 
-    def record(self, rows: Sequence[Mapping[str, Any]], metrics: Callable[[], Mapping[str, float]]) -> None:
-        """Write the entry of the last of `rows`, one row per episode; `metrics` returns the learner's metrics."""
+    def record(
+        self,
+        rows: Sequence[Mapping[str, Any]],
+        metrics: Callable[[], Mapping[str, float]],
+        *,
+        is_finished: bool = False,
+    ) -> None:
+        """Write the entry of the last of `rows`, one row per episode.
+
+        Args:
+            rows: Rows of the episodes so far.
+            metrics: Returns the learner's metrics.
+            is_finished: True after the learner's `finish`: the entry has only metrics that were recorded since.
+        """
         if not self._formats:
             return
         row = rows[-1]
+        entry = {} if is_finished else {name: row[column] for column, name in LOGGED_COLUMNS.items() if column in row}
+        entry |= metrics()
+        if not entry:
+            return
         if self._logger is None:
             from stable_baselines3.common.logger import Logger, make_output_format  # imports PyTorch: slow
 
@@ -247,10 +263,7 @@ class LearningLog:
                 for name in self._formats
             ]
             self._logger = Logger(str(self._folder), outputs)
-        for column, name in LOGGED_COLUMNS.items():
-            if column in row:
-                self._logger.record(name, row[column])
-        for name, value in metrics().items():
+        for name, value in entry.items():
             self._logger.record(name, value)
         self._logger.dump(sum(int(one["steps"]) for one in rows))
 

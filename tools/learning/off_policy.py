@@ -325,7 +325,7 @@ class OffPolicyLearner(Learner):
         """Return the network whose mean is the greedy action: the averaged actor if there is one."""
         return self.model.actor if self.averaged is None else self.averaged
 
-    def result(self) -> Any:
+    def selected_actor(self) -> Any:
         """Return the actor to export: the selected one, or the last one if none is selected."""
         weights = None if self.selection is None else self.selection.result()
         if weights is None:
@@ -335,8 +335,8 @@ class OffPolicyLearner(Learner):
         return selected
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of `result`; `description` holds further entries of its description."""
-        return export_policy(self.result(), description)
+        """Return the policy of `selected_actor`; `description` holds further entries of its description."""
+        return export_policy(self.selected_actor(), description)
 
     def has_diverged(self) -> bool:
         """Return True if a parameter of the actor is NaN or infinite."""

@@ -225,6 +225,7 @@ def _train(
         if is_last:
             break
     learner.finish()
+    learning_log.record(rows, learner.metrics, is_finished=True)
     policy = learner.policy({"task": config.task, **described_observation(env)})
     policy.save(folder.path, write=write_atomically)
     return rows

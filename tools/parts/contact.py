@@ -131,21 +131,21 @@ def choose_contact(
         reasons.append(reason)
         log(reason)
 
-    seconds, start = 0.0, _cpu_time()
+    seconds, start = 0.0, cpu_time()
     for kind in KINDS:
         for name, pieces in make_compliant(kind, usable, tolerance, report):
             number = len(surfaces[name].bodies)
             snapped = frozenset(range(number - snapping, number)) if name == "plug" else frozenset()
             contact = Contact(name, tuple(pieces), snapped)
             refusal = _refusal_of_drake(folder, contact, surfaces, make_file)
-            seconds += _cpu_time() - start
+            seconds += cpu_time() - start
             if refusal:
                 report(f"{name}: Drake refuses its contact geometry ({refusal})")
             else:
                 choices += _adapt_settings(folder, contact, surfaces, make_file, allowed, log)
                 if all(rank(max(choices, key=lambda one: rank(one, allowed)), allowed)[:3]):
                     break
-            start = _cpu_time()
+            start = cpu_time()
         if any(choice.aligned.success for choice in choices):
             break
     if not choices:
@@ -205,7 +205,7 @@ def _adapt_settings(
     overshoot proportional to the time step. The dissipation is that of `Piece`, because less would eject the plug.
     """
     choices: list[Choice] = []
-    start = _cpu_time()
+    start = cpu_time()
     for _ in range(MAX_TRIALS):
         choice = _try_contact(folder, contact, surfaces, make_file)
         choices.append(choice)
@@ -226,12 +226,12 @@ def _adapt_settings(
             contact = replace(contact, time_step=0.5 * step)
         else:
             break
-        if _cpu_time() - start > TRIAL_SECONDS:
+        if cpu_time() - start > TRIAL_SECONDS:
             break
     return choices
 
 
-def _cpu_time() -> float:
+def cpu_time() -> float:
     """Return the CPU time of this process and of its finished children [s]."""
     return sum(os.times()[:4])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -29,7 +28,7 @@ from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, 
 from guiderail.models.parts.preparation import ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.files import atomic_folder, check_new
-from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact
+from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact, cpu_time
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.part.file import PartTaskFile, SearchNumbers
@@ -206,11 +205,11 @@ class Stopwatch:
     """CPU time since the construction, including finished child processes."""
 
     def __init__(self) -> None:
-        self._start = sum(os.times()[:4])
+        self._start = cpu_time()
 
     def read(self) -> float:
         """Return the CPU time so far [s]."""
-        return round(sum(os.times()[:4]) - self._start, 2)
+        return round(cpu_time() - self._start, 2)
 
 
 def _describe_surfaces(

@@ -50,7 +50,7 @@ class Trial:
     """Result of a scripted insertion.
 
     Attributes:
-        success: Whether the plug reached the target.
+        success: True if the plug reached the target.
         pose: Final pose of the plug in the socket, position and rotation vector (6,) [m, rad].
         lowest: Smallest height of the plug above the target [m].
         peak_force: Largest contact force [N].
@@ -150,7 +150,7 @@ def insert(
         offset: Offset (x, y) of the socket [m].
         motion: Times (N,) [s] and poses (N, 6); a straight insertion by default.
         snapping: Names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
-        measure_depth: Whether penetration is measured, which takes longer than the simulation.
+        measure_depth: True to measure the penetration, which takes longer than the simulation.
     """
     numbers = file.motion
     times, poses = (

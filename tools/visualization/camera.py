@@ -47,15 +47,15 @@ class Frames(EnvCallback):
         self.frames: list[Any] = [(0.0, 0.0, self.env.render())]
         self._stride, self._actions = 1, 0
 
-    def on_step(self, decision: Transition) -> None:
+    def on_step(self, transition: Transition) -> None:
         """Render a frame if it is due; when `max_frames` are stored, drop every second one and double the interval."""
         self._actions += 1
-        if not decision.is_last and self._actions % self._stride:
+        if not transition.is_last and self._actions % self._stride:
             return
         if len(self.frames) == self._max_frames:
             self.frames, self._stride = self.frames[::2], 2 * self._stride
         time = len(self.base.trace) * self.base.task.control_period
-        self.frames.append((time, decision.info["contact_force"], self.env.render()))
+        self.frames.append((time, transition.info["contact_force"], self.env.render()))
 
     def select(self, number: int) -> list[Any]:
         """Return `number` evenly spaced frames, from the first to the last."""

@@ -19,8 +19,8 @@ def draw_passage(axis: Axes, demonstrations: bool = True, *, named: bool = False
 
     Args:
         axis: Axes.
-        demonstrations: Whether the demonstrations are drawn.
-        named: Whether the items have labels for a legend.
+        demonstrations: True to draw the demonstrations.
+        named: True to label the items for a legend.
     """
     passage = PassageGeometry()
     zone, obstacle, goal, path_label = ("forbidden zone", "obstacle", "goal", "demonstration") if named else 4 * ("",)

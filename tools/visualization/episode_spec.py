@@ -55,7 +55,7 @@ class EpisodeSpec:
             environment: Options of the environment that differ from the run's, or from the task's defaults.
             seed: Seed of the episode.
             task: Task of a policy without a run.
-            trust_policy: Whether to read a policy file that can execute code.
+            trust_policy: True to read a policy file that can execute code.
 
         Raises:
             InputError: If there is no such policy, or `environment` has another guidance than its run.

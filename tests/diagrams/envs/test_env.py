@@ -358,7 +358,7 @@ def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
 def test_info_keys_are_listed():
     env = make(num_steps=2)
     _, info = env.reset()
-    said = set(info) - set(env.drawn)
+    said = set(info) - set(env.sampled)
     said |= set(env.step([0.0])[4])
     env.toy.error = RuntimeError(SOLVER_FAILURE)
     said |= set(env.step([0.0])[4])

@@ -21,7 +21,7 @@ CASES = [
 def episode(env, seed):
     """Return the results of a dozen random actions, to the last bit."""
     observation, info = env.reset(seed=seed)
-    seen, rng = [observation.tobytes(), repr(env.drawn)], np.random.default_rng(seed)
+    seen, rng = [observation.tobytes(), repr(env.sampled)], np.random.default_rng(seed)
     for _ in range(12):
         observation, reward, terminated, truncated, info = env.step(rng.uniform(-1, 1, env.action_space.shape))
         seen += [observation.tobytes(), reward, repr(info)]

@@ -166,7 +166,7 @@ def test_all_policies_get_the_same_resampled_offsets(bead_config, tmp_path, monk
     def watching(name):
         def acts(env):
             def act(_):
-                met[name].append(tuple(env.unwrapped.drawn["jack_offset"]))
+                met[name].append(tuple(env.unwrapped.sampled["jack_offset"]))
                 return np.zeros(env.action_space.shape)
 
             return act

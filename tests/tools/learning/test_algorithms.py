@@ -213,6 +213,7 @@ def test_behavior_cloning_acts_as_the_demonstrator():
     assert np.sqrt(np.mean(np.square(errors))) < 0.1
     np.testing.assert_allclose(learner.act(observation[0]), policy(observation[0]), atol=1e-6)
     assert learner.metrics()["train/loss"] < 0.02
+    assert learner.metrics() == {}
     restored = make(config)
     restored.restore(arrays, values)
     clone(restored, 1, np.random.default_rng(5))

@@ -99,3 +99,14 @@ def test_wandb_is_refused_without_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(InputError, match=r"Weights & Biases.*guiderail\[wandb\]"):
         check_log_formats("wandb")
+
+
+def test_metrics_of_a_training_after_the_last_episode_get_an_entry(tmp_path):
+    log, rows = LearningLog(tmp_path, "csv"), [{"episode": 0, "steps": 10, "return": 1.5}]
+    log.record(rows, dict)
+    log.record(rows, lambda: {"train/loss": 0.5}, is_finished=True)
+    log.record(rows, dict, is_finished=True)
+    log.close()
+    logged = pd.read_csv(tmp_path / "progress.csv")
+    assert len(logged) == 2
+    assert logged["train/loss"].tolist()[1] == 0.5

@@ -280,7 +280,7 @@ def test_result_is_the_selected_actor_also_when_restored(config):
     second = make(first.config, seed=9)
     second.restore({key: value.copy() for key, value in arrays.items()}, values)
     for learner in (first, second):
-        torch.testing.assert_close(learner.result().state_dict()["mu.weight"], greedy[2], rtol=0, atol=0)
+        torch.testing.assert_close(learner.selected_actor().state_dict()["mu.weight"], greedy[2], rtol=0, atol=0)
     assert not torch.equal(greedy[2], first.actor().state_dict()["mu.weight"])
 
 

@@ -29,7 +29,7 @@ def list_(
     if name is None:
         names = {key: list_names() for key, list_names in cli.LISTED.items()}
         if as_json:
-            from guiderail.tools.cli.catalog import describe_all
+            from guiderail.tools.catalog import describe_all
 
             names |= describe_all()
         print_result(names, as_json)
@@ -42,7 +42,7 @@ def list_(
     elif name in cli.LISTED:
         print_result({name: cli.LISTED[name]()}, as_json)
     elif name in cli.LISTED["tasks"]():
-        from guiderail.tools.cli.catalog import describe_task, describe_task_options, is_declared
+        from guiderail.tools.catalog import describe_task, describe_task_options, is_declared
 
         print_result(
             describe_task(name) if as_json and is_declared(name) else describe_task_options(name), as_json, "_"

@@ -1,4 +1,4 @@
-"""Entry point of the installed `guiderail` script, which also starts if optional dependencies are missing."""
+"""Entry point of `guiderail` and `python -m guiderail`, which also starts if optional dependencies are missing."""
 
 import sys
 
@@ -16,3 +16,7 @@ def main() -> None:
         print(f"guiderail: {missing}", file=sys.stderr)
         sys.exit(2)
     command.main()
+
+
+if __name__ == "__main__":
+    main()

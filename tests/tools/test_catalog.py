@@ -2,7 +2,7 @@ from pydantic import Field
 
 from guiderail.diagrams.envs.options import Options
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
-from guiderail.tools.cli.catalog import describe_task_options
+from guiderail.tools.catalog import describe_task_options
 
 
 class Clock(Options):
