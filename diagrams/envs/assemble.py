@@ -25,7 +25,7 @@ from guiderail.diagrams.envs.observation import (
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig, limits_per_output
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
@@ -55,7 +55,7 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
             near ±180°, where the station's pose jumps.
     """
     provides = task.provides()
-    skill = None
+    primitive = None
     constraints = task.constraints() or LinearConstraints.none(station.pose_size)
     if "demonstrations" in provides:
         options = task.config.part("primitive")
@@ -65,7 +65,7 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
             _refuse_half_turns(reference.means)
-        skill = PrimitiveConfig(
+        primitive = PrimitiveConfig(
             reference=reference,
             kernel=kernel,
             constraints=constraints,
@@ -79,7 +79,7 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
         )
     return PriorKnowledge(
         period=station.control_period,
-        demonstrations=skill,
+        demonstrations=primitive,
         template=task.template() if "template" in provides else None,
         approach=task.approach() if "approach" in provides else None,
         options=task.config.part("guidance"),
@@ -118,14 +118,8 @@ def _motion_constraints(task: Task, constraints: LinearConstraints, station: Sta
     if options.get("joint_margin") is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
     for name in _LIMITS:
-        given = options.get(name, ())
-        if not given:
-            continue
-        if len(given) < min(outputs, 3):
-            given = np.append(np.full(min(outputs, 3), given[0]), np.full(max(outputs - 3, 0), (*given, np.inf)[1]))
-        if len(given) != outputs:
-            raise InputError(f"{name} is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(given)}")
-        limits[name] = given
+        if given := options.get(name):
+            limits[name] = limits_per_output(name, given, outputs)
     if motion is None:
         return MotionConstraints(constraints, **limits) if limits else None
     return replace(motion, **limits)
@@ -146,8 +140,8 @@ def _refuse_half_turns(means: np.ndarray) -> None:
     furthest = np.abs(means[:, 3:]).max(initial=0.0)
     if furthest > np.pi - HALF_TURN_MARGIN:
         raise InputError(
-            f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and what this station measures jumps by a full "
-            f"turn at 180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
+            f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and this station's angles jump by a full turn at "
+            f"180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
         )
 
 
@@ -189,7 +183,7 @@ class Signals:
         for name, size in names.items():
             port = self.get(name, user)
             if port.size() != size:
-                raise InputError(f"{user} takes the signal {name!r} as {size} numbers, and it has {port.size()}")
+                raise InputError(f"{user} takes {size} numbers as the signal {name!r}, which has {port.size()}")
             self._builder.Connect(port, system.get_signal_input_port(name))
 
 
@@ -272,7 +266,7 @@ class Loop:
     ) -> tuple[gymnasium.spaces.Box, OutputPort]:
         """Add the diagram `name` of observation terms; return the space and the port of its output."""
         user = f"the {name} of {task.name}"
-        names = [one.signal for one in terms if one.signal not in CLOCKS]
+        names = [term.signal for term in terms if term.signal not in CLOCKS]
         ports = {signal: self.signals.get(signal, user) for signal in names}
         duration = task.num_steps * self.station.control_period
         sizes = {signal: port.size() for signal, port in ports.items()}

@@ -55,7 +55,8 @@ class EnvConfig:
     def resolve(cls, task: str, options: Mapping[str, Any] | None = None) -> EnvConfig:
         """Validate the options of a task's environment and fill in the defaults.
 
-        The same options are resolved once in a process. The `options` of a configuration resolve to an equal one.
+        The same options are resolved once in a process. Resolving the `options` of a configuration gives an equal
+        configuration.
 
         Args:
             task: Name of the task, or path of a task folder.
@@ -134,7 +135,7 @@ _MAX_RESOLVED = 512  # entries before the cache is emptied
 def _cache_key(task: type[Task], options: Mapping[str, Any]) -> Hashable:
     """Return a key that is equal for the same options of the same task; a new one if an option is not comparable.
 
-    The registered names and the working directory belong to it because defaults and relative paths depend on them.
+    It contains the registered names and the working directory, because defaults and relative paths depend on them.
     """
     try:
         values = tuple(sorted((name, freeze(value)) for name, value in options.items()))

@@ -371,8 +371,8 @@ class DiagramEnv(DrakeGymEnv):
         commanded_violation: float,
         measured_violation: float,
         force: float,
-        fallback: float,
-        terms: Any,
+        fallback: bool,
+        terms: Mapping[str, float],
     ) -> dict[str, Any]:
         failure = {} if self._failure is None else {"simulation_failure": self._failure}
         return {
@@ -404,7 +404,7 @@ def check_render_mode(render_mode: str | None) -> None:
         InputError: If `render_mode` is not None, "human" or "rgb_array".
     """
     if render_mode not in (None, "human", "rgb_array"):
-        raise InputError(f"there is no render mode '{render_mode}': use None, 'human' or 'rgb_array'")
+        raise InputError(f"there is no render mode {brief(render_mode)}: use None, 'human' or 'rgb_array'")
 
 
 def _check_view(task: TaskDiagram, render_mode: str | None) -> None:

@@ -81,7 +81,7 @@ class Observation(Diagram):
         """Construct the diagram.
 
         Args:
-            terms: Terms of the observation, at least one.
+            terms: Terms of the observation, at least term.
             sizes: Sizes of the signals by name.
             duration: Duration of an episode [s].
             clip: Largest absolute value of an entry, positive.
@@ -96,26 +96,26 @@ class Observation(Diagram):
         builder = DiagramBuilder()
         sizes = {**sizes, **dict.fromkeys(CLOCKS, 1)}
         of_task = f" of {task_name}" if task_name else ""
-        rows = [_rows(one, sizes[one.signal], of_task) for one in terms]
+        rows = [_rows(term, sizes[term.signal], of_task) for term in terms]
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
             raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
-        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in terms]))
+        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[term.signal] for term in terms]))
         exported: set[str] = set()
         if waits:
             motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
             builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
-        for index, one in enumerate(terms):
-            if one.signal in CLOCKS:
-                clock = _add_clock(builder, one.signal, duration, motion_time if waits else None)
+        for index, term in enumerate(terms):
+            if term.signal in CLOCKS:
+                clock = _add_clock(builder, term.signal, duration, motion_time if waits else None)
                 builder.Connect(clock, multiplexer.get_input_port(index))
                 continue
-            if one.signal not in exported:
-                exported.add(one.signal)
-                signal = builder.AddNamedSystem(one.signal, PassThrough(sizes[one.signal]))
-                builder.ExportInput(signal.get_input_port(), one.signal)
+            if term.signal not in exported:
+                exported.add(term.signal)
+                signal = builder.AddNamedSystem(term.signal, PassThrough(sizes[term.signal]))
+                builder.ExportInput(signal.get_input_port(), term.signal)
             builder.Connect(
-                builder.GetSubsystemByName(one.signal).get_output_port(0), multiplexer.get_input_port(index)
+                builder.GetSubsystemByName(term.signal).get_output_port(0), multiplexer.get_input_port(index)
             )
         scale = np.concatenate([scale for _, _, scale in rows])
         center = np.concatenate([center for _, center, _ in rows])
@@ -160,37 +160,37 @@ def _add_clock(
     return builder.AddNamedSystem(name, clock).get_output_port()
 
 
-def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
     try:
-        selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
+        selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
         if selection.ndim != 2:
             raise ValueError
     except (IndexError, TypeError, ValueError):
         raise InputError(
-            f"the entries of the observed signal {one.signal!r}{of} are whole numbers from 0 to {size - 1}, "
-            f"not {brief(one.entries)}"
+            f"the entries of the observed signal {term.signal!r}{of_task} are whole numbers from 0 to {size - 1}, "
+            f"not {brief(term.entries)}"
         ) from None
-    center, scale = (_numbers(one, name, len(selection), of) for name in ("center", "scale"))
+    center, scale = (_numbers(term, name, len(selection), of_task) for name in ("center", "scale"))
     with np.errstate(all="ignore"):
         is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(center / scale).all()
     if not is_usable:
         raise InputError(
-            f"the scale of the observed signal {one.signal!r}{of} divides it, so it cannot be {brief(one.scale)}"
+            f"the scale of the observed signal {term.signal!r}{of_task} divides it, so it cannot be {brief(term.scale)}"
         )
     return selection, center, scale
 
 
-def _numbers(one: ObservationTerm, name: str, number: int, of: str) -> np.ndarray:
+def _numbers(term: ObservationTerm, name: str, number: int, of_task: str) -> np.ndarray:
     """Return the center or the scale of each entry, (n,)."""
-    given = getattr(one, name)
+    given = getattr(term, name)
     try:
         numbers = np.broadcast_to(given, number).astype(float)
         if not np.isfinite(numbers).all():
             raise ValueError
     except (TypeError, ValueError):
         raise InputError(
-            f"the {name} of the observed signal {one.signal!r}{of} is a finite number, or {number} of them, "
+            f"the {name} of the observed signal {term.signal!r}{of_task} is a finite number, or {number} of them, "
             f"not {brief(given)}"
         ) from None
     return numbers

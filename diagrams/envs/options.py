@@ -104,8 +104,8 @@ class PrimitiveOptions(Options):
     )
     max_speed: PositiveNumbers = Field(
         (),
-        description="largest speed of the command: one number for the position's axes [m/s], two with that of the "
-        "angles [rad/s], or one for each output",
+        description="largest speed of the command: one number for positions [m/s], a second one for angles [rad/s], or "
+        "one for each output",
     )
     max_acceleration: PositiveNumbers = Field((), description="largest acceleration of the command, like max_speed")
     joint_margin: Number | None = Field(
@@ -125,7 +125,7 @@ class PrimitiveOptions(Options):
         (0.0025, 0.1),
         min_length=2,
         max_length=2,
-        description="distance of the robot from its command [m] and of its angles [rad] at which the motion waits",
+        description="deviation of position [m] and angles [rad] from the command beyond which the motion waits",
     )
     max_lag: Number = Field(3.0, ge=0, le=60, description="largest time for which the motion waits in total [s]")
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")

@@ -39,7 +39,7 @@ class DrivenStation:
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
         builder.AddNamedSystem("source", source)
-        hold = builder.AddNamedSystem("action_repeat", ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE))
+        hold = builder.AddNamedSystem("hold", ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE))
         self.recorder = builder.AddNamedSystem("recorder", Recorder(SIGNALS, num_samples, CONTROL_PERIOD))
         builder.Connect(source.get_output_port(0), hold.get_input_port())
         builder.Connect(hold.get_output_port(), station.get_desired_pose_input_port())

@@ -57,7 +57,7 @@ class Symmetry:
             ):
                 raise ValueError("each matrix of a symmetry is a signed permutation")
 
-    def padded(self, count: int) -> Symmetry:
+    def pad(self, count: int) -> Symmetry:
         """Return the symmetry for an observation with `count` further entries at its end, which it leaves unchanged."""
         if count == 0:
             return self
@@ -105,7 +105,7 @@ class TaskDiagram:
 
     Attributes:
         diagram: Root diagram.
-        control_period: Control period [s]; an integer multiple of the plant's `round_period`.
+        control_period: Control period [s]; an integer multiple of the plant's time step.
         num_steps: Control steps after which an episode is truncated.
         observation_space: Space of observations, in the dtype that the environment returns.
         reward_terms: Names of the reward terms, which are ports of the diagram and keys of `info`.
@@ -144,7 +144,7 @@ class TaskDiagram:
         if not self.diagram.HasInputPort("action"):
             missing.append("action")
         if missing:
-            raise ValueError(f"the task's diagram '{self.diagram.get_name()}' exports no port {', '.join(missing)}")
+            raise ValueError(f"the task's diagram {self.diagram.get_name()!r} exports no port {', '.join(missing)}")
         if self.num_steps < 1 or not self.control_period > 0:
             raise ValueError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
         for symmetry in (self.symmetry, self.near_symmetry):

@@ -11,7 +11,7 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from guiderail.diagrams.guidance.options import BasePolicyOptions, GuardOptions
 from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig, limits_per_output
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
@@ -33,28 +33,28 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
             O; () for the default.
 
     Raises:
-        InputError: If there are other constraints of the motion, or `max_jerk` has another number of entries.
+        InputError: If the motion has constraints other than linear bounds and speed limits, or `max_jerk` has another
+            number of entries.
     """
     outputs, motion, period = config.num_outputs, config.motion, config.control_period
-    positions = min(outputs, 3)
     if motion is not None and (
         motion.outside or motion.inside or motion.state or np.isfinite(np.asarray(motion.max_acceleration)).any()
     ):
-        raise InputError("a guard limits speed and jerk inside linear bounds: leave max_acceleration and joints out")
+        raise InputError(
+            "a guard limits only speed and jerk, within linear bounds: leave max_acceleration, "
+            "joint_margin and shapes out"
+        )
     limits = []
     for order in (1, 3):
         steps = np.abs(np.diff(config.reference.means, n=order, axis=0)).max(axis=0) / period**order
-        groups = (steps[:positions], steps[positions:])
+        groups = (steps[:3], steps[3:])
         limits.append(LIMIT_FACTOR * np.concatenate([np.full(len(one), one.max(initial=0.0)) for one in groups]))
     velocity, jerk = limits
     if motion is not None:
         speed = np.asarray(motion.max_speed, dtype=float)
         velocity = np.where(np.isfinite(speed), speed, velocity)
     if max_jerk:
-        if len(max_jerk) not in (1, 2, outputs):
-            raise InputError(f"max_jerk is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(max_jerk)}")
-        angles = np.full(outputs - positions, (*max_jerk, np.inf)[1])
-        given = max_jerk if len(max_jerk) == outputs else np.append(np.full(positions, max_jerk[0]), angles)
+        given = limits_per_output("max_jerk", max_jerk, outputs)
         jerk = np.where(np.isfinite(given), given, jerk)
     return velocity, jerk
 

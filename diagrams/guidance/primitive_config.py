@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,6 +20,21 @@ if TYPE_CHECKING:
     from guiderail.models.primitives.progress import StateProgress
 
 HISTORY_SOURCES = ("commanded", "measured")
+
+
+def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.ndarray:
+    """Return limits (O,), given O of them, or one for all positions and a second one for all angles.
+
+    Angles have no limit (infinity) if only that of the positions is given.
+
+    Raises:
+        InputError: If there are more than two limits, and not O; `name` is their name in the message.
+    """
+    if len(limits) == outputs:
+        return np.array(limits)
+    if len(limits) > 2:
+        raise InputError(f"{name} is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(limits)}")
+    return np.where(np.arange(outputs) < 3, limits[0], (*limits, np.inf)[1])
 
 
 @dataclass(frozen=True)

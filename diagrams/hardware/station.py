@@ -15,7 +15,7 @@ from guiderail.diagrams.hardware.driver import Driver, PoseDriver, find_driver, 
 from guiderail.diagrams.hardware.driver import status_limits as default_status_limits
 from guiderail.diagrams.hardware.pose_control import add_pose_publisher, make_rate_limiter, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.stations.impedance_control import add_controller, add_energy_tank
+from guiderail.diagrams.stations.impedance_control import add_controller
 from guiderail.diagrams.stations.options import HardwareOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
@@ -167,11 +167,9 @@ class HardwareStation(Station):
         )
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period, command_timeout(self.control_period)))
         rate_limiter = builder.AddNamedSystem("rate_limiter", make_rate_limiter(self.driver, period))
-        controller, impedance_monitor = add_controller(builder, model, self.impedance, period, compensate_gravity=False)
-        tank = add_energy_tank(builder, self.impedance, period, controller.get_pose_output_port())
-        if tank is not None:
-            builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
-            builder.Connect(tank.get_admitted_wrench_output_port(), controller.get_max_wrench_input_port())
+        controller, impedance_monitor, tank = add_controller(
+            builder, model, self.impedance, period, compensate_gravity=False
+        )
         self._limiter = builder.AddNamedSystem(
             "limiter", TorqueSafetyLimiter(model.plant, self.limits, period=period, can_hold=self.driver.can_hold)
         )
@@ -189,11 +187,7 @@ class HardwareStation(Station):
             (safe_pose, rate_limiter.get_desired_pose_input_port()),
             (pose, rate_limiter.get_pose_input_port()),
             (limiter.get_blend_factor_output_port(), rate_limiter.get_blend_factor_input_port()),
-            (
-                rate_limiter.get_limited_pose_output_port(),
-                (tank or controller).get_desired_pose_input_port(),
-            ),
-            (controller.get_impedance_wrench_output_port(), impedance_monitor.get_impedance_wrench_input_port()),
+            (rate_limiter.get_limited_pose_output_port(), (tank or controller).get_desired_pose_input_port()),
             (controller.get_generalized_force_output_port(), limiter.get_torque_input_port()),
             (state, limiter.get_estimated_state_input_port()),
             (external_torque, limiter.get_external_torque_input_port()),

@@ -176,7 +176,7 @@ class DisturbedStation(Station):
         """Sample the errors that only a named setting has, and return them by name."""
         e = self._errors
         delay = int(rng.integers(e.wrench_delay[0], e.wrench_delay[1], endpoint=True))
-        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))  # nothing changes with the position within a few centimetres
+        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))  # nothing changes with the position within a few centimeters
         gradient[:, 3:] = rng.uniform(-1.0, 1.0, (WRENCH_SIZE, 3)) * np.repeat(e.wrench_gradient, 3)[:, None]
         calibration = rng.uniform(-1.0, 1.0, POSE_SIZE) * np.repeat(e.calibration_error, 3)
         if self._delay is not None:
@@ -212,7 +212,7 @@ def disturbed(
     name: str,
     impedance: Impedance | None = None,
 ) -> Station:
-    """Build a station with the impedance of a task, and with disturbances if any is on.
+    """Build a station with the impedance of a task, and with disturbances if there are any.
 
     Args:
         build: Builder of the station, with a parameter `impedance` if that or its stiffness is to be set.
@@ -231,7 +231,7 @@ def disturbed(
             "impedance, or choose bounded_force=False"
         )
     arguments: dict[str, Any] = {} if impedance is None else {"impedance": impedance}
-    if not disturbances.any:
+    if not disturbances.is_active:
         return build(**arguments)
     if not is_simulated and disturbances.is_named_only:
         # A real robot has its own sensor errors; of the setting only the tare applies.

@@ -56,7 +56,7 @@ LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 CARTESIAN_PLANT_PERIOD = PLANT_PERIOD / 2
 
 
-def damping(impedance: Impedance) -> np.ndarray:
+def joint_damping(impedance: Impedance) -> np.ndarray:
     """Return the damping of the joints for an impedance, (6,) [N s/m, Nm s/rad]."""
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
     return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
@@ -115,7 +115,7 @@ class GantryStation(Station):
             desired = add_joint_impedance(
                 builder,
                 impedance,
-                damping=damping(impedance),
+                damping=joint_damping(impedance),
                 mass=moving_mass(plant),
                 time_step=time_step,
                 pose=pose.get_output_port(),
@@ -190,14 +190,14 @@ def _add_gantry(
     """Add joints, tool and workpiece, all without gravity, and with springs and dampers if `with_gains` is True."""
     model = plant.AddModelInstance("gantry")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
-    for (name, joint_type, axis), stiffness, damps, limit in zip(
-        GANTRY_JOINTS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
+    for (name, joint_type, axis), stiffness, damping, limit in zip(
+        GANTRY_JOINTS, impedance.stiffness, joint_damping(impedance), impedance.limits, strict=True
     ):
         link = plant.AddRigidBody(f"{name}_link", model, SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS))
         joint = plant.AddJoint(joint_type(name, parent, link.body_frame(), axis))
         actuator: JointActuator = plant.AddJointActuator(f"{name}_motor", joint, limit)
         if with_gains:
-            actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damps))
+            actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
         parent = link.body_frame()
     inertia = UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS))
     tool = plant.AddRigidBody("tool_center", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))

@@ -23,9 +23,9 @@ from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.systems.reference_governor import ReferenceGovernor
 
 TANK_CAPACITY = 5.0  # capacity of the energy tank [J], a multiple of the work of an insertion
-# Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. The damping for them is a lower bound of the
+# Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. Their damping is a lower bound of the
 # dissipation that refills a tank.
-LEAST_MASS, LEAST_INERTIA = 1.5, 2e-3
+MIN_MASS, MIN_INERTIA = 1.5, 2e-3
 WRENCH_RATE = np.array([100.0] * 3 + [10.0] * 3 + [100.0, 10.0])
 """Largest rate at which the limits of force and torque change from state to state of a template, (8,) [N/s, Nm/s]."""
 
@@ -37,8 +37,11 @@ def add_controller(
     period: float,
     *,
     compensate_gravity: bool,
-) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
-    """Add a robot's controller, sampled with `period` [s], and the monitor of its wrench; the caller connects them."""
+) -> tuple[CartesianImpedanceController, ImpedanceMonitor, EnergyTank | None]:
+    """Add a robot's controller, sampled with `period` [s], and connect the monitor of its wrench and its energy tank.
+
+    There is a tank only if the impedance is bounded; it then receives the desired pose in place of the controller.
+    """
     controller = builder.AddNamedSystem(
         "controller",
         CartesianImpedanceController(
@@ -58,7 +61,12 @@ def add_controller(
         ),
     )
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(to_wrench_order(impedance.limits)))
-    return controller, monitor
+    builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+    tank = add_energy_tank(builder, impedance, period, controller.get_pose_output_port())
+    if tank is not None:
+        builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
+        builder.Connect(tank.get_admitted_wrench_output_port(), controller.get_max_wrench_input_port())
+    return controller, monitor, tank
 
 
 def add_energy_tank(
@@ -67,7 +75,7 @@ def add_energy_tank(
     """Add the energy tank of a bounded impedance, sampled with `period` [s]; return None if there is no bound."""
     if impedance.bound is None:
         return None
-    stiffness, masses = np.array(impedance.stiffness), np.repeat([LEAST_MASS, LEAST_INERTIA], 3)
+    stiffness, masses = np.array(impedance.stiffness), np.repeat([MIN_MASS, MIN_INERTIA], 3)
     damping = 2.0 * impedance.damping_ratio * np.sqrt(stiffness * masses)
     tank = EnergyTank(stiffness, damping, impedance.bound, capacity=TANK_CAPACITY, period=period)
     builder.AddNamedSystem("tank", tank)
@@ -119,15 +127,10 @@ def add_impedance_control(
     `state` is the port of the joint positions and velocities, (2n,), and `wrench` that of the measured wrench, (6,).
     Returns the port of the joint torques, (n,).
     """
-    controller, monitor = add_controller(
+    controller, monitor, tank = add_controller(
         builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity
     )
     builder.Connect(state, controller.get_estimated_state_input_port())
-    builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
-    tank = add_energy_tank(builder, impedance, period, controller.get_pose_output_port())
-    if tank is not None:
-        builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
-        builder.Connect(tank.get_admitted_wrench_output_port(), controller.get_max_wrench_input_port())
     export_station_ports(
         builder,
         (tank or controller).get_desired_pose_input_port(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, FixedOffsetFrame, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, damping
+from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, joint_damping
 from guiderail.diagrams.stations.impedance_control import add_joint_impedance
 from guiderail.diagrams.stations.options import ContactOptions
 from guiderail.diagrams.stations.registry import register_station
@@ -76,11 +77,7 @@ def mujoco_model(
         InputError: If MuJoCo is not installed, or there are more kinds of pairs than a contact mask has bits.
     """
     mujoco = import_extra("mujoco")
-    pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
-    if len(pairs) > MAX_PAIRS:
-        raise InputError(
-            f"station='mujoco' distinguishes at most {MAX_PAIRS} pairs of surfaces, and the workcell has {len(pairs)}"
-        )
+    masks = _contact_masks((*fixture, *workpiece))
     spec = mujoco.MjSpec()
     spec.modelname = "workcell"
     spec.compiler.autolimits = True
@@ -105,7 +102,6 @@ def mujoco_model(
         name=WORKPIECE, mass=inertia.get_mass(), inertia=moments, ipos=inertia.get_com(), explicitinertial=True
     )
     fixture_body = spec.worldbody.add_body(name=FIXTURE)
-    masks = {pair: 1 << bit for bit, pair in enumerate(pairs)}
     for surface in workpiece:
         _add_surface(mujoco, spec, workpiece_body, surface, {"contype": masks[surface.pair], "conaffinity": 0}, contact)
     for surface in fixture:
@@ -119,10 +115,12 @@ def mujoco_parts(
     """Return MJCF elements of fixture and workpiece for another model, and the assets that they need.
 
     Their contact masks leave the first bit, MuJoCo's default, to the other model.
+
+    Raises:
+        InputError: As `mujoco_model`.
     """
     mujoco = import_extra("mujoco")
-    pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
-    masks = {pair: 2 << bit for bit, pair in enumerate(pairs)}
+    masks = _contact_masks((*fixture, *workpiece), first_bit=1)
     spec = mujoco.MjSpec()
     spec.option.timestep = contact.time_step
     for name, surfaces, side in ((FIXTURE, fixture, "conaffinity"), (WORKPIECE, workpiece, "contype")):
@@ -138,9 +136,17 @@ def mujoco_parts(
     return bodies[FIXTURE], bodies[WORKPIECE], list(root.findall("asset/*"))
 
 
+def _contact_masks(surfaces: Sequence[Surface], first_bit: int = 0) -> dict[str, int]:
+    """Return a contact mask with one bit for each pair of surfaces, by its name."""
+    pairs = sorted({surface.pair for surface in surfaces})
+    if len(pairs) > (most := MAX_PAIRS - first_bit):
+        raise InputError(f"MuJoCo distinguishes at most {most} pairs of surfaces, and the workcell has {len(pairs)}")
+    return {pair: 1 << bit for bit, pair in enumerate(pairs, first_bit)}
+
+
 def _add_gantry(mujoco: Any, spec: Any, tool: Any, impedance: Impedance) -> None:
-    for (name, joint_type, axis), stiffness, damps, limit in zip(
-        GANTRY_JOINTS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
+    for (name, joint_type, axis), stiffness, damping, limit in zip(
+        GANTRY_JOINTS, impedance.stiffness, joint_damping(impedance), impedance.limits, strict=True
     ):
         slides = joint_type is PrismaticJoint
         tool.add_joint(
@@ -149,7 +155,7 @@ def _add_gantry(mujoco: Any, spec: Any, tool: Any, impedance: Impedance) -> None
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
         motor.gainprm[0] = stiffness  # force = clip(k (u − q) − d q', ± limit)
-        motor.biasprm[1], motor.biasprm[2] = -stiffness, -damps
+        motor.biasprm[1], motor.biasprm[2] = -stiffness, -damping
         motor.forcelimited, motor.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
 
 
@@ -241,7 +247,7 @@ class MujocoStation(Station):
         desired_pose = add_joint_impedance(
             builder,
             impedance,
-            damping=damping(impedance),
+            damping=joint_damping(impedance),
             mass=CARRIAGE_MASS + inertia.get_mass(),
             time_step=time_step,
             pose=gantry.get_pose_output_port(),

@@ -16,7 +16,7 @@ from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 MAX_HALVINGS = 7
 ImpedanceControl = Literal["joint", "cartesian"]
-MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; a larger one is probably in millimetres or degrees
+MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; a larger one is probably in millimeters or degrees
 MAX_FACTOR = 100.0
 """Largest factor of a disturbance; its inverse is the smallest."""
 
@@ -146,7 +146,7 @@ class Disturbances(Options):
     @classmethod
     def _check_calibration(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if value is not None and max(value) > MAX_CALIBRATION_ERROR:
-            raise ValueError(f"give a position in metres and an angle in radians, at most {MAX_CALIBRATION_ERROR}")
+            raise ValueError(f"give a position in meters and an angle in radians, at most {MAX_CALIBRATION_ERROR}")
         return value
 
     @property
@@ -182,7 +182,7 @@ class Disturbances(Options):
         return self == type(self).model_validate({"sensing": self.sensing, "tare": self.tare})
 
     @property
-    def any(self) -> bool:
+    def is_active(self) -> bool:
         """True if any disturbance is on."""
         undisturbed = type(self).model_validate({})
         given = {field.name: None for field in fields(SensorErrors) if field.name in type(self).model_fields}

@@ -34,8 +34,8 @@ class PlaneConfig:
 
     The robot is a light ball on two prismatic joints, each with a limited proportional force against viscous friction
     that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
-    mm, is much less than a wall's thickness. Otherwise its position control is critically damped: the robot reaches a
-    command within a control step and does not overshoot.
+    mm, is much less than a wall's thickness. Below saturation its position control is critically damped: the robot
+    reaches a command within a control step and does not overshoot.
 
     Attributes:
         plant_period: Time step of the plant [s].
@@ -220,7 +220,7 @@ def _add_moving_obstacles(plant: MultibodyPlant, passage: PassageGeometry) -> li
     model, frames = plant.AddModelInstance("obstacles"), []
     for number, (x, y) in enumerate(passage.obstacles):
         X_WO = RigidTransform([x, y, OBSTACLE_Z])
-        frames.append(plant.AddFrame(FixedOffsetFrame(f"place_{number}", plant.world_frame(), X_WO)))
+        frames.append(plant.AddFrame(FixedOffsetFrame(f"obstacle_mount_{number}", plant.world_frame(), X_WO)))
         body = plant.AddRigidBody(f"obstacle_{number}", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
         plant.WeldFrames(frames[-1], body.body_frame())
         plant.RegisterVisualGeometry(body, RigidTransform(), _obstacle_shape(passage), "disc", np.array(OBSTACLE_COLOR))

@@ -283,9 +283,10 @@ def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
     Raises:
         InputError: If the balls do not fit into the mug, or the mug is too large for the arm.
     """
-    if not ball.diameter * 1.25 <= inner_diameter <= 0.2 or not ball.diameter * 1.5 <= depth <= 0.25:
+    narrowest, shallowest = 1.25 * ball.diameter, 1.5 * ball.diameter
+    if not narrowest <= inner_diameter <= 0.2 or not shallowest <= depth <= 0.25:
         raise InputError(
             f"a mug of {inner_diameter} m inner diameter and {depth} m depth is too small for the balls or too large "
-            "for the arm: stay within 0.05 to 0.2 m and 0.06 to 0.25 m"
+            f"for the arm: stay within {narrowest:.3g} to 0.2 m and {shallowest:.3g} to 0.25 m"
         )
     return Vessel(inner_diameter=inner_diameter, depth=depth)

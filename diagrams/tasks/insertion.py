@@ -198,9 +198,17 @@ WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pix
 
 
 class DemonstratedInsertion(InsertionTask):
-    """Insertion with demonstrations and box constraints, and with the center of pressure as a signal."""
+    """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
+
+    The observation "center_of_pressure" adds the center of pressure and the commanded x and y to the state. "image" is
+    the wrist camera's image alone; "image_and_state" adds it to the state.
+
+    Attributes:
+        insertion_length: Length of the insertion, which scales the distance of the wrist camera [m].
+    """
 
     isotropic_groups = ((0, 1, 2), (3, 4, 5))
+    insertion_length: float
     options: Any  # must have `start_offset_max`
 
     @abstractmethod
@@ -222,12 +230,16 @@ class DemonstratedInsertion(InsertionTask):
         """True if the observation is or contains the image of the wrist camera."""
         return self.config.observation.startswith("image")
 
-    def wrist_camera(self, length: float) -> Camera:
+    def observation_camera(self) -> Camera | None:
+        """Return the wrist camera of the observation "image_and_state"."""
+        return self.wrist_camera() if self.config.observation == "image_and_state" else None
+
+    def wrist_camera(self) -> Camera:
         """Return a camera on the tool that looks at the workpiece's lower end and the fixture below it.
 
-        It is at a distance of about 3.5 times the `length` of the insertion [m] from the tool center.
+        Its distance from the tool center is about 3.5 times `insertion_length`.
         """
-        eye, target = length * np.array([2.4, 0.0, 2.4]), length * np.array([0.0, 0.0, -0.3])
+        eye, target = (self.insertion_length * np.array(place) for place in ([2.4, 0.0, 2.4], [0.0, 0.0, -0.3]))
         return Camera(WRIST_IMAGE_SIZE, np.deg2rad(40.0), look_at(eye, target), frame="grasp")
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:

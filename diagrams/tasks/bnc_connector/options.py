@@ -29,8 +29,6 @@ OFFSET_RANGES = {
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
 LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a faulty grasp
-
-
 OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
 REWARDS = ("sparse", "shaped", "aligned")
 
@@ -60,7 +58,7 @@ class BncUncertainty(HiddenOffsets):
         """Construct the sampler.
 
         `grasp_angle` and `jack_turn` are the largest tilt of the plug and turn of the jack [degrees]. `offset_range`
-        is the least and greatest offset of the jack [m]; by default that of the kind.
+        is the smallest and largest offset of the jack [m]; by default that of the kind.
         """
         super().__init__()
         self.kind = kind

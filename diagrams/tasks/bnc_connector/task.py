@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 COMPONENTS = 16  # components of the Gaussian mixture
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
-CAMERA_LENGTH = 12 * MM  # length for the distance of the wrist camera [m]
 LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
 
 
@@ -125,6 +124,7 @@ class BncConnector(DemonstratedInsertion):
     Options = BncOptions
     options: BncOptions
     workpiece, fixture = "plug", "jack"
+    insertion_length = 12.0 * MM
     simulated_rewards = ("aligned",)
     rewards = REWARDS
     observations = OBSERVATIONS
@@ -173,19 +173,12 @@ class BncConnector(DemonstratedInsertion):
         return D, y0
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
-
-        The observation "image" is the wrist camera's image alone; "image_and_state" adds it to time, pose and wrench.
-        """
+        """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
         if self.config.observation == "image":
-            return self.wrist_camera(CAMERA_LENGTH)
+            return self.wrist_camera()
         return *observation_terms(
             self.config.observation, self.num_steps * self.control_period
         ), *self.force_limit_terms()
-
-    def observation_camera(self) -> Camera | None:
-        """Return the wrist camera of the observation "image_and_state"."""
-        return self.wrist_camera(CAMERA_LENGTH) if self.config.observation == "image_and_state" else None
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
@@ -204,14 +197,14 @@ class BncConnector(DemonstratedInsertion):
             return None
         privileged = (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH)
         signs = Symmetry.of_signs(half_turn(self.config.observation), HALF_TURN[self.action_dims()], privileged)
-        return signs.padded(len(self.force_limit_terms()))
+        return signs.pad(len(self.force_limit_terms()))
 
     def near_symmetry(self) -> Symmetry | None:
         """Return the half turn, and the quarter turns and reflections that hold while the plug stands on the rim."""
         if self.has_image:
             return None
         sides = sides_of_the_rim(self.config.observation, self.action_dims())
-        return self.symmetry() if sides is None else Symmetry(*sides).padded(len(self.force_limit_terms()))
+        return self.symmetry() if sides is None else Symmetry(*sides).pad(len(self.force_limit_terms()))
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:

@@ -103,6 +103,14 @@ class Tolerance(Options):
     turn: Number = Field(4.0, gt=0, description="about z [degrees]")
     steps: int = Field(3, ge=1, description="consecutive control steps that count as success")
 
+    def accepts(self, plug: np.ndarray) -> bool:
+        """Return True if a plug is at the target; `plug` is its position and rotation vector in the socket, (6,)."""
+        return bool(
+            abs(plug[2]) < self.height
+            and np.hypot(plug[0], plug[1]) < self.lateral
+            and abs(plug[5]) < self.turn * DEGREE
+        )
+
 
 class Bounds(Options):
     """Bounds of every command, [x y z Rz Ry Rx]: one list for all steps, or one list for each phase."""
@@ -126,10 +134,10 @@ class Bounds(Options):
 
     @field_validator("phases")
     @classmethod
-    def _fit(cls, phases: tuple[float, ...] | None, others: ValidationInfo) -> tuple[float, ...] | None:
-        if not {"lower", "upper"} <= others.data.keys():
+    def _fit(cls, phases: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        if not {"lower", "upper"} <= info.data.keys():
             return phases  # the errors of `lower` and `upper` are reported instead
-        lower, upper = _filled(others.data["lower"], -np.inf), _filled(others.data["upper"], np.inf)
+        lower, upper = _filled(info.data["lower"], -np.inf), _filled(info.data["upper"], np.inf)
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
             raise ValueError("bounds that change need phases, and a list of lower and of upper ones for each")
         if phases is not None and (phases[0] != 0.0 or any(np.diff([*phases, 1.0]) <= 0.0)):

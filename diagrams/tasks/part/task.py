@@ -152,6 +152,7 @@ class PartInsertion(DemonstratedInsertion):
         self.offsets = PartUncertainty(self.options)
         self.collision = Threshold("contact_force", self.options.largest_force_limit)
         self.num_steps = self.reference().num_steps
+        self.insertion_length = self.file.motion.travel
 
     def workcell(self) -> PartWorkcell:
         """Return the socket in the world and the plug in the tool."""
@@ -191,12 +192,9 @@ class PartInsertion(DemonstratedInsertion):
         return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y.
-
-        The observation "image" is the wrist camera's image alone; "image_and_state" adds it to time, pose and wrench.
-        """
+        """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
         if self.config.observation == "image":
-            return self.wrist_camera(self.file.motion.travel)
+            return self.wrist_camera()
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
@@ -205,19 +203,14 @@ class PartInsertion(DemonstratedInsertion):
         )
         return *terms, *self.force_limit_terms()
 
-    def observation_camera(self) -> Camera | None:
-        """Return the wrist camera of the observation "image_and_state"."""
-        return self.wrist_camera(self.file.motion.travel) if self.config.observation == "image_and_state" else None
-
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return the terms of `config.reward`."""
         return reward_terms(self.config.reward, num_actions)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success at the target, and collision above the force limit."""
-        seated = TerminationTerm(
-            "success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.steps_of(self.file.tolerance.steps)
-        )
+        tolerance = self.file.tolerance
+        seated = TerminationTerm("success", {PLUG: POSE_SIZE}, tolerance.accepts, steps=self.steps_of(tolerance.steps))
         return [seated, self.force_limit()]
 
     def symmetry(self) -> Symmetry | None:
@@ -233,17 +226,7 @@ class PartInsertion(DemonstratedInsertion):
         chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
         if every is None or not chosen or self.has_image:
             return None
-        return Symmetry(*(matrices[chosen] for matrices in every)).padded(len(self.force_limit_terms()))
-
-    @classmethod
-    def is_seated(cls, plug: np.ndarray) -> bool:
-        """Return True if a plug is at the target; `plug` is its position and rotation vector in the socket, (6,)."""
-        tolerance = cls.file.tolerance
-        return bool(
-            abs(plug[2]) < tolerance.height
-            and np.hypot(plug[0], plug[1]) < tolerance.lateral
-            and abs(plug[5]) < tolerance.turn * DEGREE
-        )
+        return Symmetry(*(matrices[chosen] for matrices in every)).pad(len(self.force_limit_terms()))
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the socket."""

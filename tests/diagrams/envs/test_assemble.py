@@ -51,7 +51,7 @@ def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
     """A measured angle jumps by a full turn at ±180°, so a history of it would command a full turn."""
     assert make_prior(turn, GantryStation).demonstrations is not None
     for station in (ArmStation, HardwareStation):
-        with pytest.raises(InputError, match="jumps by a full turn at 180°"):
+        with pytest.raises(InputError, match="angles jump by a full turn at 180°"):
             make_prior(turn, station)
         assert make_prior(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
 

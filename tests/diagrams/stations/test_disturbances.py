@@ -35,7 +35,7 @@ def test_station_is_undisturbed_by_default(plain):
     env, _, info = plain
     assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
     assert "friction_factor" not in info
-    assert not EnvConfig.resolve("GridClamp", {}).parts["disturbances"].any
+    assert not EnvConfig.resolve("GridClamp", {}).parts["disturbances"].is_active
 
 
 def test_disturbances_depend_on_the_seed(plain):
@@ -140,4 +140,4 @@ def test_environment_raises_when_hardware_is_disturbed():
 
 
 def test_every_disturbance_is_off_by_default():
-    assert not Disturbances.model_validate({}).any
+    assert not Disturbances.model_validate({}).is_active

@@ -1,6 +1,7 @@
 """Physics of connector and clamp in MuJoCo, with the criteria of those in Drake."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_
 pytest.importorskip("mujoco")
 import mujoco
 
-from guiderail.diagrams.stations.mujoco import MujocoStation, constraint_torques
+from guiderail.diagrams.stations.mujoco import MujocoContact, MujocoStation, constraint_torques, mujoco_parts
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
 STIFFNESS = Impedance().stiffness[2]
@@ -280,3 +281,11 @@ def test_station_raises_when_mujoco_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r'pip install "guiderail\[mujoco\]"'):
         MujocoStation(CONNECTOR)
+
+
+def test_part_surfaces_are_refused_when_a_mask_has_too_few_bits():
+    surface = CONNECTOR.fixture_surfaces()[0]
+    fixture = [replace(surface, name=f"surface_{i}", pair=f"pair_{i}") for i in range(31)]
+    mujoco_parts(fixture[:30], [], MujocoContact())
+    with pytest.raises(InputError, match="at most 30 pairs of surfaces, and the workcell has 31"):
+        mujoco_parts(fixture, [], MujocoContact())

@@ -118,7 +118,7 @@ def test_setting_can_be_changed_in_a_stored_configuration():
     """A run's folder stores all options; another setting must not inherit the errors of the stored one."""
     stored = EnvConfig.resolve("BncConnector", {"sensing": "robot"}).options
     changed = EnvConfig.resolve("BncConnector", {**stored, "sensing": "exact"})
-    assert not changed.parts["disturbances"].any
+    assert not changed.parts["disturbances"].is_active
     assert EnvConfig.resolve("BncConnector", stored).options == stored
 
 
@@ -143,7 +143,7 @@ def test_exact_setting_adds_nothing():
     ("options", "message"),
     [
         ({"sensing": "perfect"}, "there is no sensing 'perfect'"),
-        ({"calibration_error": (0.5, 0.0)}, "metres"),
+        ({"calibration_error": (0.5, 0.0)}, "meters"),
         ({"wrench_drift": (-1.0, 0.0)}, "none negative"),
         ({"sensing": "robot", "wrench_bias": (1.0,)}, "wrench_bias"),
     ],

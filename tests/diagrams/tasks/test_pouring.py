@@ -203,6 +203,7 @@ def test_hand_shaped_reward_is_the_thesiss():
         ({"observation": "image"}, "state"),
         ({"mug_offset": 1.0}, "at most 0.04"),
         ({"mug_inner_diameter": 0.03}, "too small for the balls"),
+        ({"mug_inner_diameter": 0.03, "ball_diameter": 0.03}, "stay within 0.0375 to 0.2 m and 0.045 to 0.25 m"),
         ({"input_speed": 5.0}, "at most 2"),
     ],
 )

@@ -189,7 +189,9 @@ def test_turned_socket_accepts_a_turned_plug_without_a_turn_at_the_end(folder):
     from guiderail.diagrams.envs.config import EnvConfig
 
     task = EnvConfig.resolve(str(folder), {}).make_task()
-    seated = [task.is_seated(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.deg2rad(turn)])) for turn in (19.0, 21.0)]
+    seated = [
+        task.file.tolerance.accepts(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.deg2rad(turn)])) for turn in (19.0, 21.0)
+    ]
     assert seated == [True, False]
 
 
