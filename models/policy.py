@@ -38,7 +38,7 @@ class Policy:
     Args:
         layers: Weight (out, in) and bias (out,) of each layer, first to last.
         description: Content of `policy.json`: the shape of observations, the limits of actions, `activation` ("relu",
-            the default, "normalized_relu" or "tanh"), `squash` ("tanh", the default, or "clip"), and for images `pool`,
+            the default, "normalized_relu" or "tanh") and `squash` ("tanh", the default, or "clip"). Images need `pool`,
             the side of the squares of pixels that are averaged. `image_shape`, (height, width, channels), declares that
             observations are vectors [image / 255, state] (see `ImageObservation`).
         encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution of an image, with stride 2 and a rectifier.
@@ -139,7 +139,7 @@ class Policy:
             ) from error
 
     def save(self, folder: Path | str, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
-        """Write `policy.safetensors` and `policy.json`; `write` writes one file, for example atomically."""
+        """Write `policy.safetensors` and `policy.json`; `write` is called with the path and the content of each."""
         folder = Path(folder)
         arrays: dict[str, np.ndarray] = {}
         for kind, stored in (("layers", self._layers), ("encoder", self._encoder)):

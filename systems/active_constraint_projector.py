@@ -19,12 +19,12 @@ class ActiveConstraintProjector(LeafSystem):
 
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    (`SharedControlTemplate.command`). The last command is discrete state. Its initial value is the measured
-    pose, moved towards the constraints as far as one period allows. Between control instants the output is a pure
-    function of the last command and the request.
+    See `SharedControlTemplate.command`. The last command is discrete state. Its initial value is the measured pose,
+    moved towards the constraints as far as one period allows. Between control instants the output is a pure function of
+    the last command and the request.
 
-    The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite, or if the
-    tracking error exceeds its bound and the request would not reduce it, for example if the robot is blocked. If a
+    The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite. The same
+    happens if the tracking error exceeds its bound and the request would not reduce it, as for a blocked robot. If a
     transition or a moved object leaves the repeated command outside the constraints, the command moves inside.
 
     .. pydrake_system::

@@ -9,10 +9,8 @@ from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.control.energy_tank import admissible_share, spring_energy
-from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, POSE_ORDER, WrenchBound
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
-
-_WRENCH_ORDER = [0, 1, 2, 5, 4, 3]  # index among pose coordinates of each wrench coordinate
 
 
 class _Admitted(NamedTuple):
@@ -123,15 +121,16 @@ class EnergyTank(LeafSystem):
         dissipated = float(self._damping @ moved**2) / self._period
         energy = min(self._capacity, float(content[0]) + dissipated)
         error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)
-        released = spring_energy(K, last_limits, error) - spring_energy(K, limits, error)
+        stored = spring_energy(K, last_limits, error)
+        released = stored - spring_energy(K, limits, error)
         share = admissible_share(K, (limits, requested), (error, desired_error), energy + released)
         if share == 1.0:
-            following, admitted = desired, requested
+            next_reference, admitted = desired, requested
         else:
-            following = pose + error + share * (desired_error - error)
+            next_reference = pose + error + share * (desired_error - error)
             admitted = limits + share * (requested - limits)
-        added = spring_energy(K, admitted, pose_difference(following, pose)) - spring_energy(K, last_limits, error)
-        return _Admitted(following, admitted, min(self._capacity, max(energy - added, 0.0)))
+        added = spring_energy(K, admitted, pose_difference(next_reference, pose)) - stored
+        return _Admitted(next_reference, admitted, min(self._capacity, max(energy - added, 0.0)))
 
     def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
         desired = self._desired_pose_port.Eval(context)
@@ -140,7 +139,7 @@ class EnergyTank(LeafSystem):
     def _calc_admitted_wrench(self, context: Context, output: BasicVector) -> None:
         bound = self._requested_bound(context)
         numbers = np.empty(MAX_WRENCH_SIZE)
-        numbers[:POSE_SIZE] = self._admitted.Eval(context).limits[_WRENCH_ORDER]
+        numbers[:POSE_SIZE] = self._admitted.Eval(context).limits[POSE_ORDER]
         numbers[POSE_SIZE:] = bound.force, bound.torque
         output.SetFromVector(numbers)
 

@@ -46,9 +46,9 @@ class ExternalTorqueSensor(LeafSystem):
         τ = τ_c + ε ∘ (τ_c + g(q)) + g'(q) − g(q) − c ∘ tanh(v / v₀) + b + d + σ ∘ n,  n ~ N(0, 1) once per period
 
     An arm computes its external torques as the measured torques minus the torques of its model. τ_c are the torques of
-    contact forces, g(q) the gravity of the model and g'(q) that of the actual bodies, c friction, b offsets, and d a
-    random walk. Inertial torques are compensated exactly. The errors are parameters, which a reset samples and
-    restores.
+    contact forces, ε relative errors of the sensors, g(q) the gravity of the model and g'(q) that of the actual bodies,
+    c friction with v₀ = `FRICTION_SPEED`, b offsets, and d a random walk. Inertial torques are compensated exactly. The
+    errors are parameters, which a reset samples and restores.
 
     .. pydrake_system::
 

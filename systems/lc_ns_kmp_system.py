@@ -62,8 +62,7 @@ class LcNsKmpSystem(LeafSystem):
 
     Raises:
         InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
-            `shorter` has a history that is not shorter, the same history length as another primitive, or constraints
-            that differ from those of `primitive`.
+            `shorter` has no shorter history, the history length of another one, or other constraints than `primitive`.
     """
 
     #: ``constraint_violation`` if there is no constraint; finite, so that logs and statistics accept it.

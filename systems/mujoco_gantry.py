@@ -219,14 +219,14 @@ class MujocoGantry(LeafSystem):
             self._check_warnings()
             newest = self._contact_wrench()
             filtered = newest + decay * (filtered - newest)
-        following = np.concatenate([self._engine_state(), filtered])
-        if not np.isfinite(following).all():
+        next_state = np.concatenate([self._engine_state(), filtered])
+        if not np.isfinite(next_state).all():
             raise DivergedError("the simulation failed in MuJoCo: its state is not finite")
         if np.abs(data.qvel).max() > MAX_JOINT_SPEED:
             raise DivergedError(
                 f"the simulation failed in MuJoCo: a joint is faster than {MAX_JOINT_SPEED:g} m/s or rad/s"
             )
-        discrete_state.set_value(self._state, following)
+        discrete_state.set_value(self._state, next_state)
 
     def _check_warnings(self) -> None:
         numbers = self._data.warning.number[self._failures]

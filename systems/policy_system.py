@@ -19,9 +19,9 @@ class PolicySystem(LeafSystem):
 
         action[k] = clip(policy(observation[k]), −1, 1)
 
-    The observation is the one just before the instant k·period. The action is set by an unrestricted update, which
-    Drake performs before the discrete updates of the same instant, so a `ZeroOrderHold` of the control period outputs
-    the new action from that instant on. A `Simulator` of a task diagram with this system therefore gives bit for bit
+    The observation is the one just before the instant k·period. The action is set by an unrestricted update. Drake
+    performs it before the discrete updates of the same instant, so a `ZeroOrderHold` of the control period outputs the
+    new action from that instant on. A `Simulator` of a task diagram with this system therefore gives bit for bit
     the results of `DiagramEnv` with the same policy (see docs/concepts/rates.md).
 
     .. pydrake_system::
@@ -83,7 +83,7 @@ class PolicySystem(LeafSystem):
         try:
             action = np.asarray(returned, dtype=float)
         except (TypeError, ValueError):
-            raise PolicyError(f"the policy returned {returned!r}, which is no action: the robot must stop") from None
+            raise PolicyError(f"the policy returned {returned!r} instead of an action: the robot must stop") from None
         size = self._action_port.size()
         if action.shape != (size,) or not np.isfinite(action).all():
             raise PolicyError(f"the policy returned {action}, not {size} finite numbers: the robot must stop")

@@ -11,7 +11,7 @@ from guiderail.systems.support.declarations import check_period, declare_cache, 
 
 # Modes in order of preference. If the axes cannot be synchronized for numerical reasons (about one of 10,000
 # adversarial commands), each axis has its own trajectory; if that fails too, the motion is braked to rest.
-FALLBACKS = (
+MODES = (
     (ControlInterface.Position, Synchronization.Time),
     (ControlInterface.Position, Synchronization.No),
     (ControlInterface.Velocity, Synchronization.No),
@@ -23,9 +23,9 @@ class PoseMotionLimiter(LeafSystem):
     """Follow a desired pose with limited velocity, acceleration and jerk, starting from the measured pose at rest.
 
     While the blend factor is zero the output is the measured pose. When it becomes positive, the output starts at the
-    measured pose and moves to the desired pose on the time-optimal trajectory within the limits (Berscheid and Kröger,
-    "Jerk-limited Real-time Trajectory Generation with Arbitrary Target States", RSS 2021), computed again in each
-    period. The orientation is represented by the rotation vector from the orientation at the start
+    measured pose and moves to the desired pose on the time-optimal trajectory within the limits. The trajectory is
+    computed again in each period (Berscheid and Kröger, "Jerk-limited Real-time Trajectory Generation with Arbitrary
+    Target States", RSS 2021). The orientation is represented by the rotation vector from the orientation at the start
     (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
     the limits. A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the
     output comes to rest at the last valid one.
@@ -95,11 +95,11 @@ class PoseMotionLimiter(LeafSystem):
             # At half a turn the rotation vector jumps to the opposite direction.
             if np.linalg.norm(turn) < 0.9 * np.pi:
                 state[18:24] = np.concatenate([desired[:3], turn])
-        wanted = InputParameter(6)
-        wanted.current_position, wanted.current_velocity, wanted.current_acceleration = state[:18].reshape(3, 6)
-        wanted.target_position = state[18:24]
-        wanted.max_velocity, wanted.max_acceleration, wanted.max_jerk = self._limits
-        state[:18] = np.concatenate(_plan(wanted).at_time(self._period)[:3])
+        motion = InputParameter(6)
+        motion.current_position, motion.current_velocity, motion.current_acceleration = state[:18].reshape(3, 6)
+        motion.target_position = state[18:24]
+        motion.max_velocity, motion.max_acceleration, motion.max_jerk = self._limits
+        state[:18] = np.concatenate(_plan(motion).at_time(self._period)[:3])
         return state
 
     def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
@@ -114,21 +114,21 @@ class PoseMotionLimiter(LeafSystem):
         discrete_state.set_value(self._next_state.Eval(context))
 
 
-def _plan(wanted: InputParameter) -> Trajectory:
+def _plan(motion: InputParameter) -> Trajectory:
     """Return a trajectory to the target, or a trajectory to rest if the target has none.
 
     Raises:
         InputError: If neither is found.
     """
-    for wanted.control_interface, wanted.synchronization in FALLBACKS:
+    for motion.control_interface, motion.synchronization in MODES:
         trajectory = Trajectory(6)
         try:
             # Constructed on every call: an instance stored in a system would be reported as leaked when Python exits.
-            if Ruckig(6).calculate(wanted, trajectory) in (Result.Working, Result.Finished):
+            if Ruckig(6).calculate(motion, trajectory) in (Result.Working, Result.Finished):
                 return trajectory
         except RuckigError:
             continue
-    raise InputError(f"no trajectory from {wanted.current_position} is within the limits of the motion")
+    raise InputError(f"no trajectory from {motion.current_position} is within the limits of the motion")
 
 
 def _at_rest(pose: np.ndarray) -> np.ndarray:

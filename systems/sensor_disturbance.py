@@ -66,9 +66,9 @@ class SensorDisturbance(LeafSystem):
             if not _are_magnitudes(values, (size,)):
                 raise InputError(f"a sensor's {name} is a number from 0 for each of its numbers, not {values}")
         self._step = np.sqrt(period / DRIFT_TIME)
-        self._is_noisy, self._drifts = bool(self._noise.any()), bool(self._drift.any())
+        self._has_noise, self._has_drift = bool(self._noise.any()), bool(self._drift.any())
         self._is_rounded = self._resolution > 0.0
-        self._rounds, self._unit = bool(self._is_rounded.any()), np.where(self._is_rounded, self._resolution, 1.0)
+        self._rounds_any, self._unit = bool(self._is_rounded.any()), np.where(self._is_rounded, self._resolution, 1.0)
         self._scale = self.DeclareNumericParameter(BasicVector(np.ones(size)))
         self._bias = self.DeclareNumericParameter(BasicVector(np.zeros(size)))
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
@@ -140,11 +140,11 @@ class SensorDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value() + 1.0
         discrete_state.set_value(self._count, count)
-        if self._is_noisy or self._drifts:
+        if self._has_noise or self._has_drift:
             seed = context.get_numeric_parameter(self._seed).value()[0]
             rng = np.random.default_rng([int(seed), int(count[0])])
             discrete_state.set_value(self._noise_sample, rng.standard_normal(len(self._noise)))
-            if self._drifts:
+            if self._has_drift:
                 walk = context.get_discrete_state(self._walk).value()
                 step = self._step * self._drift * rng.standard_normal(len(self._drift))
                 discrete_state.set_value(self._walk, walk + step)
@@ -163,14 +163,14 @@ class SensorDisturbance(LeafSystem):
         scale, bias = (context.get_numeric_parameter(index).value() for index in (self._scale, self._bias))
         noise = self._noise * context.get_discrete_state(self._noise_sample).value()
         disturbed = scale * measured + bias + noise
-        if self._drifts:
+        if self._has_drift:
             disturbed = disturbed + context.get_discrete_state(self._walk).value()
         if self._configuration_port is not None:
             moved = self._configuration_port.Eval(context)
             moved = moved - context.get_discrete_state(self._first_configuration).value()
             gradient = context.get_numeric_parameter(self._gradient).value().reshape(len(noise), -1)
             disturbed = disturbed + gradient @ moved
-        if self._rounds:
+        if self._rounds_any:
             disturbed = np.where(self._is_rounded, np.round(disturbed / self._unit) * self._unit, disturbed)
         output.SetFromVector(disturbed)
 

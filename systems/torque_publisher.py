@@ -55,7 +55,6 @@ class TorquePublisher(LeafSystem):
 
     get_torque_input_port = input_getter("torque", "torques, (n,) [Nm]")
     get_is_sending_input_port = input_getter("is_sending", "enable flag, (1,); no message is sent while it is 0")
-
     get_is_holding_input_port = input_getter("is_holding", "flag that the driver holds the arm, (1,)")
 
     def _publish(self, context: Context) -> None:

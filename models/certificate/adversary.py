@@ -2,7 +2,7 @@
 
 A third of the sequences are the signs of impulse responses, which reach a bound exactly if no constraint is active. A
 third are actions of ±1 that change sign periodically or at random. A third are variations of one of the worst sequences
-so far, which replace this sequence if they are worse.
+so far; a variation that is worse replaces it.
 """
 
 from dataclasses import dataclass, field
@@ -26,12 +26,12 @@ class AttackResult:
         upper: Greatest commands (N, O).
         excess: (2, A), excess over ±1 of the actions that are equivalent to corrected commands: at one step, and in
             total over a sequence.
-        residue: (2, O), displacement of outputs that no action moves, by which corrected commands differ from the
-            commands of the equivalent actions: at one step, and in total over a sequence.
+        residue: (2, O), difference between corrected commands and the commands of the equivalent actions, in outputs
+            that no action moves: at one step, and in total over a sequence.
         steps: Number of executed steps.
         corrected: Number of steps with a correction.
-        worst: Worst value, its actions (N, A) and its start (O,), by quantity, output, and True for steps at which a
-            constraint can be active.
+        worst: Worst value with its actions (N, A) and start (O,). A key has the quantity, the output, and True for the
+            steps at which a constraint can be active.
     """
 
     largest: dict[str, np.ndarray]
@@ -86,7 +86,7 @@ class Adversary:
         goal = self.result.steps + steps
         turn = 0
         while self.result.steps < goal:
-            actions, start = (self._impulse_signs, self._deflections, self._variation)[turn % 3]()
+            actions, start = (self._impulse_signs, self._switching_actions, self._variation)[turn % 3]()
             self._execute(actions, start)
             turn += 1
         return self.result
@@ -108,18 +108,18 @@ class Adversary:
                 by_action = action_map[:, moved] * loop.gains[moved]
                 correction = commands[n] - history_map @ history.ravel() - action_map @ raw - offset
                 equivalent = np.linalg.solve(by_action[moved], correction[moved])
-                _spend(excess, np.maximum(np.abs(action + equivalent) - 1.0, 0.0))
-                _spend(residue, np.where(loop.gains == 0.0, np.abs(correction - by_action @ equivalent), 0.0))
+                _accumulate(excess, np.maximum(np.abs(action + equivalent) - 1.0, 0.0))
+                _accumulate(residue, np.where(loop.gains == 0.0, np.abs(correction - by_action @ equivalent), 0.0))
             if self._past:
                 history = np.concatenate([history[1:], commands[n : n + 1]])
         result.steps += len(actions)
         np.minimum(result.lower, commands, out=result.lower)
         np.maximum(result.upper, commands, out=result.upper)
-        for name, largest, spent in (("excess", result.excess, excess), ("residue", result.residue, residue)):
-            for o, value in enumerate(spent[1]):
+        for name, largest, values in (("excess", result.excess, excess), ("residue", result.residue, residue)):
+            for o, value in enumerate(values[1]):
                 if value > largest[1, o]:
                     result.worst[name, o, True] = (float(value), actions, start)
-            np.maximum(largest, spent, out=largest)
+            np.maximum(largest, values, out=largest)
         for name, values in self._measure(commands, start).items():
             np.maximum(result.largest[name], values, out=result.largest[name])
             for is_corrected, steps in self._masks.items():
@@ -142,12 +142,12 @@ class Adversary:
     def _sample_start(self) -> np.ndarray:
         """Sample a corner of the box of starts or, with a history, any start in the box with probability 0.5."""
         loop, rng = self._loop, self._rng
-        place = rng.choice([-1.0, 1.0], len(loop.start))
+        offset = rng.choice([-1.0, 1.0], len(loop.start))
         if self._past and loop.start_within.any() and rng.uniform() < 0.5:
-            place = rng.uniform(-1.0, 1.0, len(loop.start))
-        return loop.start + place * loop.start_within
+            offset = rng.uniform(-1.0, 1.0, len(loop.start))
+        return loop.start + offset * loop.start_within
 
-    def _deflections(self) -> tuple[np.ndarray, np.ndarray]:
+    def _switching_actions(self) -> tuple[np.ndarray, np.ndarray]:
         """Sample actions of ±1 that change sign: periodically for all outputs together, or at random for each."""
         steps, size = self._loop.primitive.num_steps, len(self._moved)
         dwell = self._rng.choice(DWELLS)
@@ -168,7 +168,7 @@ class Adversary:
         row = self._past + n
         direction = side * np.diff(self._generators[row - order : row + 1, o], order, axis=0)[0]
         signs = np.sign(direction[: steps * size].reshape(steps, size))
-        fill, start = self._deflections()
+        fill, start = self._switching_actions()
         if len(direction) > steps * size:
             start = self._loop.start + np.sign(direction[steps * size :]) * self._loop.start_within
         return np.where(signs == 0.0, fill, signs), start
@@ -186,7 +186,7 @@ class Adversary:
         worst, rng = self.result.worst, self._rng
         names = [name for name in worst if (name[0] not in QUANTITIES) or not self._attacks_budgets]
         if not names or not len(self._moved):
-            return self._deflections()
+            return self._switching_actions()
         _, actions, start = worst[names[rng.integers(len(names))]]
         actions = actions.copy()
         for _ in range(rng.integers(1, 4)):
@@ -202,7 +202,7 @@ class Adversary:
         return (np.roll(actions, rng.integers(-3, 4), axis=0) if rng.uniform() < 0.2 else actions), start
 
 
-def _spend(account: np.ndarray, amount: np.ndarray) -> None:
-    """Update the largest amount and the total, (2, n), by an amount (n,)."""
-    np.maximum(account[0], amount, out=account[0])
-    account[1] += amount
+def _accumulate(largest_and_total: np.ndarray, values: np.ndarray) -> None:
+    """Update the largest values and the totals, (2, n), by the values (n,) of one step."""
+    np.maximum(largest_and_total[0], values, out=largest_and_total[0])
+    largest_and_total[1] += values

@@ -34,7 +34,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 CELLS = {1: 16, 2: 24, 3: 3}  # number of actions → number of cells along each; 1 for more actions
 MAX_ACTIONS = 6  # largest number of actions whose corners are enumerated
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
-BORDER = 1e-6  # slack of a constraint, relative to its terms, up to which the constraint counts as active
+BORDER = 1e-6  # largest slack, relative to the terms of a constraint, of a constraint that counts as active
 CORNER_MARGIN = 1e-8  # margin of the corrections at corners, so that the checker's rounding cannot make them infeasible
 
 

@@ -27,14 +27,14 @@ KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / 
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 BUDGETS = ("excess", "residue")
 AGREEMENT = 1e-4  # largest excess of a claim over the computed value, relative to the largest value of the quantity
-BORDER = 1e-5  # slack of a constraint, relative to its terms, up to which it may be claimed active
+BORDER = 1e-5  # largest slack, relative to the terms of a constraint, of a constraint that may be claimed active
 COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit norm, that the primitive accepts
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec = 60
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
 MAX_BYTES = 2**30  # largest size of the arrays of one file
 MAX_WINDOW = 500  # upper limit of history and horizon together [steps]; environments accept 200 of each
-# First half of the SHA-256 of the assumptions: six sentences always, one for a budget, one for another period
+# First halves of the SHA-256 of assumptions: the six that are always stated, that of a budget, that of another period
 ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
 # Arrays of each file: kind, and shape in terms of steps, outputs, rows of constraints and rounds of multipliers
 ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
@@ -107,13 +107,13 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, may_be_null: bool = F
     if shape:
         require(type(value) is list and len(value) == shape[0], f"{what} has another shape")
         return np.array([numbers(one, shape[1:], what, may_be_null) for one in value]).reshape(shape)
-    require(type(value) is float or (may_be_null and value is None), f"{what} has something that is no number")
+    require(type(value) is float or (may_be_null and value is None), f"{what} has something other than numbers")
     return np.array(np.nan if value is None else value)
 
 
 def fields(value: Any, names: tuple[str, ...], what: str) -> Any:
     """Return a value that is a dictionary with exactly these keys; reject any other value."""
-    require(type(value) is dict and sorted(value) == sorted(names), f"{what} has not the fields {', '.join(names)}")
+    require(type(value) is dict and sorted(value) == sorted(names), f"the fields of {what} are not {', '.join(names)}")
     return value
 
 
@@ -143,7 +143,7 @@ def forward(L: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 def extended(matrix: np.ndarray) -> np.ndarray:
-    """Return a matrix of decimal numbers in extended precision."""
+    """Convert a matrix of decimal numbers to extended precision."""
     result = np.zeros(matrix.shape, dtype=Real)
     for place, value in np.ndenumerate(matrix):
         result[place] = Real(str(value))
@@ -195,8 +195,8 @@ class Primitive:
     def window(self, n: int) -> tuple[Any, ...]:
         """Compute the window's maps of history and action, offset, L with S = L Lᵀ, rows, c and two bounds on errors.
 
-        The first is a function of the history without actions, (P outs,), and its generators, (P outs, K). The second
-        is multiplied by the size of the actions.
+        The first bound is a function of the history without actions, (P outs,), and of the history's generators,
+        (P outs, K). The second bound is per unit of the actions.
         """
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         eye, precision, r = np.eye(outs, dtype=Real), self.precisions[at], self.F.shape[1] * self.outputs
@@ -283,23 +283,24 @@ class Primitive:
             corrected[0, unknown], corrected[1, unknown] = -np.inf, np.inf
         return middle, spread, wrong, corrected, maps
 
-    def bounds(self, p: Arrays, found: tuple[np.ndarray, ...], period: float) -> dict[str, Arrays]:
+    def bounds(self, p: Arrays, reached: tuple[np.ndarray, ...], period: float) -> dict[str, Arrays]:
         """Compute the quantities (N, outs) of the regimes "free" and "always"."""
-        (middle, spread, wrong, corrected, _), P, N, outs = found, self.past, self.steps, self.outputs
+        (middle, spread, wrong, corrected, _), P, N, outs = reached, self.past, self.steps, self.outputs
         wrong = wrong + 4 * spread.shape[2] * EXTENDED * (np.abs(middle) + np.abs(spread).sum(axis=2))
-        size, off, (least, greatest) = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0]), self.caps()
+        size, is_corrected = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0])
+        least, greatest = self.caps()
         free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
         for order, name in ((1, "speed"), (2, "acceleration")):
             change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(spread, order, axis=0)).sum(axis=2)
             for k, times in enumerate(((1, 1), (1, 2, 1))[order - 1]):
                 change += times * wrong[k : len(wrong) - order + k]
             free[name] = np.concatenate([np.zeros((order, outs)), change])[-N:] / period**order
-        low = np.where(off, np.maximum(corrected[0] - wrong[P:], least), free["lower"])
-        high = np.where(off, np.minimum(corrected[1] + wrong[P:], greatest), free["upper"])
+        low = np.where(is_corrected, np.maximum(corrected[0] - wrong[P:], least), free["lower"])
+        high = np.where(is_corrected, np.minimum(corrected[1] + wrong[P:], greatest), free["upper"])
         always = {"lower": low, "upper": high}
         low, high = (np.vstack([p["start"] + side * p["start_within"]] * 2 + [y]) for side, y in ((-1, low), (1, high)))
-        off = np.vstack([np.zeros((2, outs), bool), off])
-        near = [off[1:-1] | off[2:], off[:-2] | off[1:-1] | off[2:]]
+        is_corrected = np.vstack([np.zeros((2, outs), bool), is_corrected])
+        near = [is_corrected[1:-1] | is_corrected[2:], is_corrected[:-2] | is_corrected[1:-1] | is_corrected[2:]]
         steps = np.maximum(high[2:] - low[1:-1], high[1:-1] - low[2:])
         bends = np.maximum(high[2:] - 2 * low[1:-1] + high[:-2], 2 * high[1:-1] - low[2:] - low[:-2])
         for order, (name, new) in enumerate((("speed", steps), ("acceleration", bends))):
@@ -344,7 +345,10 @@ class Primitive:
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
-    """Bound the commands of step n by cells: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖² for the interpolation v̄ of corrections v."""
+    """Bound the commands of step n by cells of actions: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖².
+
+    v is the correction of an action in a cell, and v̄ the interpolation of the corrections at the cell's corners.
+    """
     (rows_L, rows, c, room), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / max(A, 1))) - 1
     fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
@@ -371,22 +375,22 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
     return (commands[i].min(axis=1) - radius).min(axis=0), (commands[i].max(axis=1) + radius).max(axis=0)
 
 
-def compare(claims: dict[str, Arrays], found: dict[str, Arrays]) -> None:
+def compare(claims: dict[str, Arrays], computed: dict[str, Arrays]) -> None:
     """Reject a claim that is tighter than the computed quantity, or much wider, and name the worst step."""
-    for regime, name in itertools.product(found, QUANTITIES):
-        own, claimed, sign = found[regime][name], claims[regime][name], -1.0 if name == "lower" else 1.0
+    for regime, name in itertools.product(computed, QUANTITIES):
+        own, claimed, sign = computed[regime][name], claims[regime][name], -1.0 if name == "lower" else 1.0
         require(not np.isnan(own).any(), f"{regime} {name} has no value: numbers are too large")
         require((np.isnan(claimed) == np.isinf(own)).all(), f"{regime} {name} has other unbounded entries")
         own = np.where(np.isinf(own), np.nan, own)
         room = AGREEMENT * np.maximum(np.nan_to_num(np.abs(own)).max(axis=0), 1e-9)
-        for wrong, word in ((sign * (own - claimed), "tighter"), (sign * (claimed - own) - room, "wider")):
-            n, o = np.unravel_index(int(np.nan_to_num(wrong, nan=-np.inf).argmax()), wrong.shape)
+        for excess, word in ((sign * (own - claimed), "tighter"), (sign * (claimed - own) - room, "wider")):
+            n, o = np.unravel_index(int(np.nan_to_num(excess, nan=-np.inf).argmax()), excess.shape)
             values = f"{own[n, o]:.6g}, and claimed {word}: {claimed[n, o]:.6g}"
-            require(not wrong[n, o] > 0, f"step {n}: {regime} {name} of output {o} is {values}")
+            require(not excess[n, o] > 0, f"step {n}: {regime} {name} of output {o} is {values}")
 
 
-def check_forces(impedance: Any, found: dict[str, Arrays] | None, regimes: tuple[str, ...], outputs: int) -> None:
-    """Reject forces that do not follow from the impedance and the bounds on commands; None: not computed yet."""
+def check_forces(impedance: Any, computed: dict[str, Arrays] | None, regimes: tuple[str, ...], outputs: int) -> None:
+    """Reject forces that do not follow from the impedance and the computed bounds; None: bounds not computed yet."""
     if impedance is None:
         return
     fields(impedance, ("stiffness", "limits", "force", "rest_force"), "impedance")
@@ -397,8 +401,8 @@ def check_forces(impedance: Any, found: dict[str, Arrays] | None, regimes: tuple
     for regime, claim in at_rest.items():
         claimed: Any = numbers(claim, (), "rest_force")
         own = claimed
-        if found is not None:
-            ranges = found[regime]["upper"].max(axis=0) - found[regime]["lower"].min(axis=0)
+        if computed is not None:
+            ranges = computed[regime]["upper"].max(axis=0) - computed[regime]["lower"].min(axis=0)
             own = np.asarray(np.linalg.norm(np.minimum(limits, stiffness * ranges)[:3]))
         claims[f"{regime} rest_force"] = own, claimed
     for name, (own, claim) in claims.items():
@@ -413,15 +417,15 @@ def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
     p, witness, claims = read(folder, key)
     require(claims["format"] == "guiderail certificate 4", "wrong format")
     require(type(claims["kernel"]) is str and claims["kernel"] in KERNELS, f"the kernel is none of {list(KERNELS)}")
-    require(type(claims["about"]) is dict and "task" in claims["about"], "it does not name its task")
+    require(type(claims["about"]) is dict and "task" in claims["about"], "the certificate does not name its task")
     period = float(numbers(claims["period"], (), "period"))
     require(period > 0, "the period is not positive")
-    given = True, claims["budgeted"] is not None, abs(period - p["clock"]) > 1e-6 * p["clock"]
+    is_stated = True, claims["budgeted"] is not None, abs(period - p["clock"]) > 1e-6 * p["clock"]
     sentences = claims["assumes"]
-    require(type(sentences) is list and all(type(each) is str for each in sentences), "assumes is no list of sentences")
+    require(type(sentences) is list and all(type(each) is str for each in sentences), "assumes is not a list of texts")
     texts = ["\n".join(sentences[:6]), *sentences[6:]]
     digests = [hashlib.sha256(text.encode()).hexdigest()[:32] for text in texts]
-    require(digests == list(itertools.compress(ASSUMED, given)), "it does not state the required assumptions")
+    require(digests == list(itertools.compress(ASSUMED, is_stated)), "it does not state the required assumptions")
     (steps, outputs), A = p["means"].shape, int((p["gains"] != 0).sum())
     claimed = {}
     for regime in ("free", "always", *(["budgeted"] if claims["budgeted"] is not None else [])):
@@ -430,14 +434,14 @@ def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
         claimed[regime] = {k: numbers(values[k], (steps, outputs), f"{regime} {k}", True) for k in QUANTITIES}
     check_forces(claims["impedance"], None, tuple(claimed), outputs)
     primitive = Primitive(p, claims["kernel"])
-    found = primitive.bounds(p, reached := primitive.reach(p, witness), period)
+    computed = primitive.bounds(p, reached := primitive.reach(p, witness), period)
     if claims["budgeted"] is not None:
         budgets = [numbers(claims["budgeted"][k], (2, n), k) for k, n in zip(BUDGETS, (A, outputs), strict=True)]
         third = primitive.budgeted(p, witness, budgets, reached, period)
         before = np.cumsum(witness["active"])[:, None] == 0
-        found["budgeted"] = {name: np.where(before, found["free"][name], third[name]) for name in QUANTITIES}
-    compare(claimed, found)
-    check_forces(claims["impedance"], found, tuple(claimed), outputs)
+        computed["budgeted"] = {name: np.where(before, computed["free"][name], third[name]) for name in QUANTITIES}
+    compare(claimed, computed)
+    check_forces(claims["impedance"], computed, tuple(claimed), outputs)
     return claims
 
 

@@ -64,12 +64,8 @@ def certificate_files(
     clock = float(primitive_arrays["clock"])
     witness = {"active": certified.can_be_active, "multipliers": certified.multipliers}
     if certified.budgeted is not None:
-        witness |= {f"lagrange_{key}": getattr(certified.budgeted, key) for key in ("steps", "outputs", "multipliers")}
-    files = {
-        PRIMITIVE: _npz(primitive_arrays),
-        CONSTRAINTS: _npz(constraint_arrays),
-        WITNESS: _npz(witness),
-    }
+        witness |= {f"lagrange_{k}": getattr(certified.budgeted, k) for k in ("steps", "outputs", "multipliers")}
+    files = {PRIMITIVE: _npz(primitive_arrays), CONSTRAINTS: _npz(constraint_arrays), WITNESS: _npz(witness)}
     claims: dict[str, Any] = {
         "format": FORMAT,
         "about": dict(about),

@@ -66,8 +66,8 @@ def round_period(seconds: float) -> float:
 
     Drake triggers two events together only if their times are equal, and the floating-point numbers 10 k · 0.002,
     0.02 + k · 0.02 and k · 0.02 often differ in the last bit: the plant would then step once more or once less between
-    two control steps, or a history would be updated after the command that it should include. Round the plant's period,
-    and use an integer multiple of it as the control period.
+    two control steps, or a history would be updated one step late. Round the plant's period, and use an integer
+    multiple of it as the control period.
 
     Args:
         seconds: Period [s], positive.

@@ -19,7 +19,7 @@ def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
     """Add the only model of a local SDF or URDF file to a plant.
 
     The constructor of Drake's `Parser` registers the remote package `drake_models`, and raises an error if
-    DRAKE_ALLOW_NETWORK forbids it. The variable is therefore changed meanwhile; no remote package is downloaded.
+    DRAKE_ALLOW_NETWORK forbids it. The variable is therefore changed while parsing; nothing is downloaded.
     """
     (model,) = add_models(plant, path)
     return model

@@ -92,10 +92,10 @@ class Registry(Generic[Entry]):
         return name in self._declarations
 
     def declared(self, name: str, keyword: str) -> Any:
-        """Return an entry's attribute that is a keyword argument of its decorator, or an attribute of its class.
+        """Return an attribute of an entry: a keyword argument of its decorator, or an attribute of its class.
 
-        If the entry's module is not imported yet, it is only imported if the source of the module does not show the
-        value: neither as a literal nor as a name imported from another module, which alone is then imported.
+        The entry's module is only imported if its source does not show the value. A literal is read from the source.
+        For a name that is imported from another module, only that other module is imported.
         """
         values = self._declarations[name].values if name in self._declarations else {}
         if name in self._entries or keyword not in values:
@@ -166,7 +166,7 @@ def _folders(package: str) -> list[Path]:
 
 
 def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Return the names, and the values that the source shows, of the entries that it registers with `decorator`.
+    """Yield the name and the values of each entry that the source registers with `decorator`.
 
     The values are literals and imported names among the keyword arguments and the attributes of the decorated class.
     """
@@ -208,8 +208,8 @@ def _assignments(body: Iterable[ast.stmt]) -> Iterator[tuple[str, ast.expr]]:
 def _origin(value: object) -> tuple[str, str]:
     """Return the file or module in which an object is defined, and its qualified name.
 
-    The origin identifies the object when its module is imported again, possibly under another name. The origin of an
-    entry with an attribute `build` is that of the attribute.
+    The origin identifies the object when its module is imported again, possibly under another name. An entry with an
+    attribute `build` has the origin of this attribute.
     """
     defined: Any = value if hasattr(value, "__qualname__") else getattr(value, "build", value)
     while isinstance(defined, partial):

@@ -55,7 +55,7 @@ def load_yaml(path: str | Path, what: str = "file") -> Any:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"the {what} '{path}' can't be read: it is no text in UTF-8") from error
+        raise InputError(f"the {what} '{path}' can't be read: it is not text in UTF-8") from error
     return parse_yaml(text, path.name)
 
 
@@ -129,7 +129,7 @@ class _RefusedError(Exception):
 
 
 class _Collection:
-    """List or mapping that is being read: its numbers of children, of nested entries, and of nested levels."""
+    """List or mapping that is being read, with the numbers of its children, nested entries and nested levels."""
 
     def __init__(self, event: Any):
         self.anchor, self.is_mapping = event.anchor, isinstance(event, MappingStartEvent)
@@ -187,7 +187,7 @@ def _check_node(event: Any, resolver: Any, tags: Collection[str], *, is_key: boo
         _refuse(f"{brief(event.value)} is a date, or a subtraction: put it in quotes", event)
     if is_key and kind not in ("str", "merge"):
         key = "a list or a mapping" if kind == "collection" else brief(event.value)
-        _refuse(f"{key} as a key is no text: put it in quotes", event)
+        _refuse(f"the key {key} is not text: put it in quotes", event)
 
 
 def _refuse(problem: str, event: Any) -> NoReturn:

@@ -67,7 +67,7 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
 
 
 def _root_of_inverse(Lambda_inverse: np.ndarray) -> np.ndarray:
-    """Compute R⁻¹ (6, 6), lower triangular, of Λ⁻¹ = R Rᵀ, so that Λ = R⁻ᵀ R⁻¹."""
+    """Compute the inverse (6, 6) of the lower triangular factor R of Λ⁻¹ = R Rᵀ; then Λ = R⁻ᵀ R⁻¹."""
     # LAPACK is called directly: NumPy's overhead exceeds the computation for matrices of six rows.
     R, failed = lapack.dpotrf(Lambda_inverse, lower=1, clean=1)
     if failed:
@@ -184,7 +184,7 @@ def impedance_torques(
 
 
 def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:
-    """Return the effective mass [kg] at the tool in the direction of its velocity (3,); the tool is free to turn."""
+    """Return the effective mass [kg] at the tool, free to rotate, in the direction of its velocity (3,) [m/s]."""
     square = float(velocity @ velocity)
     return square / float(velocity @ Lambda_inverse[:3, :3] @ velocity) if square > 0.0 else 0.0
 

@@ -26,7 +26,8 @@ class GuardedChunk:
 
     Attributes:
         outputs: Outputs (K, O).
-        rate: Speed along the path of the requested chunk, relative to the requested speed; 1 with a projection.
+        rate: Speed along the path of the requested chunk, relative to the requested speed; 1 for a projection and 0 for
+            a fallback.
         is_fallback: True if no chunk within the limits was found; `outputs` is then the rest of the previous result.
     """
 
@@ -57,7 +58,7 @@ class ChunkGuard:
         period: T, control period [s], positive.
         start: Output (O,) at rest inside the constraints, from which the motion starts; see `reset`.
         mode: "projection" or "slowdown".
-        tolerance: Distance from the path (O,) that a slowdown accepts [unit]; a tenth of v T by default.
+        tolerance: Distance from the path (O,) that a slowdown accepts [unit], positive; a tenth of v T by default.
 
     Raises:
         InputError: If an argument has the wrong shape or is out of range, or the start violates a constraint.
@@ -75,9 +76,10 @@ class ChunkGuard:
         tolerance: np.ndarray | None = None,
     ):
         outputs = constraints.num_outputs
-        limits = as_numbers(velocity, "velocity limits"), as_numbers(jerk, "jerk limits")
+        limits = [as_numbers(velocity, "velocity limits"), as_numbers(jerk, "jerk limits")]
+        limits += [] if tolerance is None else [as_numbers(tolerance, "tolerance")]
         if any(one.shape != (outputs,) or not (np.isfinite(one) & (one > 0)).all() for one in limits):
-            raise InputError(f"limits of velocity and jerk are {outputs} positive numbers each")
+            raise InputError(f"limits of velocity and jerk, and the tolerance, are {outputs} positive numbers each")
         if constraints.num_steps is not None:
             raise InputError("a guard has the same constraints at every step")
         if not (np.isfinite(period) and period > 0):
@@ -86,7 +88,7 @@ class ChunkGuard:
             raise InputError(f"a guard's mode is {' or '.join(MODES)}, not {brief(mode)}")
         self.constraints, self._mode = constraints, mode
         self._step, self._jerk = limits[0] * period, limits[1] * period**3
-        self._tolerance = 0.1 * self._step if tolerance is None else as_numbers(tolerance, "tolerance")
+        self._tolerance = 0.1 * self._step if tolerance is None else limits[2]
         coupled = (constraints.G != 0).T.astype(float) @ (constraints.G != 0)
         number, labels = connected_components(coupled, directed=False)
         self._groups = [np.flatnonzero(labels == group) for group in range(number)]

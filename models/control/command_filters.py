@@ -26,7 +26,7 @@ class CommandLaw(Protocol):
         ...
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the next state (S,) for the last one and a desired command (O,), and True if that was changed."""
+        """Return the state (S,) after the last one, and True if the desired command (O,) was changed."""
         ...
 
 
@@ -45,7 +45,7 @@ class BarrierFilter(_LastCommand):
 
         h(y_{k+1}) ≥ (1 − γ) h(y_k)
 
-    The barrier of a box to keep out of is that of its face with the most clearance at the last command (nonsmooth:
+    The barrier of a keep-out box is that of its face with the most clearance at the last command (nonsmooth:
     Glotfelter, Cortés and Egerstedt, 2017). With γ = 1 the filter is a projection.
 
     Args:

@@ -13,9 +13,9 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
     """Compute J⁺ V + (1 − J⁺ J) v_preferred (n,) with a pseudoinverse J⁺ that is damped near singular directions.
 
     Each singular value σ below σ₀ = `REGULAR` is inverted as σ / (σ² + λ²) with λ² = σ₀² − σ², which is σ / σ₀²
-    (numerical filtering after Maciejewski and Klein 1988). The result is continuous and bounded, and for a regular
-    posture it is that of the pseudoinverse. In singular directions, the joints follow the preferred
-    velocities, so that the arm leaves a singular posture.
+    (numerical filtering after Maciejewski and Klein 1988). The result is continuous and bounded. For a regular posture,
+    J⁺ is the pseudoinverse. In singular directions, the joints follow the preferred velocities, so that the arm leaves
+    a singular posture.
 
     Args:
         J: Jacobian (6, n), [rotational, translational], of six joints or more.

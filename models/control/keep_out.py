@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 
 
@@ -20,7 +21,7 @@ class KeepOut:
         margin: Distance from boxes and constraints, not negative.
 
     Raises:
-        ValueError: If shapes do not match, a box is empty, or the margin is negative.
+        InputError: If shapes do not match, a box is empty, or the margin is negative.
 
     Attributes:
         margin: Distance from boxes and constraints [unit of a position].
@@ -32,11 +33,11 @@ class KeepOut:
         self._lower = np.atleast_2d(np.asarray(lower, dtype=float))
         self._upper = np.atleast_2d(np.asarray(upper, dtype=float))
         if self._lower.shape != self._upper.shape or not (self._lower < self._upper).all():
-            raise ValueError("each box needs a lower corner below its upper corner")
+            raise InputError("each box needs a lower corner below its upper corner")
         if constraints.num_outputs != self._lower.shape[1] or constraints.num_steps is not None:
-            raise ValueError(f"constraints must be constant and on {self._lower.shape[1]} outputs, as the boxes are")
+            raise InputError(f"constraints must be constant and on {self._lower.shape[1]} outputs, as the boxes are")
         if not margin >= 0:
-            raise ValueError(f"the margin must not be negative, not {margin}")
+            raise InputError(f"a margin is a distance from 0, not {margin}")
         self.margin = float(margin)
         norms = np.linalg.norm(constraints.G, axis=1)
         self._constraints = LinearConstraints(constraints.G, constraints.c + self.margin * norms)
@@ -70,7 +71,7 @@ class KeepOut:
     def half_spaces(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return half-spaces that exclude the boxes with their margin, selected at a position.
 
-        The half-spaces are the constraints and, for each box, that of its face with most clearance at the position.
+        They are the constraints and, for each box, the half-space outside of its face with the most clearance.
 
         Args:
             position: Position (O,).

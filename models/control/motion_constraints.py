@@ -18,8 +18,8 @@ from guiderail.models.primitives import LinearConstraints, UnsolvableError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.qp import solve_least_norm
 
-# Distance that the QP aims at and smaller distance that every command keeps, from a shape and from the plane of a
-# linear constraint. The difference allows for the solver's tolerance.
+# Distances from a shape and from the plane of a linear constraint: that at which the QP aims, and the smaller one that
+# every command keeps. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
 _CUTS = 4  # number of times that the shapes to stay inside of are linearized
 _BISECTIONS = 12  # number of bisections between the braking command and the nearest command
@@ -122,8 +122,7 @@ class MotionConstraintFilter:
     for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if a motion that
     brakes from it on a straight line at the largest deceleration stays within the constraints; otherwise the last safe
     command on the line from the braking command to the nearest one is executed. Braking was verified one step earlier,
-    so that a safe command always exists. The flag is True if only braking is left. Without a largest acceleration,
-    braking repeats the last command.
+    so that a safe command always exists. Without a largest acceleration, braking repeats the last command.
 
     A start outside of the constraints (after a push, or because the constraints moved) moves back inside; from
     then on every command satisfies all of them.
@@ -206,10 +205,10 @@ class MotionConstraintFilter:
         return np.concatenate([command, command - last]), safe == 0.0
 
     def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
-        """Return the displacements of the next step and until rest when braking, as shares of the last step's (O,).
+        """Return the displacements of the next step and until rest in braking, as shares of the last displacement (O,).
 
-        The displacement decreases by the same amount in each step, a share φ of the last step's displacement. φ is the
-        largest share that the acceleration limits of all outputs allow: the next steps are 1 − φ, 1 − 2 φ, … of it.
+        The share of each step is smaller by φ than that of the step before: 1 − φ, 1 − 2 φ, …. φ is the largest number
+        that the acceleration limits of all outputs allow.
         """
         share = math.inf
         if self._has_acceleration:

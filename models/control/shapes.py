@@ -6,8 +6,7 @@ subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, f
 - Outside: d(y) ≥ 0 everywhere in the half-space nᵀ(y − p) ≥ −d(p). The half-space contains p if p is outside the set,
   hence also the straight line from p to every other point of the half-space.
 - The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the command keeps at least the distance that
-  the linear constraint promises. For a sphere whose center is r away from p the error is at most ‖y − p‖² / (2 r),
-  by which the half-space is conservative.
+  the linear constraint promises. For a sphere whose center is r away from p, the error is at most ‖y − p‖² / (2 r).
 """
 
 from __future__ import annotations
@@ -191,9 +190,9 @@ def linearize(
 
     Args:
         shapes: Shapes to stay outside of.
-        path: Reference means (N, O), of which the first D outputs are positions. For a point inside
-            of a shape, the half-space touches the nearest point of the surface. A path through the middle of a shape
-            does not determine on which side to pass.
+        path: Reference means (N, O); the first D outputs are positions. For a point inside of a shape, the half-space
+            touches the nearest point of the surface. A path through the middle of a shape does not determine on which
+            side to pass.
         linear: Further constraints of every step; none by default.
 
     Raises:

@@ -13,9 +13,9 @@ from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus
 from guiderail.models.control.message_sequence import RESOLUTION
 
 ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # faults with a valid status
-# Faults after which the message is dropped, and the next one is compared with the last readable status. After all other
-# faults, statuses are in doubt: one is accepted only if it agrees with the prediction, until all have been valid for
-# the settling time.
+# Faults after which the message is dropped, and the next one is compared with the last readable status. After any other
+# fault, statuses are in doubt until all have been valid for the settling time. A status in doubt is only accepted if it
+# agrees with the prediction.
 DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
 FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping with a measured velocity does not oscillate
 AGREEMENT = 0.1  # largest difference from the predicted velocity for a status in doubt to be accepted [rad/s]
@@ -155,8 +155,8 @@ class StateEstimator:
     `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
     with a model, for each joint:
 
-    - *Equal values*: no joint that moves, by its velocity or its positions, repeats its position or its velocity to the
-      bit in consecutive statuses, and no joint repeats position, velocity and external torque together while another
+    - *Equal values*: a joint whose velocity or positions show motion does not repeat its position or its velocity to
+      the bit in consecutive statuses. No joint repeats position, velocity and external torque together while another
       joint moves.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
       the position tolerance.

@@ -13,7 +13,7 @@ import numpy as np
 from guiderail.models.common.arrays import cross
 from guiderail.models.common.errors import InputError
 
-_POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench
+POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench, and vice versa
 
 MAX_WRENCH_SIZE = 8
 """Size of a bound as a signal: six along and about the axes, and the norms of force and torque."""
@@ -52,7 +52,7 @@ class WrenchBound:
     @cached_property
     def in_pose_order(self) -> WrenchBound:
         """The bound with its axes in the order of a pose, [x y z Rz Ry Rx]."""
-        return replace(self, axes=self.axes[_POSE_ORDER])
+        return replace(self, axes=self.axes[POSE_ORDER])
 
     def lowered_to(self, max_wrench: np.ndarray) -> WrenchBound:
         """Return the element-wise minimum of this bound and another (8,), whose negative or NaN numbers count as 0.
@@ -73,7 +73,7 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
 def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:
     """Move a bound straight towards another one, so that no number changes by more than `max_change`.
 
-    On the straight line the norms stay at least those of the limits per axis, if that holds at both ends.
+    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line.
 
     Args:
         bound: Bound as a signal (8,).

@@ -27,6 +27,12 @@ def strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
 
 
+def area_vectors(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the normals (T, 3) of triangles, each with twice the area of its triangle as length [m²]."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
 @dataclass(frozen=True)
 class TriangleMesh:
     """Triangle mesh: vertices (V, 3) [m] and triangles (T, 3), counter-clockwise as seen from outside."""
@@ -46,8 +52,7 @@ class TriangleMesh:
 
     def normals(self) -> np.ndarray:
         """Return the unit normals (T, 3) of the triangles."""
-        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
-        normal = np.cross(b - a, c - a)
+        normal = area_vectors(self.vertices, self.triangles)
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def to_obj(self) -> str:
@@ -66,7 +71,7 @@ def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMes
 
     Args:
         profile: (radius, height) [m] of each circle. Along the profile, with the radius plotted to the right and the
-            height up, the outside is on the left: the wall of a bore is listed upwards, that of a shaft downwards.
+            height up, the outside is on the left: a bore's wall is listed upwards, a shaft's wall downwards.
         num_sides: Number of sides of the polygons.
     """
     angles = 2.0 * np.pi * (np.arange(num_sides + 1) + 0.5) / num_sides

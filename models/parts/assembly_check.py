@@ -10,8 +10,9 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import MM
+from guiderail.models.objects.sdf import area_vectors
 from guiderail.models.parts.mesh_file import Part
-from guiderail.models.parts.solids import SurfaceLocator, sample_surface, to_arrays, to_manifold
+from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, sample_surface, to_arrays, to_manifold
 
 MAX_WALL_SLOPE = 0.5  # largest component of a wall's normal along the axis
 MAX_RESTING_OVERLAP = 2e-6  # largest overlap that counts as rounding of faces in contact [m]
@@ -120,18 +121,15 @@ def measure_side_clearance(plug: Part, socket: Part) -> float:
 
 def _walls(part: Part) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and triangles (T, 3) of the walls of a part, its faces along the axis."""
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in part.bodies)])
-    triangles = np.concatenate([t + start for (_, t), start in zip(part.bodies, starts, strict=False)])
-    corners = part.corners[triangles]
-    is_large = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > _SLIVER
-    is_wall = np.abs(_normals(part.corners, triangles)[:, 2]) < MAX_WALL_SLOPE
-    return part.corners, triangles[is_large & is_wall]
+    vertices, triangles = join_surfaces(part.bodies)
+    is_large = np.linalg.norm(area_vectors(vertices, triangles), axis=1) > _SLIVER
+    is_wall = np.abs(_normals(vertices, triangles)[:, 2]) < MAX_WALL_SLOPE
+    return vertices, triangles[is_large & is_wall]
 
 
 def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the unit normals (T, 3) of triangles; zero for triangles without area."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = area_vectors(vertices, triangles)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
@@ -144,7 +142,7 @@ def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list
     return obstructions
 
 
-MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance; parts that overlap more are not drawn assembled [m]
+MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance; a larger overlap shows that parts are drawn apart [m]
 _SPARE = 0.01 * MM  # clearance left by the suggested distance [m]
 _VOLUME_SAMPLES = 1000  # number of points sampled on the surface of a common volume
 _REGULARIZATION = 1e-3  # relative weight of the motion of a vertex in the least-squares problem
@@ -220,8 +218,7 @@ def shrink(part: Part, distance: float) -> Part:
 
 
 def _vertex_motion(vertices: np.ndarray, triangles: np.ndarray, distance: float) -> np.ndarray:
-    corners = vertices[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners, normals = vertices[triangles], area_vectors(vertices, triangles)
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(areas > 1e-14, normals / np.maximum(areas, 1e-30), 0.0)
     matrices, sides = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))

@@ -1,6 +1,6 @@
 """Exact decomposition of a solid into convex pieces.
 
-Contact of a compliant mesh needs tetrahedra, of which a convex piece has few. An approximate decomposition would lose
+Contact of a compliant mesh needs tetrahedra, and a convex piece has few. An approximate decomposition would lose
 clearances of a tenth of a millimeter. The solid is therefore cut along its own faces at concave edges, and no surface
 moves.
 """
@@ -23,17 +23,17 @@ _DIGITS = 9  # decimal places [m] in an OBJ file; rounding may bend a flat face
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
 
-def cut_into_convex_pieces(solid: Any, most: int = MAX_PIECES) -> list[Any] | None:
+def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES) -> list[Any] | None:
     """Cut a solid into convex pieces.
 
     Each cut is along the plane of a face at a concave edge: the one that leaves the smallest concave volume.
 
     Returns:
-        The pieces; None if more than `most` are necessary, or if they would fill a concavity that no cut removes.
+        The pieces; None if more than `max_pieces` are necessary, or if they would fill a concavity that no cut removes.
     """
-    total, filled, todo, pieces = solid.volume(), 0.0, [solid], []
-    while todo:
-        for part in todo.pop().decompose():
+    total, filled, uncut, pieces = solid.volume(), 0.0, [solid], []
+    while uncut:
+        for part in uncut.pop().decompose():
             if part.volume() < _SLIVER * total:
                 continue
             hollow = _hollow(part)
@@ -42,9 +42,9 @@ def cut_into_convex_pieces(solid: Any, most: int = MAX_PIECES) -> list[Any] | No
                 pieces.append(_with_large_faces(part.hull()))
                 filled += hollow
             else:
-                todo += cut
+                uncut += cut
         # Edges that are each too flat to count as concave may form a bore.
-        if len(pieces) + len(todo) > most or filled > 2.0 * _CONVEX * total:
+        if len(pieces) + len(uncut) > max_pieces or filled > 2.0 * _CONVEX * total:
             return None
     return pieces
 

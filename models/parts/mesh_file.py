@@ -12,7 +12,17 @@ import numpy as np
 from guiderail.models.common.errors import InputError, brief, import_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.objects.sdf import ContactMaterial, TriangleMesh, at, collision, convex_mesh, mesh, model, visual
+from guiderail.models.objects.sdf import (
+    ContactMaterial,
+    TriangleMesh,
+    area_vectors,
+    at,
+    collision,
+    convex_mesh,
+    mesh,
+    model,
+    visual,
+)
 from guiderail.models.parts.repair import Repair, close_surface
 from guiderail.models.parts.solids import to_manifold
 
@@ -150,9 +160,8 @@ class Surface(Protocol):
 
 def obj_text(vertices: np.ndarray, triangles: np.ndarray) -> str:
     """Return an OBJ file of vertices (V, 3) [m] and triangles (T, 3), without triangles of almost no area."""
-    corners = vertices[triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return TriangleMesh(vertices, triangles[area > 1e-10]).to_obj()
+    has_area = np.linalg.norm(area_vectors(vertices, triangles), axis=1) > 1e-10
+    return TriangleMesh(vertices, triangles[has_area]).to_obj()
 
 
 def part_sdf(

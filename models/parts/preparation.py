@@ -15,7 +15,7 @@ from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.simplification import as_hull_if_near, count_simplified, crop_to_contact, simplify
-from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, to_arrays
+from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, measure_deviation, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
@@ -24,8 +24,8 @@ MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [
 _THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
 MAX_YAW = 0.1  # largest rotation of the plug about its axis in a search, which widens the margin [rad]
 CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
-EARLY = 0.2  # fraction of the tolerance that `decimate` may use
-_LATE = 0.7  # fraction of the rest that is tried first, as the deviation may exceed the bound of `manifold3d`
+DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
+_FIRST_FRACTION = 0.7  # fraction of the rest that is tried first, as the deviation may exceed the bound of `manifold3d`
 
 KINDS = ("convex", "tetrahedra")
 """Kinds of pieces of a compliant part; tetrahedra are tried if no convex pieces let the plug reach its target."""
@@ -65,8 +65,8 @@ def choose_tolerance(clearance: float) -> float:
 
 
 def decimate(part: Part, tolerance: float) -> tuple[Part, float]:
-    """Return a part with fewer triangles and its deviation [m], at most `EARLY` of the `tolerance` [m]."""
-    simpler = [simplify(solid, 1e3 * EARLY * tolerance) for solid in make_solids(part)]
+    """Return a part with fewer triangles and its deviation [m], at most `DECIMATION_FRACTION` of `tolerance` [m]."""
+    simpler = [simplify(solid, 1e3 * DECIMATION_FRACTION * tolerance) for solid in make_solids(part)]
     bodies = tuple(to_arrays(solid) for solid, _ in simpler)
     return Part(part.path, bodies, part.repair), 1e-3 * max(deviation for _, deviation in simpler)
 
@@ -89,25 +89,25 @@ def prepare_surfaces(
     fixed = _unite(socket_solids)
     radius = float(np.hypot(*plug.corners[:, :2].T).max())
     margin = 1e3 * (MARGIN + MAX_YAW * radius)
-    left = 1e3 * (tolerance - moved)
+    remaining = 1e3 * (tolerance - moved)  # [mm]
     surfaces = []
     for part, whole, other, extra in (
         (plug, rigid, fixed, [plug_solids[number] for number in sorted(snapping)]),
         (socket, fixed, rigid, []),
     ):
-        lean = whole
+        solid = whole
         if not snapping:  # a deflected body may touch where a rigid one would not
             cropped = crop_to_contact(whole, other, margin, motion.turn, is_plug=part is plug)
             # Cropping adds edges, too: the solid with fewer triangles is used.
-            lean = min(whole, cropped, key=lambda solid: count_simplified(solid, _LATE * left))
-        bodies = [_reduce(one, left) for one in lean.decompose()] + [simplify(one, left) for one in extra]
+            solid = min(whole, cropped, key=lambda one: count_simplified(one, _FIRST_FRACTION * remaining))
+        bodies = [_reduce(one, remaining) for one in solid.decompose()] + [simplify(one, remaining) for one in extra]
         surfaces.append(
             ContactSurface(
-                bodies=tuple(to_arrays(solid) for solid, _ in bodies),
+                bodies=tuple(to_arrays(one) for one, _ in bodies),
                 snapping=len(extra),
-                visual=_join([to_arrays(solid) for solid in (whole, *extra)]),
+                visual=join_surfaces([to_arrays(one) for one in (whole, *extra)]),
                 deviation=moved + 1e-3 * max(deviation for _, deviation in bodies),
-                volume=1e-9 * sum(solid.volume() for solid in (whole, *extra)),
+                volume=1e-9 * sum(one.volume() for one in (whole, *extra)),
             )
         )
     return surfaces[0], surfaces[1]
@@ -120,20 +120,9 @@ def _unite(solids: Sequence[Any]) -> Any:
 
 def _reduce(solid: Any, tolerance: float) -> tuple[Any, float]:
     """Return a solid with few triangles, or its hull if that deviates little, and the deviation [mm]."""
-    simpler, moved = simplify(solid, tolerance, _LATE)
+    simpler, moved = simplify(solid, tolerance, _FIRST_FRACTION)
     hull, filled = as_hull_if_near(simpler, tolerance - moved)
     return hull, moved + filled
-
-
-def _join(surfaces: Sequence[Arrays]) -> Arrays:
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
-    triangles = [t + start for (_, t), start in zip(surfaces, starts, strict=False)]
-    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(triangles)
-
-
-def join_bodies(surface: ContactSurface) -> Arrays:
-    """Return vertices (V, 3) [m] and triangles (T, 3) of all bodies of a surface."""
-    return _join(surface.bodies)
 
 
 def make_compliant(
@@ -167,8 +156,6 @@ def make_compliant(
 
 def cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
     """Return convex pieces of all bodies; None if there are too many pieces or they deviate too much."""
-    from guiderail.models.parts.solids import to_manifold
-
     manifold3d = import_extra("manifold3d")
     pieces: list[Piece] = []
     for number, arrays in enumerate(surface.bodies):

@@ -24,7 +24,7 @@ class Repair:
     """Changes of a mesh that made it a solid.
 
     Attributes:
-        closed_edges: Number of edges that did not join exactly two triangles.
+        closed_edges: Number of edges that did not join exactly two triangles, at least 1 if the surface was changed.
         moved: Largest distance of the new surface from the old one [m].
         cavities: Number of filled closed cavities.
         inverted: Number of bodies whose faces pointed inwards.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from guiderail.models.common.errors import import_extra
+from guiderail.models.objects.sdf import area_vectors
 
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
@@ -23,6 +25,13 @@ def to_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and triangles (T, 3) of a solid."""
     mesh = solid.to_mesh64()
     return np.asarray(mesh.vert_properties)[:, :3] / _SCALE, np.asarray(mesh.tri_verts).astype(int)
+
+
+def join_surfaces(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) and triangles (T, 3) of several surfaces as one surface."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
+    triangles = [t + start for (_, t), start in zip(surfaces, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(triangles)
 
 
 NUM_SAMPLES = 2000  # default number of points sampled on a surface
@@ -59,8 +68,7 @@ def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> t
     The samples are the same in every call.
     """
     corners = vertices[triangles]
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    cumulative = np.cumsum(areas)
+    cumulative = np.cumsum(0.5 * np.linalg.norm(area_vectors(vertices, triangles), axis=1))
     rng = np.random.default_rng(0)
     chosen = np.searchsorted(cumulative, rng.uniform(0.0, cumulative[-1], count)).clip(0, len(triangles) - 1)
     u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)

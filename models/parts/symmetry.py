@@ -39,7 +39,7 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
     fixed, held = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]
-    radius = _AROUND * 1e3 * float(np.hypot(*np.concatenate([v for v, _ in plug.bodies])[:, :2].T).max())
+    radius = _AROUND * 1e3 * float(np.hypot(*plug.corners[:, :2].T).max())
     heights = np.linspace(low, rim, _SECTIONS + 2)[1:-1]
     entering = [_outline(held, height) for height in heights]
     holes = [_hole(fixed, height, radius) for height in heights]

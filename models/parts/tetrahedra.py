@@ -56,19 +56,21 @@ def _oriented(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 def boundary_of(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) and outward triangles (T, 3) of the boundary of tetrahedra."""
+    used, faces = np.unique(_boundary_faces(cells), return_inverse=True)
+    return points[used], faces.reshape(-1, 3)
+
+
+def _boundary_faces(cells: np.ndarray) -> np.ndarray:
+    """Return the faces (T, 3) that belong to one tetrahedron only."""
     faces = np.concatenate([cells[:, corners] for corners in _FACES])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    faces = faces[first[count == 1]]
-    used, faces = np.unique(faces, return_inverse=True)
-    return points[used], faces.reshape(-1, 3)
+    return faces[first[count == 1]]
 
 
 def add_interior_points(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split each tetrahedron at its center if all its corners are on the boundary, where the pressure is zero."""
-    faces = np.concatenate([cells[:, corners] for corners in _FACES])
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     is_outer = np.zeros(len(points), bool)
-    is_outer[faces[first[count == 1]].ravel()] = True
+    is_outer[_boundary_faces(cells)] = True
     flat = is_outer[cells].all(axis=1)
     centers = points[cells[flat]].mean(axis=1)
     center = len(points) + np.arange(len(centers))

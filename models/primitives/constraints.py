@@ -166,12 +166,13 @@ class LinearConstraints:
         """Divide every row and its bound by the row's norm; rows of unit norm up to rounding keep their digits."""
         # Scaled by the largest entry first: the squares of very large or small entries leave the range of doubles.
         largest = np.abs(self.G).max(axis=-1, initial=0.0)
+        scale = np.where(largest > 0.0, largest, 1.0)
         with np.errstate(over="ignore"):
-            G, c = (a / b for a, b in ((self.G, np.where(largest > 0.0, largest, 1.0)[..., None]), (self.c, 1.0)))
+            G = self.G / scale[..., None]
             norm = np.linalg.norm(G, axis=-1)
             is_unit = np.abs(np.where(largest > 0.0, norm * largest, 1.0) - 1.0) <= 4 * _EPS
             norm = np.where(largest > 0.0, norm, 1.0)
-            c = self.c / np.where(largest > 0.0, largest, 1.0) / norm
+            c = self.c / scale / norm
         if not np.isfinite(c).all():
             raise InputError("a constraint's bound divided by the norm of its row is not finite: scale the row up")
         self.G = np.where(is_unit[..., None], self.G, G / norm[..., None])

@@ -11,7 +11,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
 MAX_MISS = 0.1
-"""RMS distance, relative to an output's range, up to which any deviation is accepted, as spreads may be tiny."""
+"""RMS distance relative to an output's range; up to it any deviation is accepted, because spreads may be tiny."""
 _EVALUATED = 16  # number of steps at which the deviation is measured
 
 
@@ -74,7 +74,7 @@ def squared_distances(covariances: np.ndarray, errors: np.ndarray) -> np.ndarray
 
 
 def describe_deviation(deviation: float, miss: float) -> str:
-    """Return a sentence on a deviation above one and what to do."""
+    """Return a message about a deviation above one, with the remedy."""
     return (
         f"without actions the primitive is {deviation:.3g} standard deviations away from its demonstrations (RMS), and "
         f"{miss:.2g} of an output's range: check the unit of the outputs (defaults are for meters and seconds), or "

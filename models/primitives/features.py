@@ -7,8 +7,8 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import Kernel
 
-# Conditioning on a history of standard deviation √ρ loses digits in double precision, as that of the kernel is 1.
-# Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
+# Conditioning on a history with a standard deviation √ρ far below the kernel's, which is 1, loses digits in double
+# precision. Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
 # Smallest conditional variance of a point given the others, relative to the kernel's, for it to have its own action.
 _MIN_INDEPENDENCE = 1e-9
@@ -133,7 +133,7 @@ class KernelBasis:
         """Add features until `inputs` (n, I) are represented; return True if any were added."""
         inputs = inputs.astype(_Extended)
         F = self._extended_features(inputs)
-        residual = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs]) - (F**2).sum(axis=1)
+        residual = self.residual(inputs, F)
         # Larger than the tolerance of a window: a feature of size 1e-7 would multiply weights that no data determines.
         tolerance = 1e-15
         before = self.size

@@ -17,7 +17,7 @@ from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.deviation import outputs_at, squared_distances
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
-from guiderail.models.primitives.reference import ReferenceTrajectory, fit_mixture, information_criteria, regress
+from guiderail.models.primitives.reference import ReferenceTrajectory, information_criteria
 
 MIN_SHARE = 0.95
 """Smallest share of the steps within one standard deviation at which a motion follows the demonstrations."""
@@ -136,7 +136,8 @@ def fit(
     components = min(criteria, key=lambda count: criteria[count])
 
     reference = ReferenceTrajectory.from_demonstrations(resampled, components, seed, floor=floor)
-    folds = [_reference(times, np.delete(outputs, m, axis=0), components, seed, floor) for m in range(len(outputs))]
+    others = (Demonstrations(times, np.delete(outputs, m, axis=0)) for m in range(len(outputs)))
+    folds = [ReferenceTrajectory.from_demonstrations(fold, components, seed, floor=floor) for fold in others]
     make = partial(make_kernel, kernel, parameters=kernel_parameters)
     candidates = _validate(reference, folds, outputs, horizon, _grid(resampled, length_scale, lambda_), make)
     selected = _select(candidates)
@@ -194,14 +195,6 @@ def motion_without_actions(primitive: LcNsKmp) -> np.ndarray:
         if primitive.history:
             past = np.vstack([past[1:], motion[step]])
     return motion
-
-
-def _reference(
-    times: np.ndarray, outputs: np.ndarray, components: int, seed: int, floor: float | np.ndarray
-) -> ReferenceTrajectory:
-    """Return the reference of a subset of the demonstrations."""
-    means, covariances = regress(fit_mixture(times, outputs, components, seed), times)
-    return ReferenceTrajectory(times, means, covariances + np.diag(np.broadcast_to(floor, means.shape[1:]) ** 2))
 
 
 def _within(reference: ReferenceTrajectory, motion: np.ndarray, steps: Any) -> np.ndarray:

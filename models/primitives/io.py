@@ -220,7 +220,7 @@ def _parse_header(file: Any, key: str) -> tuple[tuple[int, ...], np.dtype]:
     try:
         reader = readers[np.lib.format.read_magic(file)]
     except (ValueError, KeyError) as error:
-        raise InputError(f"'{key}' is no array") from error
+        raise InputError(f"'{key}' is not an array") from error
     try:
         shape, _, dtype = reader(file, max_header_size=_MAX_HEADER_SIZE)
     except (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError) as error:
@@ -259,15 +259,15 @@ def _read_csv(data: bytes) -> Recording:
             if len(row) != len(header):
                 raise InputError(f"line {rows.line_num} has {len(row)} fields, the header has {len(header)}")
             if not is_plain and not all(field.isascii() and "_" not in field for field in row):
-                raise InputError(f"line {rows.line_num} holds something that is no number")
+                raise InputError(f"line {rows.line_num} holds something other than numbers")
             try:
                 values.extend(map(float, row))
             except ValueError as error:
-                raise InputError(f"line {rows.line_num} holds something that is no number: {error}") from error
+                raise InputError(f"line {rows.line_num} holds something other than numbers: {error}") from error
             if len(values) > MAX_NUMBERS:
                 raise InputError(f"it holds more than {MAX_NUMBERS} numbers: thin the samples out")
     except (csv.Error, UnicodeDecodeError) as error:
-        raise InputError(f"it is no table of numbers: {error}") from error
+        raise InputError(f"it is not a table of numbers: {error}") from error
     samples = np.frombuffer(values, dtype=float).reshape(-1, len(header))
     if not is_numbered:
         return Recording([samples[:, 0]], [samples[:, 1:]], header[1:])

@@ -23,8 +23,8 @@ class Kmp:
     `LcNsKmp` solves for a window of a clock; this class uses the whole reference at once, for primitives driven by a
     state instead of time, and for via-points. The solution is stored as weights of the kernel's features, whose number
     is the rank of the kernel and not the number of points. The weights are solved for with the triangular factor of a
-    QR decomposition. Adding, moving or removing a via-point appends the O rows of each via-point to the factor of the
-    reference, which is stored.
+    QR decomposition. The factor of the reference is stored: a change of a via-point only appends the O rows of each
+    via-point to it.
 
     Args:
         inputs: Times or states, (N,) or (N, I).

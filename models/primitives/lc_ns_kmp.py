@@ -342,7 +342,7 @@ class LcNsKmp:
         indices = points.astype(int) - step
         action = window_interpolation(self.kernel, past, future, self._history_noise, indices) @ actions
         trajectory, signed = factor.modified(x, action, self._solve)
-        violation = factor.max_commanded_violation(trajectory)
+        violation = factor.max_violation(trajectory)
         if not violation <= TOLERANCE:
             raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
         alpha = np.zeros(factor.multipliers_shape) if signed is None else factor.multipliers(signed)

@@ -5,8 +5,8 @@ In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = �
 same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
 length, so that a solver's tolerance is a tolerance on the output itself.
 
-The package `qpsolvers` is not used, because its constraints are one-sided, which doubles the rows (DAQP takes 1.8 times
-as long), and because it has no second tolerance, no margin and no check of an inaccurate result.
+The package `qpsolvers` is not used. Its constraints are one-sided, which doubles the rows (DAQP takes 1.8 times as
+long), and it has no second tolerance, no margin and no check of an inaccurate result.
 """
 
 from collections.abc import Callable

@@ -91,8 +91,8 @@ class ReferenceTrajectory:
             num_steps: Number of steps N; that of the longest demonstration by default.
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
                 such as the resolution of a sensor or a controller if demonstrations differ by less.
-            prior_std: Standard deviation, (O,), scalar, or rows of a phase and these, (K · (1 + O),), of a single
-                demonstration, as in `interpolate_prior`; required for one demonstration, refused for several.
+            prior_std: Standard deviations (O,) of a single demonstration, a scalar, or rows as in `interpolate_prior`;
+                required for one demonstration, refused for several.
 
         Raises:
             InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is
@@ -312,7 +312,7 @@ def information_criteria(
 def _fit_candidates(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, tuple[GaussianMixture, float]]:
-    """Return mixtures and their criteria by number of components, up to two in a row that are not better."""
+    """Return mixtures and their criteria by number of components; the search stops after two that are not better."""
     for count in candidates:
         if not 1 <= count <= len(times) // 2:
             raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")

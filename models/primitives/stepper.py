@@ -25,8 +25,8 @@ class Command:
         output: Command (O,).
         violation: max(c − G y) of the command, or its violation of the motion's constraints if there is a motion
             filter: negative if all constraints are slack, −inf without constraints.
-        is_fallback: True if no window within the constraints was found, so that the command is the point nearest to the
-            last command within the constraints of its step, or if braking is the only motion within the constraints.
+        is_fallback: True if no window within the constraints was found; the command is then the point within the
+            constraints of its step that is nearest to the last command. Also True if only braking was left.
     """
 
     output: np.ndarray

@@ -111,7 +111,7 @@ class StepFactor:
         R = np.linalg.qr(np.vstack([whitened, np.sqrt(self._hbar) * np.eye(rank * outputs)]), mode="r")
         eye = np.eye(outputs)
         F_bar = np.einsum("jk,oi->joki", F, eye).reshape(steps * outputs, rank * outputs)
-        # L is computed from the features and not as Σ^(1/2) Lw: the former is exact where Σ is tiny.
+        # L is computed from the features, because Σ^(1/2) Lw would lose digits where Σ is tiny.
         L = solve_triangular(R, F_bar.T, trans="T", check_finite=False).T
         Lw = solve_triangular(R, whitened.T, trans="T", check_finite=False).T
         # Data terms: L Lᵀ Σ⁻¹ μ of the means, and W̄ − L Lᵀ Σ⁻¹ W̄ of the history.
@@ -131,10 +131,9 @@ class StepFactor:
     def _factor_constraints(self, solution: _Solution) -> None:
         window = self._window
         steps, outputs = window.means.shape
-        self._directions = directions, first, second = _pair_opposites(window.G)
+        self._directions, self._opposites = directions, opposites = _pair_opposites(window.G)
         D = window.G[:, directions].reshape(-1, outputs)
-        lower = np.where(first >= 0, window.c[:, first], -np.inf)
-        upper = np.where(second >= 0, -window.c[:, second], np.inf)
+        lower, upper = window.c[:, directions], np.where(opposites >= 0, -window.c[:, opposites], np.inf)
 
         y_map, y_offset = solution.rows(np.arange(steps * outputs))
         at = np.repeat(np.arange(steps), len(directions))
@@ -217,11 +216,10 @@ class StepFactor:
 
     def multipliers(self, signed: np.ndarray) -> np.ndarray:
         """Return α (H+1, F) ≥ 0 for multipliers (m,) that are positive at an upper and negative at a lower bound."""
-        directions, first, second = self._directions
-        signed = (signed * self._scale).reshape(-1, len(directions))
-        alpha = np.zeros(self.multipliers_shape)
-        alpha[:, first[first >= 0]] = np.maximum(-signed[:, first >= 0], 0)
-        alpha[:, second[second >= 0]] = np.maximum(signed[:, second >= 0], 0)
+        signed = (signed * self._scale).reshape(-1, len(self._directions))
+        alpha, has_opposite = np.zeros(self.multipliers_shape), self._opposites >= 0
+        alpha[:, self._directions] = np.maximum(-signed, 0)
+        alpha[:, self._opposites[has_opposite]] = np.maximum(signed[:, has_opposite], 0)
         return alpha
 
     def violation(self, output: np.ndarray) -> float:
@@ -258,14 +256,14 @@ class StepFactor:
         pull = self._beta / self._hbar * projected
         latent = solution.latent_mean + solution.latent_map @ x
         y = (solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]).reshape(action.shape) + pull
-        along = np.einsum("jmo,jo->jm", self._window.G[:, self._directions[0]], pull).ravel() * self._scale
+        along = np.einsum("jmo,jo->jm", self._window.G[:, self._directions], pull).ravel() * self._scale
         free = self.constraint_map @ x + along
         if (free >= self.lower).all() and (free <= self.upper).all():
             return y, None
         v, signed = self.correct(free, solver)
         return y + (solution.L @ (self._basis @ v)).reshape(action.shape), signed
 
-    def max_commanded_violation(self, trajectory: np.ndarray) -> float:
+    def max_violation(self, trajectory: np.ndarray) -> float:
         """Return max(c − G y) over a whole window (H+1, O), −inf without constraints."""
         missing = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
         return float(missing.max(initial=-np.inf))
@@ -282,15 +280,16 @@ class StepFactor:
         return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))
 
 
-def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pair the rows of G (n, F, O) that are each other's negative at every step, as the two sides of a box are.
 
     The comparison has a tolerance, because normalization rounds rows of different scales differently.
 
     Returns:
-        For each direction: its row of G, the row of its lower bound, and the row of its upper bound (−1: no bound).
+        For each direction: its row of G, which has the lower bound, and the opposite row, which has the upper bound;
+        −1 if there is no opposite row.
     """
-    directions, first, second = [], [], []
+    directions, opposites = [], []
     taken: set[int] = set()
     for f in range(G.shape[1]):
         if f in taken:
@@ -301,6 +300,5 @@ def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         )
         taken |= {f, opposite}
         directions.append(f)
-        first.append(f)
-        second.append(opposite)
-    return np.array(directions, dtype=int), np.array(first, dtype=int), np.array(second, dtype=int)
+        opposites.append(opposite)
+    return np.array(directions, dtype=int), np.array(opposites, dtype=int)

@@ -9,7 +9,7 @@ from guiderail.models.robots.robot import EndEffector, JointDrives, register_end
 
 # A bayonet is locked by a quarter turn, from 90 degrees to 0. With the tool mounted half of that angle back, the
 # quarter turn is in the middle of the last joint's range for every robot.
-HALF_TURN_ANGLE = math.pi / 4  # half of the quarter turn [rad]
+MOUNT_ANGLE = math.pi / 4  # half of the quarter turn [rad]
 
 CONNECTOR_TOOL = register_end_effector(
     EndEffector(
@@ -19,7 +19,7 @@ CONNECTOR_TOOL = register_end_effector(
         mount_frame="tool_body",
         tool_center="tool_center",
         bodies=("tool_body", "tool_center"),
-        X_FlangeMount=RigidTransform(RotationMatrix.MakeZRotation(-HALF_TURN_ANGLE), [0.0, 0.0, 0.0]),
+        X_FlangeMount=RigidTransform(RotationMatrix.MakeZRotation(-MOUNT_ANGLE), [0.0, 0.0, 0.0]),
         source="this project's own design",
     )
 )

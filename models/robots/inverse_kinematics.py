@@ -120,9 +120,14 @@ class _Problem:
         """Return the error from the pose at `q` to X, (6,) rotation first, and the Jacobian (6, n)."""
         plant, context = self._plant, self._context
         plant.SetPositions(context, q)
-        X_now = self._tool_center.CalcPose(context, self._reference)
-        turn = (self._X.rotation() @ X_now.rotation().inverse()).ToAngleAxis()
+        error = pose_error(self._X, self._tool_center.CalcPose(context, self._reference))
         J = plant.CalcJacobianSpatialVelocity(
             context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._reference, self._reference
         )
-        return np.concatenate([turn.axis() * turn.angle(), self._X.translation() - X_now.translation()]), J
+        return error, J
+
+
+def pose_error(X_desired: RigidTransform, X: RigidTransform) -> np.ndarray:
+    """Return the twist (6,) that leads from a pose to the desired one in unit time, rotation first [rad, m]."""
+    turn = (X_desired.rotation() @ X.rotation().inverse()).ToAngleAxis()
+    return np.concatenate([turn.axis() * turn.angle(), X_desired.translation() - X.translation()])

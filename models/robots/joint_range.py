@@ -8,6 +8,7 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.damped_inverse import LEVER, TOOL_SCALE
+from guiderail.models.robots.inverse_kinematics import pose_error
 
 _ITERATIONS = 60
 _TOLERANCE = 1e-9  # largest norm of the pose error, as a scaled twist [m]
@@ -18,7 +19,7 @@ _DIFFERENCE = 1e-6  # joint step of the finite difference of a singular value [r
 class JointRange:
     """Joint positions at a commanded pose, and constraints on them.
 
-    The joint positions of a pose are those nearest to the posture, to which null-space control brings an arm at rest.
+    The joint positions of a pose are those nearest to the posture, because null-space control brings an arm there.
     Near a command y they are q(z) ≈ q(y) + J⁺ (z − y), so that limits of the joints are linear constraints on the next
     command. The second-order error of these constraints is not bounded in advance: `violation` computes the joint
     positions of the command itself, and a command with a violation is not executed (`MotionConstraintFilter`).
@@ -61,7 +62,8 @@ class JointRange:
         X = RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
         q = self._posture.copy()
         for _ in range(_ITERATIONS):
-            error, J = self._error_and_jacobian(q, X)
+            J = self._jacobian(q)
+            error = TOOL_SCALE * pose_error(X, self._tool_center.CalcPose(self._context, self._reference))
             U, sigma, WT = np.linalg.svd(J, full_matrices=False)
             rest = self._posture - q
             change = WT.T @ ((U.T @ error) * sigma / (sigma**2 + 1e-8) - WT @ rest) + rest
@@ -76,8 +78,7 @@ class JointRange:
         q = self.solve(output)
         if q is None:
             return np.zeros((0, POSE_SIZE)), np.zeros(0)
-        _, J = self._error_and_jacobian(q, None)
-        inverse = np.linalg.pinv(J) @ (TOOL_SCALE[:, None] * _twist_of_change(output))
+        inverse = np.linalg.pinv(self._jacobian(q)) @ (TOOL_SCALE[:, None] * _twist_of_change(output))
         rows, bounds = [inverse, -inverse], [self._lower - q, q - self._upper]
         if self._smallest:
             value, gradient = self._singular_value(q)
@@ -101,27 +102,21 @@ class JointRange:
         violation = float(np.maximum(self._lower - q, q - self._upper).max())
         return max(violation, (self._smallest - self._singular_value(q)[0]) / LEVER) if self._smallest else violation
 
-    def _error_and_jacobian(self, q: np.ndarray, X: RigidTransform | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the scaled twist (6,) from the pose at `q` to X, rotation first, and the scaled Jacobian (6, n)."""
-        plant, context = self._plant, self._context
-        plant.SetPositions(context, q)
-        J = plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._reference, self._reference
+    def _jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Set the arm to `q` and return the scaled Jacobian (6, n), rotation first."""
+        self._plant.SetPositions(self._context, q)
+        J = self._plant.CalcJacobianSpatialVelocity(
+            self._context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._reference, self._reference
         )
-        error = np.zeros(POSE_SIZE)
-        if X is not None:
-            X_now = self._tool_center.CalcPose(context, self._reference)
-            turn = (X.rotation() @ X_now.rotation().inverse()).ToAngleAxis()
-            error = np.concatenate([turn.axis() * turn.angle(), X.translation() - X_now.translation()])
-        return TOOL_SCALE * error, TOOL_SCALE[:, None] * J
+        return TOOL_SCALE[:, None] * J
 
     def _singular_value(self, q: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the smallest singular value of the scaled Jacobian, and its gradient (n,)."""
-        _, J = self._error_and_jacobian(q, None)
+        J = self._jacobian(q)
         U, sigma, WT = np.linalg.svd(J, full_matrices=False)
         gradient = np.zeros(len(q))
         for joint in range(len(q)):
-            _, moved = self._error_and_jacobian(q + _DIFFERENCE * np.eye(len(q))[joint], None)
+            moved = self._jacobian(q + _DIFFERENCE * np.eye(len(q))[joint])
             gradient[joint] = U[:, -1] @ ((moved - J) / _DIFFERENCE) @ WT[-1]
         return float(sigma[-1]), gradient
 

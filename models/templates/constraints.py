@@ -20,7 +20,6 @@ from guiderail.models.templates.geometry import (
     Frames,
     bearing,
     chord_angle,
-    interpolate,
     largest,
     matrix_deg,
     pose_distance,
@@ -257,7 +256,7 @@ class KeepAbove(FrameConstraint):
 @register(ACTIVE_CONSTRAINTS, "funnel")
 @dataclass(frozen=True)
 class Funnel(PositionConstraint):
-    """Conical ceiling z ≤ height_m + slope · max(0, radius − radius_m) for p_FE, which falls towards F's z axis."""
+    """Ceiling of p_FE that falls like a cone to F's z axis: z ≤ height_m + slope · max(0, radius − radius_m)."""
 
     frame: str  # F: frame of an object, or `world`
     radius_m: float  # radius within which the ceiling is flat
@@ -387,7 +386,7 @@ class TiltByDistance(TiltConstraint):
 
     @override
     def limits_deg(self, distance_m: float) -> tuple[float, float]:
-        tilt = interpolate(distance_m, self.distance_m, self.tilt_deg)
+        tilt = float(np.interp(distance_m, self.distance_m, self.tilt_deg))
         return tilt, tilt
 
 

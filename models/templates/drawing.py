@@ -15,17 +15,14 @@ def state_lines(state: TemplateState) -> list[str]:
     """Describe a state in short lines: mappings, constraints, limits and distance, in the order in which they apply."""
     mappings = [f"{type(m).__name__} ← {', '.join(f'u{i + 1}' for i in m.used_inputs)}" for m in state.input_mapping]
     constraints = [f"{i + 1}. {type(c).__name__}" for i, c in enumerate(state.active_constraints)]
-    given = [
-        (sign, getattr(state, name), unit)
-        for sign, name, unit in (
-            ("|f|", "max_force_n", "N"),
-            ("|τ|", "max_torque_nm", "Nm"),
-            ("|v|", "max_speed_m_per_s", "m/s"),
-            ("|ω|", "max_speed_rad_per_s", "rad/s"),
-        )
-    ]
-    limits = [f"{sign} ≤ {value:g} {unit}" for sign, value, unit in given if value is not None]
-    return [*mappings, *constraints, *limits, f"d: {type(state.transition_distance).__name__}"]
+    limits = (
+        ("|f|", state.max_force_n, "N"),
+        ("|τ|", state.max_torque_nm, "Nm"),
+        ("|v|", state.max_speed_m_per_s, "m/s"),
+        ("|ω|", state.max_speed_rad_per_s, "rad/s"),
+    )
+    bounds = [f"{sign} ≤ {value:g} {unit}" for sign, value, unit in limits if value is not None]
+    return [*mappings, *constraints, *bounds, f"d: {type(state.transition_distance).__name__}"]
 
 
 def list_edges(template: SharedControlTemplate) -> list[tuple[str, str, str]]:

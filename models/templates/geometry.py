@@ -1,4 +1,4 @@
-"""Frames, tilt, bearing and interpolation of poses, shared by mappings and constraints.
+"""Frames, tilt, bearing and distances of poses, shared by mappings and constraints.
 
 Frames: W world, E the end effector (or the tip of what it holds), F an object. A tilt is a rotation about the
 horizontal axis that is perpendicular to the bearing, the horizontal direction from E to the object.
@@ -7,7 +7,6 @@ horizontal axis that is perpendicular to the bearing, the horizontal direction f
 import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -80,11 +79,6 @@ def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
     return np.array([-towards[1], towards[0], 0.0])
 
 
-def about(axis: Any, angle: float) -> RotationMatrix:
-    """Return the rotation by `angle` [rad] about the unit vector `axis`."""
-    return axis_angle_rotation(axis, angle)
-
-
 def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
     """Return the angle [rad] of the rotation from A to B; accurate for small angles too."""
     return chord_angle(R_WA.matrix(), R_WB.matrix())
@@ -122,8 +116,3 @@ def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> Rigi
     R_WA = X_WA.rotation().matrix()
     axis, angle = axis_angle(RotationMatrix(R_WA.T @ X_WB.rotation().matrix()))
     return RigidTransform(R_WA @ axis_angle_rotation(axis, fraction * angle).matrix(), p_WX)
-
-
-def interpolate(x: float, xs: tuple[float, ...], ys: tuple[float, ...]) -> float:
-    """Return the value at `x` of the piecewise linear function through (xs, ys), constant beyond both ends."""
-    return float(np.interp(x, xs, ys))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from typing_extensions import override
 
-from guiderail.models.common.transforms import RigidTransform, RotationMatrix
-from guiderail.models.templates.geometry import WORLD, Frames, about, bearing, interpolate, position_in, tilt_axis
+from guiderail.models.common.transforms import RigidTransform, RotationMatrix, axis_angle_rotation
+from guiderail.models.templates.geometry import WORLD, Frames, bearing, position_in, tilt_axis
 from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
 
 TOOL = "tool"
@@ -16,8 +16,8 @@ TOOL = "tool"
 class InputMapping(ABC):
     """One mapping of map_q (equation 2.19), for some of the inputs.
 
-    A displacement ΔH is a RigidTransform whose translation is added to p_WE and whose rotation is applied to R_WE
-    from the left, that is about the end effector's origin and expressed in the world.
+    A displacement ΔH is a RigidTransform. Its translation is added to p_WE. Its rotation, about the end effector's
+    origin and expressed in the world, is applied to R_WE from the left.
     """
 
     inputs: tuple[int, ...]
@@ -101,7 +101,7 @@ class Rotation(InputMapping):
         w_FE = self.speed_rad_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
         turn = axes_in_world(self.frame, X_WE, frames) @ w_FE * period_s
         angle = float(np.linalg.norm(turn))
-        return RigidTransform(RotationMatrix() if angle == 0 else about(turn / angle, angle), np.zeros(3))
+        return RigidTransform(RotationMatrix() if angle == 0 else axis_angle_rotation(turn / angle, angle), np.zeros(3))
 
 
 @register(INPUT_MAPPINGS, "tilt_towards")
@@ -127,7 +127,7 @@ class TiltTowards(InputMapping):
         p_FE = position_in(self.frame, X_WE, frames)
         along = float(np.clip(inputs[list(self.inputs)] @ bearing(p_FE)[:2], -1.0, 1.0))
         axis_W = axes_in_world(self.frame, X_WE, frames) @ tilt_axis(p_FE)
-        return RigidTransform(about(axis_W, along * self.speed_rad_per_s * period_s), np.zeros(3))
+        return RigidTransform(axis_angle_rotation(axis_W, along * self.speed_rad_per_s * period_s), np.zeros(3))
 
 
 class ScaledMapping(InputMapping):
@@ -167,7 +167,7 @@ class Scaled(ScaledMapping):
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
-        factor = interpolate(distance, self.distance_m, self.factor)
+        factor = float(np.interp(distance, self.distance_m, self.factor))
         return self.of.displacement(factor * inputs, X_WE, frames, period_s)
 
 

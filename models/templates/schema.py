@@ -310,7 +310,7 @@ def _read(data: Any, where: str, given: Mapping[str, float]) -> SharedControlTem
 
 
 def _check_references(template: SharedControlTemplate, state: TemplateState) -> None:
-    """Raise an InputError if a state names what the template does not have, or has a higher speed than the template."""
+    """Raise an InputError if a state uses a name that the template lacks, or is faster than the template allows."""
     for name in ("max_speed_m_per_s", "max_speed_rad_per_s"):
         speed, largest = getattr(state, name), getattr(template, name)
         if speed is not None and speed > largest:

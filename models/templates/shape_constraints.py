@@ -18,7 +18,7 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, requi
 class Outside(PositionConstraint):
     """Base class of constraints to stay outside of a convex shape in F.
 
-    A request is projected into the half-space outside of the shape that is linearized at the last command. Hence the
+    A request is projected into a half-space outside of the shape, which is linearized at the last command. Hence the
     straight line from every command to the next one is outside too.
     """
 

@@ -150,7 +150,7 @@ class SharedControlTemplate:
     def command(
         self, state: int, X_WLast: RigidTransform, X_WRequest: RigidTransform, frames: Frames, period_s: float
     ) -> Command:
-        """Return the pose nearest to a request that is allowed and reachable from the last command in one period.
+        """Return the pose nearest to a request, of the poses that are allowed and reachable in one period.
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the

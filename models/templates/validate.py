@@ -85,7 +85,7 @@ def _find_unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
 
 
 def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
-    """Check that each constraint and their sequence are idempotent, and that the sequence satisfies all constraints."""
+    """Check that each constraint and the whole sequence are idempotent, and that no constraint undoes another."""
     for number, state in enumerate(template.states):
         for i, constraint in enumerate(state.active_constraints):
             name = f"{state.name}: active constraint {i + 1} ({type(constraint).__name__})"
@@ -146,7 +146,7 @@ def _greedy(
     number: int,
     X_WE: RigidTransform,
     frames: Frames,
-    enough: float,
+    threshold: float,
     period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
     """Return the least distance, and the last pose, of a greedy search that applies one full input at every step."""
@@ -162,7 +162,7 @@ def _greedy(
         if distance > best - 1e-6 * period:
             return min(best, distance), X_WE
         best = distance
-        if best < enough:
+        if best < threshold:
             return best, X_WE
     return best, X_WE
 

@@ -9,8 +9,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period
 
 _TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s], far above rounding errors after days, far below any period
-
-
 _MAX_COORDINATE = 1e6  # largest number in a command [m, rad], so that no wrench overflows
 
 

@@ -73,6 +73,7 @@ class TemplateFrames:
 
 
 def _checked_pose(name: str, X_WF: RigidTransform) -> np.ndarray:
-    if not np.isfinite(transform_to_pose(X_WF)).all():
+    pose = transform_to_pose(X_WF)
+    if not np.isfinite(pose).all():
         raise InputError(f"the frame {name} must be at a finite pose, not at {X_WF.translation()}")
-    return transform_to_pose(X_WF)
+    return pose

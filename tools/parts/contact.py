@@ -16,7 +16,8 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.common.transforms import MM
 from guiderail.models.parts.drake_check import Piece, piece_text
 from guiderail.models.parts.mesh_file import obj_text
-from guiderail.models.parts.preparation import KINDS, ContactSurface, join_bodies, make_compliant
+from guiderail.models.parts.preparation import KINDS, ContactSurface, make_compliant
+from guiderail.models.parts.solids import join_surfaces
 
 MODULUS = 2e9  # first modulus of the compliant part [Pa]
 MAX_MODULUS = 5e10
@@ -268,6 +269,7 @@ def _write_pieces(folder: Path, contact: Contact, surfaces: dict[str, ContactSur
         for old in [*folder.glob(f"{name}_*.obj"), *folder.glob(f"{name}_*.vtk")]:
             old.unlink()
         if name != contact.compliant:
-            (folder / f"{name}_surface.obj").write_text(obj_text(*join_bodies(surfaces[name])), encoding="utf-8")
+            text = obj_text(*join_surfaces(surfaces[name].bodies))
+            (folder / f"{name}_surface.obj").write_text(text, encoding="utf-8")
     for (file, _), piece in zip(contact.files, contact.pieces, strict=True):
         (folder / file).write_text(piece_text(piece), encoding="utf-8")

@@ -30,7 +30,7 @@ BORE_SIDES = 24  # sides of the polygon that approximates the bore
 
 @dataclass(frozen=True)
 class BncDimensions:
-    """Dimensions in meters and radians; heights of the slot are those of a lug's center above the mouth."""
+    """Dimensions in meters and radians; the slot's heights are heights of a lug's center above the mouth."""
 
     barrel_radius: float = 4.825 * MM
     barrel_height: float = 10.0 * MM

@@ -30,7 +30,7 @@ NUM_VISUAL_SIDES = 12  # sides of a polygon in visual geometry
 
 @dataclass(frozen=True)
 class GridClampDimensions:
-    """Dimensions in meters; a radius is that of the circle inside the polygon, depths are from the table's face."""
+    """Dimensions in meters. Radii are of the circles inside the polygons; depths are measured from the table's face."""
 
     peg_radius: float = 4.0 * MM
     peg_length: float = 12.0 * MM  # from the shoulder to the tip
@@ -96,7 +96,7 @@ def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
 
 
 def lip_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """Return the collision mesh of the lip, a ring that narrows and widens; the origin is that of the middle hole."""
+    """Return the collision mesh of the lip, a ring that narrows and widens, in the frame of the middle hole's mesh."""
     d = dimensions
     top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
     return _lathe(

@@ -78,7 +78,7 @@ class PassageGeometry:
 
         Args:
             pose: Pose of the robot (2,) [m].
-            obstacle: Position (x, y) of the obstacle; that of `obstacle` by default.
+            obstacle: Position (x, y) of the obstacle [m]; the attribute `obstacle` by default.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius

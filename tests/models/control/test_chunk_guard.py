@@ -58,6 +58,7 @@ def test_slowdown_preserves_the_path_of_a_fast_chunk():
 
 def test_guard_is_refused_when_an_argument_is_out_of_range():
     wrong = [{"start": np.array([0.06, 0.0])}, {"mode": "brake"}, {"period": 0.0}]
+    wrong += [{"tolerance": np.ones(3)}, {"tolerance": np.array([0.0, 1.0])}]
     for argument in wrong:
         with pytest.raises(InputError):
             make(**argument)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import LinearConstraints
@@ -99,5 +100,5 @@ def test_two_active_constraints_give_the_nearest_corner():
     ("lower", "upper", "margin"), [([[0, 0]], [[0, 1]], 0.1), ([[0, 0]], [[1]], 0.1), ([[0, 0]], [[1, 1]], -0.1)]
 )
 def test_constructor_refuses_nonsense(lower, upper, margin):
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         KeepOut(lower, upper, LinearConstraints.none(2), margin)

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints
 
@@ -170,8 +171,8 @@ def test_constructor_refuses_invalid_arguments():
         ([[0, 0], [0, 0]], [[1, 1]], none),
         ([[0, 0]], [[1, 0]], none),
     ):
-        with pytest.raises(ValueError):
+        with pytest.raises(InputError):
             KeepOut(lower, upper, constraints, 0.1)
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         KeepOut([[0, 0]], [[1, 1]], none, np.nan)
     assert KeepOut([[0, 0]], [[1, 1]], none, 0.0).margin == 0.0

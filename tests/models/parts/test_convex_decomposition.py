@@ -35,7 +35,7 @@ def test_cut_returns_convex_pieces_that_make_up_the_plug(name, tmp_path):
 
 
 def test_cut_returns_none_when_pieces_exceed_the_limit(tmp_path):
-    assert cut_into_convex_pieces(make_solids(load_plug("bayonet", tmp_path))[0], most=3) is None
+    assert cut_into_convex_pieces(make_solids(load_plug("bayonet", tmp_path))[0], max_pieces=3) is None
 
 
 def test_cut_returns_none_when_a_faceted_bore_would_be_filled():

@@ -63,9 +63,9 @@ GOOD = {"times": npy("<f8", (4,), T.tobytes()), "outputs": npy("<f8", (1, 4, 2),
         ({"outputs": npy("<f8", "(" * 300, Y.tobytes())}, "header of 'outputs'"),
         ({"outputs": npy("<f8", "(1, 4, 2), 'shape': __import__('os')", Y.tobytes())}, "header of 'outputs'"),
         ({"outputs": npy("<f8", "(1, 4, 2)" + " " * 2000, Y.tobytes())}, "header of 'outputs'"),
-        ({"outputs": npy("<f8", (1, 4, 2), Y.tobytes(), version=b"\x09\x00")}, "no array"),
-        ({"outputs": b"\x93NUMPY"}, "no array"),
-        ({"outputs": b""}, "no array"),
+        ({"outputs": npy("<f8", (1, 4, 2), Y.tobytes(), version=b"\x09\x00")}, "not an array"),
+        ({"outputs": b"\x93NUMPY"}, "not an array"),
+        ({"outputs": b""}, "not an array"),
         ({"outputs": npy("<c16", (1, 4, 1), Y.tobytes())}, "must hold numbers"),
         ({"outputs": npy("|O", (1, 4, 2), b"cos\nsystem\n(S'true'\ntR.")}, "Python objects"),
         ({"outputs": npy([("x", "<f8")], (1, 4, 2), Y.tobytes())}, "must hold numbers"),
@@ -268,7 +268,7 @@ def test_folder_with_no_or_too_many_files_is_refused(tmp_path):
         ("t,x\n0," + "1" * 140_000, "longer than"),
         ("t,x\n" + "," * 200_000, "longer than"),
         ('t,x\n0,"' + "\n" * 200_000, "field limit"),
-        ('t,x\n0,1\n"1"5,1\n', "no table"),
+        ('t,x\n0,1\n"1"5,1\n', "not a table"),
         ("t,x\x00y\n0,1\n1,2\n", "can't be named"),
         ('t,"x\ny"\n0,1\n1,2\n', "can't be named"),
         ("t,x\n" + "\n" * 400_001, "more than 400000 lines"),
@@ -282,7 +282,7 @@ def test_csv_reader_refuses_invalid_tables(tmp_path, text, said):
 
 def test_csv_reader_refuses_invalid_utf8(tmp_path):
     (tmp_path / "d.csv").write_bytes(b"t,x\n0,\xff\n")
-    assert "no table" in refused(tmp_path / "d.csv")
+    assert "not a table" in refused(tmp_path / "d.csv")
 
 
 def test_read_refuses_pipes_and_devices(tmp_path):

@@ -64,7 +64,7 @@ def test_readers_refuse_a_name_that_is_too_long(read, ending, tmp_path):
         ("0,1,2\n0.1,1,2\n", "first line must be"),
         ("x,y,z\n0,1,2\n1,2,3\n", "first line must be"),
         ("t,x\n0,one\n1,2\n", "could not convert"),
-        ("t,x\n0,1\n1,\n", "line 3 holds something that is no number"),
+        ("t,x\n0,1\n1,\n", "line 3 holds something other than numbers"),
         ("t,x\n0,1\n1,nan\n", "NaN"),
         ("t,x\n1,1\n0,2\n", "does not increase"),
     ],

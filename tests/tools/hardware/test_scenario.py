@@ -56,7 +56,7 @@ def test_shipped_scenario_has_a_simulated_driver():
         ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "must accept them"),
         (DRIVER, "does not define"),
         ("directives: 3\n", "is no scenario"),
-        ("{{", "as a key is no text"),
+        ("{{", "is not text: put it in quotes"),
         ("[" * 5000, "inside each other"),
         ("station: [\n", "is not YAML"),
         ("station: !python/object:os.system x\n", "the tag"),
