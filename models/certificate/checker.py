@@ -287,8 +287,7 @@ class Primitive:
         """Compute the quantities (N, outs) of the regimes "free" and "always"."""
         (middle, spread, wrong, corrected, _), P, N, outs = reached, self.past, self.steps, self.outputs
         wrong = wrong + 4 * spread.shape[2] * EXTENDED * (np.abs(middle) + np.abs(spread).sum(axis=2))
-        size, is_corrected = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0])
-        least, greatest = self.caps()
+        size, is_corrected, (least, greatest) = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0]), self.caps()
         free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
         for order, name in ((1, "speed"), (2, "acceleration")):
             change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(spread, order, axis=0)).sum(axis=2)
@@ -345,10 +344,7 @@ class Primitive:
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
-    """Bound the commands of step n by cells of actions: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖².
-
-    v is the correction of an action in a cell, and v̄ the interpolation of the corrections at the cell's corners.
-    """
+    """Bound the commands of step n by cells: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², with v̄ interpolated from a cell's corners."""
     (rows_L, rows, c, room), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / max(A, 1))) - 1
     fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)

@@ -103,9 +103,7 @@ class Demonstrations:
         if count is None:
             return self
         if not 1 <= count <= self.num_demonstrations:
-            raise InputError(
-                f"choose from 1 to all {self.num_demonstrations} demonstrations, not {count}"
-            )
+            raise InputError(f"choose from 1 to all {self.num_demonstrations} demonstrations, not {count}")
         return Demonstrations(self.times[:count], self.outputs[:count], self.names)
 
     def resampled(self, num_steps: int | None = None) -> "Demonstrations":

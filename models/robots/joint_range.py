@@ -1,5 +1,7 @@
 """Joint limits of an arm, and distance from singular postures, as constraints on the commanded pose."""
 
+from functools import lru_cache
+
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
@@ -51,6 +53,7 @@ class JointRange:
             raise InputError(f"a margin and a singular value are not negative, not {margin} and {min_singular_value}")
         self._plant, self._reference, self._tool_center = plant, reference, tool_center
         self._context = plant.CreateDefaultContext()
+        self._solve_once = lru_cache(maxsize=8)(self._solve)  # a control step requests the same poses several times
         self._posture, self._smallest = np.array(posture, dtype=float), float(min_singular_value)
         self._lower = plant.GetPositionLowerLimits() + margin
         self._upper = plant.GetPositionUpperLimits() - margin
@@ -59,6 +62,10 @@ class JointRange:
 
     def solve(self, pose: np.ndarray) -> np.ndarray | None:
         """Return the joint positions (n,) of a pose (6,), nearest to the posture; None if they are not found."""
+        return self._solve_once(np.asarray(pose, dtype=float).tobytes())
+
+    def _solve(self, coordinates: bytes) -> np.ndarray | None:
+        pose = np.frombuffer(coordinates)
         X = RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
         q = self._posture.copy()
         for _ in range(_ITERATIONS):
@@ -100,7 +107,10 @@ class JointRange:
         if q is None:
             return np.inf
         violation = float(np.maximum(self._lower - q, q - self._upper).max())
-        return max(violation, (self._smallest - self._singular_value(q)[0]) / LEVER) if self._smallest else violation
+        if self._smallest:
+            sigma = np.linalg.svd(self._jacobian(q), full_matrices=False)[1]
+            violation = max(violation, (self._smallest - float(sigma[-1])) / LEVER)
+        return violation
 
     def _jacobian(self, q: np.ndarray) -> np.ndarray:
         """Set the arm to `q` and return the scaled Jacobian (6, n), rotation first."""

@@ -117,7 +117,7 @@ def test_projector_updates_once_at_each_instant():
     rig = Rig()
     step = np.array([0.001, 0.0, 0.0, 0.0, 0.0, 0.0])
     rig.step(START + step)
-    # Seen before the events of an instant: the command of the step that is over, and the one before it.
+    # Before the events of an instant, the last command is that of the step before.
     np.testing.assert_allclose(rig.value("last_desired_pose"), START[0])
     rig.step(START + 2 * step)
     np.testing.assert_allclose(rig.system.get_last_desired_pose_output_port().Eval(rig.context), START + step)
@@ -140,13 +140,13 @@ def test_command_waits_when_the_tracking_error_is_too_large():
     assert 0.02 < desired[0] < 0.02 + 2 * 0.5 * PERIOD
     # A request within the last command brings the robot no nearer either.
     assert rig.step(desired)[1] == 1.0
-    # It may always come back.
+    # A request towards the robot is always followed.
     desired, fallback = rig.step(START)
     assert fallback == 0.0
     assert desired[0] < 0.02
 
 
-# The second state's floor is a little above where the first one's transition happens, but within reach of a period.
+# The floor of the second state is slightly above the transition's threshold, within reach of one period.
 RAISED = parse_template(
     "name: step"
     + ABOVE
@@ -186,7 +186,7 @@ def test_waiting_command_is_led_inside_when_an_object_moves():
     rig = Rig(max_tracking_error=0.02)
     rig.step(START, measured=START + [0.0, 0.0, -0.05, 0.0, 0.0, 0.0])
     rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.3])})
-    # The command that is over is the last of before the object was moved.
+    # This command was computed before the object moved.
     last, _ = rig.step(START)
     for _ in range(30):
         desired, fallback = rig.step(START)
@@ -256,7 +256,7 @@ def test_command_is_led_inside_when_the_robot_starts_outside():
     assert violations[-1] <= 1e-9
 
 
-def test_measured_violation_is_that_of_the_measured_pose():
+def test_measured_violation_is_evaluated_at_the_measured_pose():
     rig = Rig()
     rig.step(START, measured=np.array([0.0, 0.0, 0.07, 0.0, 0.0, 0.0]))
     assert rig.value("measured_violation") == pytest.approx(0.03)

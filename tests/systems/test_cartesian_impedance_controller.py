@@ -230,7 +230,7 @@ def test_last_valid_pose_is_followed_when_commands_stop():
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300, 1.001e6])
 def test_command_is_ignored_when_it_is_not_finite(wrong):
-    """A stiffness frame that is turned rotates the wrench, in which an overflow would become NaN."""
+    """A rotated stiffness frame rotates the wrench, and the rotation of an overflow would be NaN."""
     arm = FreeArm(POSTURES[0], time_step=0.005, turned_axes=RotationMatrix.MakeZRotation(0.7))
     start = arm.pose()
     arm.command(np.array([wrong, -wrong, wrong, 0.0, 0.0, 0.0]))
@@ -268,10 +268,8 @@ def test_damping_gives_every_mode_its_damping_ratio():
     A, B = rng.standard_normal((2, 6, 6))
     K, Lambda = A @ A.T + np.eye(6), B @ B.T + np.eye(6)
     D = damping_matrix(K, np.linalg.inv(Lambda), 0.7)
-    subprocess_tied_to_parent = np.block(
-        [[np.zeros((6, 6)), np.eye(6)], [-np.linalg.solve(Lambda, K), -np.linalg.solve(Lambda, D)]]
-    )
-    poles = np.linalg.eigvals(subprocess_tied_to_parent)
+    companion = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.linalg.solve(Lambda, K), -np.linalg.solve(Lambda, D)]])
+    poles = np.linalg.eigvals(companion)
     np.testing.assert_allclose(-poles.real / np.abs(poles), 0.7, atol=1e-6)
 
 

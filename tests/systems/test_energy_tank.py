@@ -1,4 +1,4 @@
-"""Adversarial test of passivity: references, bounds and the surroundings conspire to extract energy."""
+"""Adversarial test of passivity: reference, bound and surroundings move so as to extract energy."""
 
 import numpy as np
 import pytest

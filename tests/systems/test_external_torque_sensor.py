@@ -20,7 +20,7 @@ def arm():
     return controller_model(BncWorkcell())
 
 
-def none(sensor):
+def no_errors(sensor):
     bodies = len(sensor.bodies)
     return JointTorqueErrors(np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(bodies), np.zeros((bodies, 3)))
 
@@ -33,7 +33,7 @@ def measured(arm, *, noise=0.0, drift=0.0, seconds=0.005, velocity=0.0, payload=
     context = simulator.get_mutable_context()
     sensor.get_state_input_port().FixValue(context, np.concatenate([HOME, np.full(7, velocity)]))
     sensor.get_contact_torque_input_port().FixValue(context, CONTACT)
-    sensor.set_errors(context, replace(none(sensor), **errors), seed)
+    sensor.set_errors(context, replace(no_errors(sensor), **errors), seed)
     sensor.add_payload(context, payload)
     simulator.AdvanceTo(seconds)
     return sensor.get_external_torque_output_port().Eval(context).copy(), sensor
@@ -52,7 +52,7 @@ def test_contact_torques_are_measured_without_errors(arm):
 
 
 def test_gain_acts_on_gravity_too(arm):
-    """A sensor measures the whole torque of its joint, also that of the arm's own weight."""
+    """A sensor measures the whole torque of its joint, including the weight of the arm."""
     gain = 0.01 * np.arange(7)
     np.testing.assert_allclose(measured(arm, gain=gain)[0], CONTACT + gain * (CONTACT + gravity(arm)), atol=1e-9)
 

@@ -78,7 +78,7 @@ def test_repeated_or_older_heartbeat_is_no_sign_of_life(sequence):
     assert rig.fault == Fault.MONITOR_STOP
 
 
-def test_silent_monitor_is_noticed_while_another_one_speaks():
+def test_missing_monitor_is_noticed_while_another_is_alive():
     rig = Rig()
     rig.step(Heartbeat(1, False, 7), Heartbeat(1, False, 8))
     faults = [rig.step(Heartbeat(1, False, 7), Heartbeat(2 + k, False, 8)) for k in range(12)]
@@ -87,7 +87,7 @@ def test_silent_monitor_is_noticed_while_another_one_speaks():
     assert faults[4 : 4 + missed] == [Fault.MONITOR_STOP] * missed
     assert set(faults[4 + missed :]) == {Fault.NONE}  # replaced
     assert rig.is_alive
-    # It is missed again if it has returned meanwhile.
+    # A monitor that has returned is missed again.
     rig.step(Heartbeat(2, False, 7), Heartbeat(90, False, 8))
     faults = [rig.step(Heartbeat(2, False, 7), Heartbeat(91 + k, False, 8)) for k in range(5)]
     assert faults == [Fault.NONE] * 4 + [Fault.MONITOR_STOP]
@@ -100,7 +100,7 @@ def test_last_monitor_is_never_forgotten():
     assert rig.fault == Fault.MONITOR_STOP
 
 
-def test_stop_of_a_silent_monitor_is_forgotten_with_it():
+def test_stop_of_a_missing_monitor_is_forgotten_with_it():
     rig = Rig()
     rig.step(Heartbeat(1, True, 7), Heartbeat(1, False, 8))
     for k in range(20):

@@ -1,4 +1,4 @@
-"""Tests of the system alone; `tests/diagrams/stations/test_mujoco_gantry.py` tests the physics."""
+"""Tests of the system alone; `tests/diagrams/stations/test_mujoco.py` tests the physics."""
 
 import numpy as np
 import pytest

@@ -92,7 +92,7 @@ def test_distance_and_progress_equal_those_of_the_template(template):
     assert rig.system.get_transition_distance_output_port().Eval(rig.context)[0] == pytest.approx(0.24)
     progress = rig.system.get_progress_output_port().Eval(rig.context)[0]
     assert progress == pytest.approx(template.progress(1, X_WE, FRAMES))
-    # 5 per meter, from 0.40 m on: the same in both states where one hands over to the other.
+    # 5 per meter from 0.40 m on, continuous at the transition.
     assert progress == pytest.approx(5.0 * (0.40 - 0.24))
 
 

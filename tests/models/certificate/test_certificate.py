@@ -536,7 +536,7 @@ def test_signature_needs_the_key(tmp_path):
         checker.check(tmp_path, KEY[::-1])
     with pytest.raises(checker.Rejected, match="16 bytes"):
         checker.check(tmp_path, KEY[:15])
-    # Anyone can compute the digest of other claims, and even keep the signature of the first ones.
+    # Anyone can change the claims, compute their digest and keep the old signature.
     claims = json.loads(contents[CERTIFICATE])
     claims["about"] = {"task": "easier"}
     forged = json.loads(seal(claims))

@@ -1,4 +1,4 @@
-"""A function in a process of its own returns its result, or the reason for which it has none."""
+"""An isolated function returns its result, or an error with the reason."""
 
 import os
 

@@ -107,7 +107,7 @@ def test_torques_are_the_wrench_and_gravity_in_joint_space(seed):
 def test_posture_torque_does_not_accelerate_the_tool(seed):
     given_ = arm(seed)
     Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T)
-    # Near a singular posture a part of the posture's torque is let through on purpose, to leave it again.
+    # Near a singular posture a part of the posture's torque acts on the tool, so that the arm leaves the posture.
     assume(np.allclose(reachable_inertia(Lambda_inverse) @ Lambda_inverse, np.eye(6)))
     with_posture = impedance_torques(**given_)
     without = impedance_torques(**arm(seed, posture_torque=np.zeros(7)))
@@ -115,7 +115,7 @@ def test_posture_torque_does_not_accelerate_the_tool(seed):
     added = with_posture.torque - without.torque
     acceleration = given_["J"] @ np.linalg.solve(given_["M"], added)
     assert np.abs(acceleration).max() < 1e-6 * np.abs(given_["posture_torque"]).max() * 100
-    # Yet it does move the joints: seven of them have one direction left.
+    # It moves the joints, because seven joints have one direction that does not move the tool.
     assert np.abs(added).max() > 1e-6
 
 

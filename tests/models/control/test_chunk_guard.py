@@ -1,4 +1,4 @@
-"""Guard of chunks: limits at every commanded step for any chunk, and the chunk itself where it is within them."""
+"""Chunk guard: every command is within the limits, and a chunk within the limits is hardly changed."""
 
 import numpy as np
 import pytest

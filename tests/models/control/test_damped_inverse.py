@@ -27,7 +27,7 @@ def test_regular_posture_uses_the_pseudoinverse(num_joints):
 
 
 def test_joint_velocities_stay_bounded_near_a_singularity():
-    """No unit of tool speed takes more than 1/σ₀ of joint speed, however singular the posture."""
+    """A unit of tool speed takes at most a joint speed of 1/σ₀ in any posture."""
     rng = np.random.default_rng(1)
     for left in (0.05, 0.02, 0.01, 1e-4, 1e-9, 0.0):
         J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, left]), 6, rng)

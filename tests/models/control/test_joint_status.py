@@ -20,7 +20,7 @@ from guiderail.models.control.joint_status import (
     damping_torque,
 )
 
-# Dyadic numbers, so that a value exactly at a limit is no matter of rounding.
+# Dyadic numbers, so that rounding does not decide on a value exactly at a limit.
 LIMITS = StatusLimits(
     velocity=(1.0, 2.0), max_age=0.03125, max_lead=0.0625, position_jump=0.015625, velocity_jump=1.5, settling_time=0.25
 )

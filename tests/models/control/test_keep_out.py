@@ -99,6 +99,6 @@ def test_two_active_constraints_give_the_nearest_corner():
 @pytest.mark.parametrize(
     ("lower", "upper", "margin"), [([[0, 0]], [[0, 1]], 0.1), ([[0, 0]], [[1]], 0.1), ([[0, 0]], [[1, 1]], -0.1)]
 )
-def test_constructor_refuses_nonsense(lower, upper, margin):
+def test_constructor_refuses_empty_boxes_and_invalid_margins(lower, upper, margin):
     with pytest.raises(InputError):
         KeepOut(lower, upper, LinearConstraints.none(2), margin)

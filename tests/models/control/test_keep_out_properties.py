@@ -102,7 +102,7 @@ def test_projection_to_constraints_is_the_nearest_point(seed, planes):
     assert not blocked
     distances = (G @ safe - c) / norms
     assert distances.min() >= MARGIN - 1e-9
-    # No allowed point is nearer: moving towards the wish breaks a plane that is reached.
+    # No allowed point is nearer: moving towards the desired point would violate an active constraint.
     tightened = LinearConstraints(G, c + MARGIN * norms)
     np.testing.assert_allclose(safe, tightened.nearest(desired), rtol=0, atol=1e-8)
     if ((G @ desired - c) / norms).min() >= MARGIN:
@@ -121,7 +121,7 @@ def test_robot_within_the_margin_comes_no_closer(seed):
     safe, _ = keep_out.project(start, desired)
     way = np.linspace(start, safe, 100)
     assert clearances(lower, upper, way).min() >= min(clearance, MARGIN) - 2 * GAP
-    # Straight away from the nearest face nothing holds it.
+    # A motion straight away from the nearest face is not limited.
     gaps = np.concatenate([lower[0] - start, start - upper[0]])
     out = int(np.argmax(gaps))
     direction = np.eye(2)[out % 2] * (-1.0 if out < 2 else 1.0)

@@ -33,8 +33,8 @@ def test_equal_time_stamps_conflict_when_values_differ():
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize(("share", "is_conflict"), [(0.9999, False), (1.0001, True)])
-def test_positions_conflict_when_they_go_to_and_fro(share, is_conflict, joint, sign):
-    """Forth in 3/4 and back in 1/4 of a period."""
+def test_positions_conflict_when_they_move_back_and_forth(share, is_conflict, joint, sign):
+    """The positions move forth in 3/4 of a period and back in 1/4."""
     times = 1.0 + PERIOD * np.array([0.0, 0.75, 1.0])
     rates = 1.0 / np.diff(times)
     limit = (module.REVERSAL + 2.0 * module.RESOLUTION * rates.sum()) / rates.sum()
@@ -46,7 +46,7 @@ def test_positions_conflict_when_they_go_to_and_fro(share, is_conflict, joint, s
 
 
 def test_positions_do_not_conflict_without_a_reversal():
-    """As in a collision or a jump."""
+    """A collision or a jump changes the positions in one direction."""
     steps = [0.0, 0.05, 0.05, 0.0501, 0.0502]
     assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate(steps))) == 0
     assert conflicts(*(status(n * PERIOD, q) for n, q in enumerate([0.0, 0.001, 0.05]))) == 0

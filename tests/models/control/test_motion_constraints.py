@@ -20,7 +20,7 @@ LIMITS = {
 }
 
 
-def test_no_command_and_no_way_enters_a_spherical_obstacle():
+def test_no_command_and_no_path_enters_a_spherical_obstacle():
     results = attack(2400, seed=5)
     for kind in KINDS:
         assert not is_violated(kind, results[kind]), (kind, results[kind])
@@ -94,7 +94,7 @@ def test_only_braking_is_left_when_a_wall_is_as_near_as_braking_takes():
 
 
 def test_room_without_a_width_leaves_motion_along_it():
-    """Constraints do not contradict each other at the last command, so that there always is a next one."""
+    """Constraints do not contradict each other at the last command, so that a next command exists."""
     walls = Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.2 + 1e-9, -np.inf], [np.inf, np.inf])
     law = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(2), walls), PERIOD)
     state, is_braking = law.apply(law.start(np.array([0.2 + 5e-10, 0.1])), np.array([0.4, 0.3]))

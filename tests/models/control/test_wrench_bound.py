@@ -1,4 +1,4 @@
-"""Bound of an impedance's wrench: inside for every input, passive, and with a limited approach speed."""
+"""Bounded wrench of an impedance: within its bound for every input, passive, and with a limited approach speed."""
 
 import itertools
 

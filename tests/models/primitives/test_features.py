@@ -61,7 +61,7 @@ def test_basis_represents_its_inputs_and_returns_the_residual(seed, dimensions):
     np.testing.assert_allclose(F @ F.T, kernel(inputs, inputs), rtol=0, atol=1e-13)
     assert np.abs(basis.residual(inputs, F)).max() < 1e-13
 
-    # Elsewhere: the part of the kernel that the given inputs explain, and the rest of its diagonal.
+    # At other inputs: the part of the kernel that the given inputs explain, and the rest of its diagonal.
     G = basis.features(elsewhere)
     np.testing.assert_allclose(G @ F.T, kernel(elsewhere, inputs), rtol=0, atol=1e-6)
     residual = basis.residual(elsewhere, G)
@@ -76,7 +76,7 @@ def test_basis_represents_its_inputs_and_returns_the_residual(seed, dimensions):
     everything = np.vstack([inputs, elsewhere])
     H = basis.features(everything)
     np.testing.assert_allclose(H @ H.T, kernel(everything, everything), rtol=0, atol=1e-13)
-    # What there was stays where it was: only new features were added.
+    # The old features are unchanged; only new ones were added.
     np.testing.assert_allclose(H[:15, :before], F, rtol=0, atol=1e-9)
 
 

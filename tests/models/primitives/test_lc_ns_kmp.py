@@ -101,7 +101,7 @@ def test_predict_agrees_with_a_qp_over_kernel_weights(seed):
     rows = np.einsum("nfo,nox->nfx", G * scale, Phi[P * num_outputs :].reshape(H + 1, num_outputs, -1)).reshape(
         -1, Phi.shape[1]
     )
-    # Around the unconstrained minimum, in units of the Hessian: what is left for the solver is well scaled.
+    # Relative to the unconstrained minimum and in units of the Hessian, the solver's problem is well scaled.
     free = np.linalg.solve(quadratic, -linear)
     unit = np.linalg.inv(np.linalg.cholesky(quadratic)).T
     rows, bounds = rows @ unit, c.ravel() - rows @ free

@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.qp import SOLVERS, find_solver, solve_least_norm
 
-# [of the problem's size] how exactly each keeps a bound, and how near its v is to the best.
+# Largest violation of a bound, and distance of v from the optimum, relative to the problem's size.
 VIOLATION = {"daqp": 1e-12, "piqp": 1e-11, "osqp": 2e-9}
 DISTANCE = {"daqp": 1e-10, "piqp": 1e-8, "osqp": 1e-6}
 
@@ -68,7 +68,7 @@ def test_infeasible_problem_raises_unsolvable_error(name, seed, gap):
     rng = np.random.default_rng(seed)
     row = rng.standard_normal(4)
     row /= np.linalg.norm(row)
-    # The same direction must be above one bound and below another, or three directions can't all be.
+    # One direction above a bound and below a lower one, or three directions that cannot all be positive.
     A, lower, upper = np.array([row, row]), np.array([gap, -np.inf]), np.array([np.inf, 0.0])
     if seed % 2:
         angles = np.array([0, 2, 4]) * np.pi / 3

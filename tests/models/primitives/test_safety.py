@@ -222,7 +222,7 @@ def test_history_inputs_are_on_the_clock(kernel):
     direct = p.predict_at(t[7:12], means[7:12], covariances[7:12], np.ones(2), past, t[4:7])
     prediction = p.predict(7, np.ones(2), past)
     np.testing.assert_allclose(prediction.output, direct.output, rtol=0, atol=1e-12)
-    # At the start the clock was running before: one period a step.
+    # Before the first step the clock is extrapolated.
     early = p.predict(1, np.ones(2), past).output
     at = p.predict_at(t[1:6], means[1:6], covariances[1:6], np.ones(2), past, np.array([-0.2, -0.1, 0.0])).output
     np.testing.assert_allclose(early, at, rtol=0, atol=1e-12)

@@ -98,7 +98,7 @@ def test_wrong_start_is_refused(keywords, message):
         primitive().start(**keywords)
 
 
-def test_wrong_step_is_refused_and_the_episode_goes_on():
+def test_wrong_step_is_refused_and_the_episode_continues():
     stepper = primitive().start(history_source="measured")
     for action in ([0.0], [np.nan, 0.0], [np.inf, 0.0]):
         with pytest.raises(InputError, match="action must be 2 finite numbers"):

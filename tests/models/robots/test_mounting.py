@@ -57,7 +57,7 @@ def test_add_end_effector_as_rigid_adds_one_open_body():
         tool.tool_center.CalcPoseInWorld(context).GetAsMatrix4(),
         atol=1e-12,
     )
-    # Open, both fingers of it: one of them mimics the other.
+    # Both fingers are open; one of them mimics the other.
     np.testing.assert_allclose(plant.GetPositions(context, tool.model), [0.04, 0.04])
 
 

@@ -163,7 +163,7 @@ def test_flange_pose_equals_published_kinematics(alone):
     rng = np.random.default_rng(0)
     for _ in range(5):
         q = rng.uniform(-1.5, 1.5, alone.robot.num_joints)
-        # A UR's own base is turned by half a turn from where its arm points at zero.
+        # The base frame of a UR is turned by half a turn relative to the direction of its arm at zero.
         X = RigidTransform(RotationMatrix.MakeZRotation(np.pi if name == "ur5e" else 0.0), [0.0, 0.0, 0.0])
         for row, theta in zip((CRAIG | CLASSIC)[name], q, strict=True):
             X = X @ _step(*row, theta, craig=name in CRAIG)

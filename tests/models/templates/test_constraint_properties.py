@@ -148,7 +148,7 @@ def test_fixed_orientation(seed):
 
 
 def leaning(R_FE, p_FE, rest, turns_along):
-    """Return the tilt of an orientation that only leans towards F's axis, and its distance from such an orientation."""
+    """Return the tilt towards F's axis, and the angle about other axes [rad], of an orientation relative to `rest`."""
     towards = -p_FE[:2] / np.linalg.norm(p_FE[:2])
     if turns_along:
         rest = Rotation.from_euler("z", math.atan2(towards[1], towards[0])) * rest

@@ -104,7 +104,7 @@ def test_turns_along_tilts_about_a_constant_axis_of_the_tool():
     for angle in (0.0, 1.0, -2.5):
         p_FE = 0.2 * np.array([np.cos(angle), np.sin(angle), 0.0])
         R = constraint.project(RigidTransform(p_FE), {F: RigidTransform()}).rotation().matrix()
-        # The tool's own x axis stays level and across the bearing, its z axis leans along it by the tilt.
+        # The tool's x axis stays level and across the bearing; its z axis tilts along the bearing.
         assert R[2, 0] == pytest.approx(0.0, abs=1e-12)
         assert R[:, 0] @ p_FE == pytest.approx(0.0, abs=1e-12)
         assert R[:, 2] @ (-p_FE / 0.2) == pytest.approx(np.sin(np.deg2rad(40.0)))

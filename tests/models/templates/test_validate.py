@@ -98,7 +98,7 @@ def test_draw_quotes_names_of_states(tmp_path, name):
     change(data)
     template = parse_template(yaml.safe_dump(data, sort_keys=False))
     draw(template, tmp_path / "a.png")
-    # Quotes and backslashes inside a quoted word are escaped: what is left pairs up.
+    # Quotes and backslashes inside a quoted word are escaped, so that the other quotes form pairs.
     for line in to_dot(template).splitlines():
         assert line.replace("\\\\", "").replace('\\"', "").count('"') % 2 == 0
 

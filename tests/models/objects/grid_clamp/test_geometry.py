@@ -19,7 +19,7 @@ DIMENSIONS = GridClampDimensions()
 
 
 def plane_distances(mesh, select):
-    """Return the distances from the z axis of the planes of triangles whose center's height `select` accepts."""
+    """Return the distances of triangles' planes from the z axis; `select` accepts the heights of their centers."""
     corners = mesh.vertices[mesh.triangles]
     chosen = select(corners[:, :, 2].mean(axis=1))
     return np.abs(np.einsum("ij,ij->i", mesh.normals()[chosen], corners[chosen, 0]))
