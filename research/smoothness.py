@@ -68,7 +68,7 @@ def spectral_arc_length(
         positions: Positions, (N, O).
         period: Time between them [s].
         cutoff: Largest frequency [Hz].
-        threshold: Smallest amplitude, as a part of the largest.
+        threshold: Smallest amplitude, as a fraction of the largest.
         padding: Powers of two by which the signal is zero-padded.
     """
     speed = np.linalg.norm(np.diff(np.asarray(positions, dtype=float), axis=0), axis=1) / period
@@ -293,7 +293,7 @@ def _ratios(rows: list[dict[str, Any]]) -> dict[str, Any]:
                 f"{kgrl[key] / ours[key]:.0f} times commanded ({kgrl[added] / ours[added]:.0f} times what exploring "
                 f"adds), {kgrl[measured] / ours[measured]:.1f} times measured"
             )
-            ratios[f"{ours_name}, commanded {part} jerk as a part of the demonstrations' own"] = (
+            ratios[f"{ours_name}, commanded {part} jerk as a fraction of the demonstrations' own"] = (
                 f"{ours[key] / free[ALONE][key]:.3g}"
             )
             for what, column in (("commanded", key), ("added", added)):

@@ -176,14 +176,14 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
     """
     task, arguments, about = _find_subject(subject, environment)
     options = check_environment(task, arguments)
-    guidance = str(options["guidance"])
+    config, guidance = EnvConfig.resolve(task, options), str(options["guidance"])
     if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
         raise InputError(
             f"guidance={guidance!r} cannot be certified: use {' or '.join(GUIDANCE)}, with a "
             "history of commands and of one length (neither adaptive_history nor history_source=measured)"
         )
-    loop = _make_loop(task, options, start_within)
-    impedance = EnvConfig.resolve(task, options).make_task().impedance()
+    loop = _make_loop(config, start_within)
+    impedance = config.make_task().impedance()
     if impedance is None and loop.primitive.num_outputs == len(Impedance().stiffness):
         impedance = Impedance()
     if impedance is None:
@@ -222,24 +222,24 @@ def _read_key(key: Path | None) -> bytes | None:
     return content
 
 
-def _make_loop(task: str, options: Mapping[str, Any], start_within: float | None) -> CertifiedLoop:
+def _make_loop(config: EnvConfig, start_within: float | None) -> CertifiedLoop:
     """Build the feedback loop of an environment's primitive.
 
     Raises:
         InputError: If an option cannot be certified, or the start offset is negative or not finite.
     """
-    demonstrated = make_prior_knowledge(task, **options).demonstrations
+    demonstrated = make_prior_knowledge(config).demonstrations
     assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
     if demonstrated.motion is not None or demonstrated.progress is not None:
         raise InputError(
             "a certificate covers linear constraints and the clock: leave out progress, max_speed, max_acceleration "
             "and shapes"
         )
-    has_actions = options["guidance"] != "kmp"
-    primitive = demonstrated.primitive(history=options["guidance"] == "skgrl", constrained=has_actions)
+    has_actions = config.guidance != "kmp"
+    primitive = demonstrated.primitive(history=config.guidance == "skgrl", constrained=has_actions)
     # A reset starts at the demonstrations, not at the via-points that the primitive passes through.
-    start = primitive.constraints.nearest(EnvConfig.resolve(task, options).make_task().reference().means[0])
-    within = _declared_start(task, options, len(start)) if start_within is None else np.full(len(start), start_within)
+    start = primitive.constraints.nearest(config.make_task().reference().means[0])
+    within = _declared_start(config, len(start)) if start_within is None else np.full(len(start), start_within)
     if not (np.isfinite(within).all() and (within >= 0.0).all()):
         raise InputError(f"the start offset must be finite and not negative, not {within.min()}")
     gains = demonstrated.null_space_gains(primitive) if has_actions else np.zeros(primitive.num_outputs)
@@ -290,14 +290,15 @@ def _find_corrected_steps(loop: CertifiedLoop, certified: CertifiedBounds) -> np
     return active | np.append(False, active[:-1]) | np.append([False, False], active[:-2])
 
 
-def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndarray:
+def _declared_start(config: EnvConfig, size: int) -> np.ndarray:
     """Return the largest start offset (O,) of the environment's history: the offset of a reset plus a pose's error."""
-    config = EnvConfig.resolve(task, options)
     declared = config.make_task().start_within()
     try:
         within = np.array(np.broadcast_to(declared, size), dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"start_within of {task} is a number, or {size} of them, not {brief(declared)}") from None
+        raise InputError(
+            f"start_within of {config.task} is a number, or {size} of them, not {brief(declared)}"
+        ) from None
     disturbances = config.parts["disturbances"]
     if isinstance(disturbances, Disturbances):
         errors = disturbances.errors

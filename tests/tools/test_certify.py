@@ -9,7 +9,6 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
 from guiderail.models.common.errors import InputError
 from guiderail.tools.certify import _declared_start, certify_skill, verify_certificate
-from guiderail.tools.environments import check_environment
 
 COARSE = {"control_period": 0.05}  # 160 steps instead of 400: a certificate takes a third of the time
 
@@ -117,8 +116,8 @@ def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty,
 
 def declared_start(task, **environment):
     """Return the start offset of a certificate for a task."""
-    options = check_environment(task, environment)
-    return _declared_start(task, options, EnvConfig.resolve(task, options).make_task().reference().num_outputs)
+    config = EnvConfig.resolve(task, environment)
+    return _declared_start(config, config.make_task().reference().num_outputs)
 
 
 def test_start_is_within_the_declared_offset():

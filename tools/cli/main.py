@@ -1,5 +1,6 @@
 """Entry point of the `guiderail` command: reports errors as one sentence and an exit code."""
 
+import errno
 import logging
 import os
 import sys
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from guiderail.models.common.errors import InputError, RunsFailedError, explain_missing
+from guiderail.models.common.errors import InputError, RunsFailedError, brief, explain_missing
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app, print_message
 
@@ -74,6 +75,11 @@ def main(arguments: list[str] | None = None) -> None:
         code = 130
     except BrokenPipeError:
         code = 1
+    except OSError as error:
+        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES):
+            raise
+        print_message(f"the path {brief(error.filename)} cannot be used ({error.strerror}): name another")
+        code = 2
     except Exception as error:
         missing = explain_missing(error) if isinstance(error, ModuleNotFoundError) else None
         if missing is None and not hasattr(error, "format_message"):

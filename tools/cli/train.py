@@ -130,9 +130,9 @@ def train(
         )
         check_declared_options(task, environment)
     if (folders or "demonstrations" in environment) and task is not None and not resume:
-        from guiderail.tools.datasets.validate import leaves_demonstrations
+        from guiderail.tools.datasets.validate import warn_of_deviation
 
-        if (warning := leaves_demonstrations(task, environment)) is not None:
+        if (warning := warn_of_deviation(task, environment)) is not None:
             print_message(warning)
     if cli.is_hardware(environment.get("station")):
         if task is None or out is None or resume or human_in_the_loop:

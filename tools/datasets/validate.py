@@ -118,7 +118,7 @@ def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> Non
 _MAX_COMPONENTS = 8  # largest number of mixture components in the comparison with a default primitive
 
 
-def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | None:
+def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
     """Return a warning if the motion without actions leaves the spread of the demonstrations, else None.
 
     Args:
@@ -183,10 +183,10 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         "widest": spread.max(axis=0).round(6).tolist(),
     }
     summary |= {} if draw is None else {"picture": str(draw)}
-    return summary | (fit_primitive(demonstrations) if fit else _follow_by_default(common))
+    return summary | (fit_primitive(demonstrations) if fit else _default_deviation(common))
 
 
-def _follow_by_default(common: Demonstrations) -> dict[str, Any]:
+def _default_deviation(common: Demonstrations) -> dict[str, Any]:
     """Return the deviation of a default primitive from resampled demonstrations, and a remark if it is large."""
     from guiderail.models.primitives.deviation import describe_deviation, measure_deviation
 

@@ -302,14 +302,14 @@ def evaluate(
         }
         for name in stored:
             print(f"{labels[name]}: evaluated before, and used again", file=sys.stderr, flush=True)
-        recorder = None if save is None else _DemonstrationRecorder(signal)
-        evaluated = dict(stored)
+        evaluated, motions = dict(stored), []
+        collect = None if save is None else partial(_successful_motion, signal)
         for name, rows, kept in evaluate_policies(
-            evaluation_env, policies, labels=labels, processes=processes, collect=recorder, **how
+            evaluation_env, policies, labels=labels, processes=processes, collect=collect, **how
         ):
             evaluated[name] = rows
-            if name == POLICY and recorder is not None:
-                recorder.keep(kept)
+            if name == POLICY:
+                motions = kept
             _store(subject, name, rows, where, how)
     finally:
         if config is not None:
@@ -320,8 +320,8 @@ def evaluate(
     result |= {"skipped_baselines": skipped, "episodes": episodes, "seed": seed} | _training(folder)
     if (comparison := compare(rows_of)) is not None:
         result |= {"best_baseline": comparison.baseline, "p": comparison.p}
-    if recorder is not None and save is not None:
-        result["saved"] = recorder.save(save)
+    if save is not None:
+        result["saved"] = _save_demonstrations(motions, save)
     if describe_differences is not None and config is not None:
         result["differences"] = list(describe_differences(replace(config, environment=where)))
     return Evaluation(result, rows_of)
@@ -376,37 +376,23 @@ def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any
 
 def _training(folder: RunFolder | None) -> dict[str, Any]:
     """Return the number of training episodes and the episodes to convergence; None without a table of episodes."""
-    has_table = folder is not None and (folder.path / "episodes.csv").is_file()
-    trained = folder.episodes() if folder is not None and has_table else None
-    return {
-        "episodes_to_convergence": None if trained is None else episodes_to_convergence(trained),
-        "trained_episodes": None if trained is None else len(trained),
-    }
+    if folder is None or not (folder.path / "episodes.csv").is_file():
+        return {"episodes_to_convergence": None, "trained_episodes": None}
+    rows = folder.episodes()
+    return {"episodes_to_convergence": episodes_to_convergence(rows), "trained_episodes": len(rows)}
 
 
-class _DemonstrationRecorder:
-    """Collects the poses of successful episodes."""
+def _successful_motion(signal: str, env: gymnasium.Env, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return times (N,) [s] and poses (N, O) of an episode; None if it failed."""
+    if not row["success"]:
+        return None
+    trace = cast(Any, env.unwrapped).trace
+    return trace.period * np.arange(1, len(trace) + 1), getattr(trace, signal).copy()
 
-    def __init__(self, signal: str):
-        self._signal = signal
-        self._times: list[np.ndarray] = []
-        self._outputs: list[np.ndarray] = []
 
-    def __call__(self, env: gymnasium.Env, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return times and poses of a successful episode; None if the episode failed."""
-        if not row["success"]:
-            return None
-        trace = cast(Any, env.unwrapped).trace
-        return trace.period * np.arange(1, len(trace) + 1), getattr(trace, self._signal).copy()
-
-    def keep(self, found: Sequence[tuple[np.ndarray, np.ndarray] | None]) -> None:
-        """Keep the times and poses of the successful episodes."""
-        for times, outputs in filter(None, found):
-            self._times.append(times)
-            self._outputs.append(outputs)
-
-    def save(self, file: Path) -> int:
-        """Write the demonstrations, if there are any; return their number."""
-        if self._outputs:
-            Demonstrations(self._times, self._outputs).save(file)
-        return len(self._outputs)
+def _save_demonstrations(motions: Sequence[tuple[np.ndarray, np.ndarray] | None], file: Path) -> int:
+    """Write the motions of successful episodes, if there are any; return their number."""
+    successful = [motion for motion in motions if motion is not None]
+    if successful:
+        Demonstrations([times for times, _ in successful], [poses for _, poses in successful]).save(file)
+    return len(successful)

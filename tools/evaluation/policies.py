@@ -298,9 +298,9 @@ _MAX_DIFFERENCES = 5  # largest number of options that a message names
 
 def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
     """Return a sentence with the shapes of policy and environment, and the options that differ or would fit."""
-    sees, moves = shapes(policy, env)
-    takes = "cannot take these observations" if sees is None else f"takes observations {sees}"
-    returns = "" if moves is None else f" and returns actions {moves}"
+    observation_shape, action_shape = shapes(policy, env)
+    takes = "cannot take these observations" if observation_shape is None else f"takes observations {observation_shape}"
+    returns = "" if action_shape is None else f" and returns actions {action_shape}"
     task, options = _task_options(env)
     changed = [
         f"{name}={brief(value)} instead of {brief(options[name])}"
@@ -320,14 +320,14 @@ def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None
     """Return the shapes of a policy's observation and action; None if a shape is unknown."""
     if isinstance(policy, Policy):
         return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
-    sees, moves = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
-    observation_shape = sees or env.observation_space.shape or ()
-    if moves is None:
+    given, action_shape = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
+    observation_shape = given or env.observation_space.shape or ()
+    if action_shape is None:
         try:
-            moves = np.shape(policy(np.zeros(observation_shape, np.float32)))
+            action_shape = np.shape(policy(np.zeros(observation_shape, np.float32)))
         except (IndexError, ValueError):
-            return sees, None
-    return observation_shape, moves
+            return given, None
+    return observation_shape, action_shape
 
 
 def _task_options(env: gymnasium.Env) -> tuple[str, dict[str, Any]]:

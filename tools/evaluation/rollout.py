@@ -103,7 +103,7 @@ def has_image(space: Any) -> bool:
 def rollout(
     env: gymnasium.Env,
     act: PolicyFn,
-    *observers: Callback,
+    *callbacks: Callback,
     index: int = 0,
     seed: int | None = None,
     held_out: bool = False,
@@ -116,7 +116,7 @@ def rollout(
     Args:
         env: Environment.
         act: Policy; if it is a `Callback`, its callback methods are called too.
-        observers: Callbacks.
+        callbacks: Callbacks.
         index: Number of the episode, for its row.
         seed: Seed of the reset; default: the next conditions of the training distribution.
         held_out: Sample the conditions from the held-out distribution, by the seed.
@@ -131,7 +131,8 @@ def rollout(
     )
     base: Any = env.unwrapped
     is_own = hasattr(base, "trace")
-    callbacks = (*([act] if isinstance(act, Callback) and act not in observers else []), *observers)
+    if isinstance(act, Callback) and act not in callbacks:
+        callbacks = (act, *callbacks)
     for callback in callbacks:
         callback.on_episode_start()
     total, terms = 0.0, dict.fromkeys(base.task.reward_terms if is_own else (), 0.0)

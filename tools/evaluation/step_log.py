@@ -33,8 +33,8 @@ MEANINGS = {
     "wrench_i": ("N, Nm", "wrench of the surroundings on the tool"),
     "saturation": ("", "largest demand on an actuator beyond its limit, 0 within it"),
     "collision": ("", "True in a collision"),
-    "command_timed_out": ("", "True while the last safe pose is held because commands stopped"),
-    "fallback": ("", "True where guidance commanded something safe instead of the requested pose"),
+    "command_timed_out": ("", "True while the last safe pose is held because commands stopped or are not finite"),
+    "fallback": ("", "True if guidance commanded a safe pose instead of the requested one"),
     "state": ("", "number of the template's state, if there is a template"),
     "reward": ("reward", "reward of the control step"),
 }

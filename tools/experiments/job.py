@@ -36,7 +36,7 @@ from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Study
 from guiderail.tools.experiments.engines.engine import Outcome
 from guiderail.tools.files import write_atomically
-from guiderail.tools.imports import import_modules  # fmt: skip
+from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.learning.train import configure, with_defaults
 

@@ -137,7 +137,7 @@ def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
     if not len(of) or of["seed"].tolist() != against["seed"].tolist():
         return {}
     numerator, denominator = (one[wanted.of].to_numpy(float) for one in (of, against))
-    label = f"{wanted.of.replace('_', ' ')} of {wanted.method} as a part of {wanted.against}'s"
+    label = f"{wanted.of.replace('_', ' ')} of {wanted.method} as a fraction of {wanted.against}'s"
     return {
         f"{label}, each seed": ", ".join(f"{value:.2f}" for value in numerator / denominator),
         f"{label}, all seeds together": f"{numerator.sum() / denominator.sum():.2f}",
@@ -185,7 +185,7 @@ def _refuse_shared_folders(jobs: list[Job]) -> None:
         other = owners.setdefault(job.folder.path, job)
         if other is not job:
             raise InputError(
-                f"{job.folder.path} would hold both runs of {other.method}, seed {other.seed} and of {job.method}, "
+                f"{job.folder.path} would hold the runs of {other.method}, seed {other.seed}, and of {job.method}, "
                 f"seed {job.seed}: write the study's folder with {{method}} and {{seed}}"
             )
 

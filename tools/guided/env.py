@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -273,14 +274,8 @@ class GuidedVectorEnv(SyncVectorEnv):
             self.single_observation_space, self._env_obs, self._observations
         )
         self._autoreset_envs = np.logical_or(self._terminations, self._truncations)
-        copied = self._observations if not self.copy else _copied(self._observations)
-        return copied, np.copy(self._rewards), np.copy(self._terminations), np.copy(self._truncations), infos
-
-
-def _copied(observations: Any) -> Any:
-    from copy import deepcopy
-
-    return deepcopy(observations)
+        observations = deepcopy(self._observations) if self.copy else self._observations
+        return observations, np.copy(self._rewards), np.copy(self._terminations), np.copy(self._truncations), infos
 
 
 def _predict_batch(requests: list[Any]) -> list[np.ndarray | None]:

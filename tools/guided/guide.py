@@ -117,14 +117,11 @@ class _FittedSegment:
         self.discrete = segment.discrete_values(self.num_steps)
         samples = np.concatenate(segment.recorded.outputs)
         self.center = 0.5 * (samples.max(axis=0) + samples.min(axis=0))
-        self.half_range = np.maximum(0.5 * np.ptp(samples, axis=0), np.sqrt(np.mean(self._variances(), axis=0)))
+        self.half_range = np.maximum(0.5 * np.ptp(samples, axis=0), deviation(self.reference))
         self._primitive: LcNsKmp | None = None
         given = segment.constraints
         if not callable(given):
             self.primitive_for(self.as_constraints(given))  # refuses invalid constraints before an episode
-
-    def _variances(self) -> np.ndarray:
-        return self.reference.standard_deviations**2
 
     def as_constraints(self, given: Any) -> LinearConstraints:
         """Return linear constraints: the given ones, or a box for each step's phase from demonstrated bounds."""
@@ -144,27 +141,24 @@ class _FittedSegment:
     def primitive_for(self, constraints: LinearConstraints) -> tuple[LcNsKmp, np.ndarray]:
         """Return the primitive with these constraints, built only when they change, and the gains (O,)."""
         current = self._primitive
-        same = current is not None and all(
-            np.array_equal(a, b)
-            for a, b in ((current.constraints.G, constraints.G), (current.constraints.c, constraints.c))
-        )
-        if not same:
-            settings, is_smooth = self.settings, self.guidance == "skgrl"
+        if current is None or not (
+            np.array_equal(current.constraints.G, constraints.G)
+            and np.array_equal(current.constraints.c, constraints.c)
+        ):
             self._primitive = current = self.selection.primitive(
-                horizon=settings.horizon,
-                history=settings.history if is_smooth else 0,
-                history_variance=settings.history_variance,
+                horizon=self.settings.horizon,
+                history=self.settings.history if self.guidance == "skgrl" else 0,
+                history_variance=self.settings.history_variance,
                 constraints=constraints,
             )
             self._gains = self._make_gains(current)
-        assert current is not None
         return current, self._gains
 
     def _make_gains(self, primitive: LcNsKmp) -> np.ndarray:
-        dims = list(range(self.num_outputs)) if self.settings.action_dims is None else list(self.settings.action_dims)
         if self.guidance == "kmp":
             return np.zeros(self.num_outputs)
-        if self.guidance in ("residual", "clipped_residual"):
+        dims = list(range(self.num_outputs)) if self.settings.action_dims is None else list(self.settings.action_dims)
+        if "residual" in self.guidance:
             # One gain for each group of outputs and all times: RMS displacement by a constant null-space action of ±1.
             gains = np.zeros(self.num_outputs)
             sigma = deviation(self.reference)
@@ -172,8 +166,7 @@ class _FittedSegment:
             for group in map(list, groups):
                 rms = np.sqrt(np.mean(sigma[group] ** 2))
                 gains[group] = np.sqrt(3.0) * self.settings.action_scale * rms
-            mask = np.isin(np.arange(self.num_outputs), dims)
-            return np.where(mask, gains, 0.0)
+            return np.where(np.isin(np.arange(self.num_outputs), dims), gains, 0.0)
         return authority_gains(primitive, self.settings.action_scale, np.array(dims))
 
 
@@ -237,7 +230,7 @@ class PrimitiveGuide(Guide):
         self._begin(0, env, observation)
 
     def _begin(self, index: int, env: Any, observation: Any) -> None:
-        self._index, self._step, self._ended_early = index, 0, False
+        self._index, self._step = index, 0
         fitted = self.segments[index]
         segment = fitted.segment
         frame = segment.frame(env, observation) if segment.frame is not None else np.zeros(0)
@@ -245,7 +238,7 @@ class PrimitiveGuide(Guide):
         given = segment.constraints
         given = given(env, observation) if callable(given) else given
         self.constraints = fitted.as_constraints(given)
-        is_enforced = self.guidance != "residual" and self.guidance != "clipped_residual"
+        is_enforced = "residual" not in self.guidance
         self._motion, motion_filter = given if isinstance(given, MotionConstraints) else None, None
         if self._motion is not None and is_enforced:
             if self._period is None:
@@ -268,7 +261,7 @@ class PrimitiveGuide(Guide):
         segment = fitted.segment
         is_over = self._step >= fitted.num_steps + segment.dwell
         if not is_over and segment.until is not None and self._step > 0:
-            is_over = self._ended_early = bool(segment.until(env, observation))
+            is_over = bool(segment.until(env, observation))
         if is_over and self._index + 1 < len(self.segments):
             self._begin(self._index + 1, env, observation)
         elif is_over:
@@ -365,7 +358,7 @@ class TemplateGuide(Guide):
         X_WE = pose_to_transform(pose)
         self._state = self.template.state_at(X_WE, self._frames)
         self._X = self.template.command(self._state, X_WE, X_WE, self._frames, self._period).X_WE
-        self._start, self._has_begun = self._progress(), False
+        self._has_begun = False
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> None:
         """Make the transition to the next state if it is due, and apply the input mapping."""
@@ -384,9 +377,6 @@ class TemplateGuide(Guide):
         violation = self.template.violation(self._state, self._X, self._frames)
         extra = self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
         return GuideCommand(transform_to_pose(self._X), violation, is_fallback, extra)
-
-    def _progress(self) -> float:
-        return self.template.progress(self._state, self._X, self._frames)
 
     @property
     def is_finished(self) -> bool:

@@ -130,7 +130,7 @@ class ParallelLearner(Learner):
         return row
 
     def _required(self, index: int) -> int:
-        """Return the number of episodes from which the weights that episode `index` uses are learned."""
+        """Return the number of episodes that the weights for episode `index` are learned from."""
         return max(0, index - self._num_envs)
 
     def _exchange(self, timeout: float | None) -> None:
@@ -195,7 +195,7 @@ class ParallelLearner(Learner):
                     yield number, module, name, array
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; episodes that were simulated ahead are simulated again."""
+        """Set the state to what `state` returned; episodes simulated ahead of the checkpoint are simulated again."""
         parts: dict[str, dict[str, np.ndarray]] = {"learner": {}, "snapshot": {}}
         for name, array in arrays.items():
             part, _, rest = name.partition("/")

@@ -17,6 +17,7 @@ import numpy as np
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import kernel_from_options
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.gains import deviation
 from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
@@ -120,7 +121,7 @@ class ViaPointCorrections:
             InputError: If the guidance has no demonstrations to correct.
         """
         config = EnvConfig.resolve(task, environment)
-        declared, kind = config.make_task(), config.guidance_kind
+        instance, kind = config.make_task(), config.guidance_kind
         if "demonstrations" not in {one for needed in kind.needs for one in needed}:
             raise InputError(
                 f"corrections need demonstrations, which guidance {kind.name!r} does not use: choose another, such as "
@@ -128,13 +129,12 @@ class ViaPointCorrections:
             )
         values = config.options
         self.points = tuple(values["via_points"])
-        reference = declared.reference()
+        reference = instance.reference()
         self._reference = pass_through(reference, self.points, kernel_from_options(values))
         action_dims = values["action_dims"]
         self._action_dims = list(range(reference.num_outputs)) if action_dims is None else list(action_dims)
-        deviation = np.sqrt(np.mean(reference.standard_deviations**2, axis=0))
-        self.reach = np.sqrt(3.0) * values["action_scale"] * deviation[self._action_dims]
-        self._constraints = declared.constraints()
+        self.reach = np.sqrt(3.0) * values["action_scale"] * deviation(reference)[self._action_dims]
+        self._constraints = instance.constraints()
 
     def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
         """Return the via-points including an episode's corrections; new ones replace old ones nearby.

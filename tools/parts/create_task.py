@@ -337,9 +337,10 @@ def _write_task(
     """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
     from guiderail.diagrams.tasks.part.file import write_task_file
     from guiderail.tools.parts.difficulty import calibrate
-    from guiderail.tools.parts.trial import demonstrate, demonstration_time, triangles_of, write_preview
+    from guiderail.tools.parts.trial import demonstrate, triangles_of, write_preview
 
-    log(f"recording demonstrations: about {5.0 * demonstration_time(file) / measured['real_time_factor']:.0f} s")
+    duration = float(file.motion.plan_search()[0][-1])
+    log(f"recording demonstrations: about {5.0 * duration / measured['real_time_factor']:.0f} s")
     succeeded = demonstrate(folder, file)
     if not succeeded:
         raise InputError(

@@ -17,7 +17,6 @@ from guiderail.diagrams.tasks.registry import register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.common.transforms import MM
-from guiderail.models.parts.demonstrator import plan_search
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
@@ -168,7 +167,7 @@ class StopOnRim(gymnasium.Wrapper):
         """Construct the wrapper for an environment with the task file `file`."""
         super().__init__(env)
         numbers = file.motion
-        times, _ = plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
+        times, _ = numbers.plan_search()
         self._progress = 2.0 * (times[SEARCH_END] + PATIENCE) / times[-1] - 1.0
         self._height = 2.0 * (numbers.rim - IN_SOCKET) / numbers.travel - 1.0
 

@@ -26,12 +26,7 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
-from guiderail.models.parts.demonstrator import (
-    NUM_DEMONSTRATIONS,
-    demonstrator_motions,
-    plan_search,
-    plan_straight_insertion,
-)
+from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS, demonstrator_motions
 from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
 from guiderail.models.parts.solids import SurfaceLocator
@@ -152,10 +147,7 @@ def insert(
         snapping: Names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
         measure_depth: True to measure the penetration, which takes longer than the simulation.
     """
-    numbers = file.motion
-    times, poses = (
-        plan_straight_insertion(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
-    )
+    times, poses = file.motion.plan_straight_insertion() if motion is None else motion
     workcell = write_workcell(folder, file)
     station = GantryStation(workcell, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
@@ -282,16 +274,9 @@ DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are no longe
 MAX_SESSIONS = 3  # largest number of sessions of five attempts; they end once five have seated the plug
 
 
-def demonstration_time(file: PartTaskFile) -> float:
-    """Return the duration of a demonstration [s]."""
-    numbers = file.motion
-    return float(plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)[0][-1])
-
-
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
     """Write the demonstrations; return how many of them seat the plug."""
-    numbers = file.motion
-    script = plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
+    numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
     start = time.process_time()
     seated: list[np.ndarray] = []
@@ -371,8 +356,7 @@ def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> b
         file: Task file, which need not be written yet.
         offset: Offset of the motion along x [m].
     """
-    numbers = file.motion
-    times, poses = plan_straight_insertion(numbers.travel, numbers.rim, file.turn, numbers.push)
+    times, poses = file.motion.plan_straight_insertion()
     poses[:, 0] += offset
     station = MujocoStation(write_workcell(folder, file), time_step=file.time_step)
     _, recording = drive_along(station, times, poses)

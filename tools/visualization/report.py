@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 import pandas as pd
 
 from guiderail.models.common.errors import InputError
@@ -24,7 +25,7 @@ from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
 from guiderail.tools.visualization import report_figures as figures
-from guiderail.tools.visualization.report_data import LEARNED, ReportData, Run, command, flat, gather, is_finite
+from guiderail.tools.visualization.report_data import LEARNED, ReportData, Run, command, flat, gather
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
@@ -202,7 +203,7 @@ def _safety(safety: dict[str, list[dict[str, Any]]]) -> Table:
 
 
 def _largest(value: float, key: str) -> Cell:
-    if not is_finite(value) or value < UNCONSTRAINED:
+    if not np.isfinite(value) or value < UNCONSTRAINED:
         return Cell("–" if value < 0 else "not finite", "" if value < 0 else "bad")
     return Cell(f"{value:.3g}", "bad" if key == "max_commanded_violation" and value > TOLERANCE else "")
 

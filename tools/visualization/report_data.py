@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.tasks.registry import known_tasks
@@ -40,8 +39,14 @@ STEP_LOG_COLUMNS = (
 )  # fmt: skip
 
 
-def _count_violations(values: pd.Series) -> int:
-    return int((~(values <= TOLERANCE)).sum())  # NaN counts as a violation
+def _extremes(rows: pd.DataFrame, prefix: str, force: str) -> dict[str, Any]:
+    """Return numbers and maxima of violations, and the peak force; columns of violations begin with a prefix."""
+    result: dict[str, Any] = {}
+    for kind in ("commanded", "measured"):
+        values = rows[f"{prefix}{kind}_violation"]
+        result[f"{kind}_violations"] = int((~(values <= TOLERANCE)).sum())  # NaN counts as a violation
+        result[f"max_{kind}_violation"] = float(values.max(skipna=False))
+    return result | {"peak_force": float(rows[force].max(skipna=False))}
 
 
 @dataclass
@@ -68,11 +73,7 @@ class Run:
             "source": "table",
             "episodes": len(rows),
             "steps": int(rows["steps"].sum()),
-            "commanded_violations": _count_violations(rows["max_commanded_violation"]),
-            "max_commanded_violation": float(rows["max_commanded_violation"].max(skipna=False)),
-            "measured_violations": _count_violations(rows["max_measured_violation"]),
-            "max_measured_violation": float(rows["max_measured_violation"].max(skipna=False)),
-            "peak_force": float(rows["peak_force"].max(skipna=False)),
+            **_extremes(rows, "max_", "peak_force"),
             "collisions": int(rows["collisions"].sum()),
             "collision_steps": int(rows["collision_steps"].sum()) if "collision_steps" in rows else None,
             "saturated_steps": int(rows["saturated_steps"].sum()) if "saturated_steps" in rows else None,
@@ -89,11 +90,7 @@ class Run:
         return of_episodes | {
             "source": "step_log",
             "steps": len(steps),
-            "commanded_violations": _count_violations(steps["commanded_violation"]),
-            "max_commanded_violation": float(steps["commanded_violation"].max(skipna=False)),
-            "measured_violations": _count_violations(steps["measured_violation"]),
-            "max_measured_violation": float(steps["measured_violation"].max(skipna=False)),
-            "peak_force": float(steps["contact_force"].max(skipna=False)),
+            **_extremes(steps, "", "contact_force"),
             "collision_steps": int(steps["collision"].sum()),
             "saturated_steps": int((steps["saturation"] > 0).sum()),
             "timed_out_steps": int(steps["command_timed_out"].sum()),
@@ -306,8 +303,3 @@ def command(config: RunConfig, out: str) -> str:
     if not config.step_log:
         words.append("--no-step-log")
     return shlex.join([*words, "--out", out])
-
-
-def is_finite(value: float | None) -> bool:
-    """Return True for a finite number."""
-    return value is not None and bool(np.isfinite(value))

@@ -22,6 +22,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATABILITY_STD
+from guiderail.models.parts.demonstrator import plan_search, plan_straight_insertion
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
@@ -93,6 +94,14 @@ class MotionNumbers(Options):
     press: Number = Field(
         2.5 * MM, ge=0, le=10 * MM, description="depth of the command below the rim during a search [m]"
     )
+
+    def plan_straight_insertion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return times (N,) [s] and poses (N, 6) of a straight insertion."""
+        return plan_straight_insertion(self.travel, self.rim, self.turn * DEGREE, self.push)
+
+    def plan_search(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return times (N,) [s] and poses (N, 6) of a demonstration with a search on the rim."""
+        return plan_search(self.travel, self.rim, self.turn * DEGREE, self.push, self.press)
 
 
 class Tolerance(Options):

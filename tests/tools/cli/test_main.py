@@ -138,6 +138,15 @@ def test_json_has_null_for_nan_and_infinity_at_any_depth():
     assert row == {"part": "round trip", "worst_ms": None, "median_ms": 1.5, "number": 3}
 
 
+@pytest.mark.parametrize("command", ["list", "evaluate", "visualize", "train", "report", "study"])
+def test_command_refuses_a_path_when_it_is_too_long(command, capsys):
+    options = ["--out", "out"] if command in ("train", "study") else []
+    code, out, err = call(capsys, command, 5000 * "x", *options)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "(File name too long): name another" in err
+
+
 def test_train_refuses_an_existing_folder(capsys, trained):
     before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
     code, _, err = call(capsys, "train", "Bead", "--out", trained)

@@ -131,7 +131,7 @@ def test_study_imports_what_registers_its_task(tmp_path):
 
 
 def test_study_refuses_two_runs_in_one_folder(tmp_path):
-    with pytest.raises(InputError, match="both runs of learner, seed 5 and of learner, seed 6"):
+    with pytest.raises(InputError, match="the runs of learner, seed 5, and of learner, seed 6"):
         run(study(folder="{method}"), tmp_path)
 
 
@@ -259,7 +259,7 @@ def test_study_command_summarizes_each_seed(tmp_path, capsys):
     assert len(rows) == 2
     rates = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
     assert result["learner after 2 episodes, held out, success of each seed"] == rates
-    assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
+    assert result["mean return of learner as a fraction of learner's, each seed"] == "1.00, 1.00"
     assert "differences" not in result
     err = capsys.readouterr().err
     assert "1/2 learner, seed 5: held out" in err

@@ -7,8 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+from guiderail.diagrams.tasks.part.file import MotionNumbers
 from guiderail.models.common.errors import InputError
-from guiderail.models.parts.demonstrator import plan_search
 from guiderail.tools.parts import difficulty
 from guiderail.tools.parts.create_task import create_task
 from guiderail.tools.parts.difficulty import (
@@ -110,9 +110,8 @@ class Steps(gymnasium.Env):
 
 
 def test_episode_ends_when_the_plug_stays_on_the_rim():
-    motion = SimpleNamespace(travel=0.010, rim=0.007, push=0.004, press=0.0025)
-    file = SimpleNamespace(motion=motion, turn=0.0)
-    times = plan_search(0.010, 0.007, 0.0, 0.004, 0.0025)[0]
+    file = SimpleNamespace(motion=MotionNumbers(travel=0.010, rim=0.007))
+    times = file.motion.plan_search()[0]
     late = times[3] + difficulty.PATIENCE
     rows = [(late - 0.01, 0.007), (late + 0.01, 0.0064), (late + 0.01, 0.0066)]
     env = difficulty.StopOnRim(Steps(rows, times[-1]), file)

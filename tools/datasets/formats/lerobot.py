@@ -139,7 +139,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     }
     features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _CLOCKS.items()}
     ends = np.cumsum(lengths)
-    describe_options = {
+    episode_columns = {
         "episode_index": list(range(len(lengths))),
         "tasks": [[TASK]] * len(lengths),
         "length": lengths,
@@ -168,7 +168,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     with atomic_folder(folder) as part:
         for path, table in (
             (DATA_PATH.format(chunk_index=0, file_index=0), columns),
-            ("meta/episodes/chunk-000/file-000.parquet", describe_options),
+            ("meta/episodes/chunk-000/file-000.parquet", episode_columns),
         ):
             (part / path).parent.mkdir(parents=True)
             parquet.write_table(arrow.table(table), part / path)
