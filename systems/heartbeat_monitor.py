@@ -47,8 +47,8 @@ class HeartbeatMonitor(LeafSystem):
         self._period, self._timeout = period, timeout
         self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
-        # For each sender [sender, or NaN for an unused row; its last sequence number; time since that heartbeat in s].
-        self._initial = np.tile([np.nan, 0.0, 0.0], MAX_SENDERS)
+        # For each sender [sender; its last sequence number; time since that heartbeat in s]; NaN if unused.
+        self._initial = np.full(3 * MAX_SENDERS, np.nan)
         self._state = self.DeclareDiscreteState(self._initial)
         self._fault_port = self.DeclareVectorOutputPort(
             "fault",
@@ -77,14 +77,13 @@ class HeartbeatMonitor(LeafSystem):
 
     def _senders(self, context: Context) -> np.ndarray:
         """Return sender, sequence and age of each known monitor, (m, 3), with the newest heartbeats."""
-        senders = context.get_discrete_state(self._state).value().reshape(-1, 3)
-        known = {sender: (sequence, age) for sender, sequence, age in senders.tolist() if np.isfinite(sender)}
+        senders = context.get_discrete_state(self._state).value().reshape(MAX_SENDERS, 3)
+        known = {sender: (sequence, age) for sender, sequence, age in senders.tolist() if not np.isnan(sender)}
         for heartbeat in self._heartbeats(context):
-            sequence, _ = known.get(heartbeat.sender, (-np.inf, 0.0))
-            if heartbeat.sequence > sequence:
+            if heartbeat.sender not in known or heartbeat.sequence > known[heartbeat.sender][0]:
                 known[heartbeat.sender] = (heartbeat.sequence, 0.0)
         rows = sorted((age, sender, sequence) for sender, (sequence, age) in known.items())[:MAX_SENDERS]
-        return np.array([(sender, sequence, age) for age, sender, sequence in rows]).reshape(-1, 3)
+        return np.array([(sender, sequence, age) for age, sender, sequence in rows]).reshape(len(rows), 3)
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._initial)
@@ -104,8 +103,6 @@ class HeartbeatMonitor(LeafSystem):
     def _is_stopping_or_missing(self, context: Context) -> bool:
         ages = {sender: age for sender, _, age in self._senders(context).tolist()}
         is_alive = {sender: age <= self._timeout for sender, age in ages.items()}
-        is_stopping = any(
-            heartbeat.is_stopping and is_alive.get(heartbeat.sender, False) for heartbeat in self._heartbeats(context)
-        )
+        is_stopping = any(each.is_stopping and is_alive.get(each.sender) for each in self._heartbeats(context))
         is_missing = any(not alive and ages[sender] <= FORGET_TIME for sender, alive in is_alive.items())
         return is_stopping or is_missing or (bool(ages) and not any(is_alive.values()))

@@ -120,7 +120,7 @@ class StatusWatchdog(LeafSystem):
     def _evaluate(self, context: Context) -> Estimate:
         value, state, clock = self._status_port.Eval(context), self._state_of(context), self._clock(context)
         # An unchanged clock input belongs to the previous check.
-        is_new_clock = np.isfinite(clock) and clock != context.get_discrete_state(self._last_clock).value()[0]
+        is_new_clock = np.isfinite(clock) and clock not in context.get_discrete_state(self._last_clock).value()
         now = clock if is_new_clock else state.check_time
         status = value if isinstance(value, JointStatus) else None
         M, drag = self._dynamics.evaluate(self._plant_context.Eval(context))

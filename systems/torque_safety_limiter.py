@@ -17,11 +17,9 @@ from guiderail.systems.support.declarations import (
     output_getter,
 )
 
-# Indices into the discrete state.
-_ARM_STATE = 0  # value of `ArmState`
-_FAULT = 1  # code of `Fault` that caused the last stop
-_STATE_TIME = 2  # time since the arm state changed [s]
-_BLEND_FACTOR = 3  # from 0 to 1
+# Indices into the discrete state: [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
+# last change to DAMPING or OFF in s; blend factor from 0 to 1].
+_ARM_STATE, _BLEND_FACTOR = 0, 3
 
 ZERO_TORQUE_TIME = 0.05  # zero torque is sent this long to a robot without status before publishing stops [s]
 
@@ -68,7 +66,7 @@ class SafetyLimits:
         for value in (*self.velocity, *self.torque, *self.external_torque, self.force, *times):
             if not 0.0 < value < np.inf:
                 raise InputError(f"an arm's limits and times must be positive, not {value}")
-        if not (np.array(self.lower) < np.array(self.upper)).all():
+        if not (self.lower < np.array(self.upper)).all():
             raise InputError(f"a workspace from {self.lower} to {self.upper} is empty")
 
 
@@ -264,7 +262,7 @@ class TorqueSafetyLimiter(LeafSystem):
         status_fault = Fault(int(self._status_fault_port.Eval(context)[0]))
         if status_fault:
             return status_fault
-        if not self._status_age_port.Eval(context)[0] <= np.inf:
+        if np.isnan(self._status_age_port.Eval(context)[0]):
             return Fault.STALE
         joint_state = self._estimated_state_port.Eval(context)
         if not np.isfinite(joint_state).all():
@@ -294,14 +292,14 @@ class TorqueSafetyLimiter(LeafSystem):
         present_fault = self._present_fault.Eval(context)
         if arm_state == ArmState.WAITING:
             if not present_fault:
-                arm_state, state_time = ArmState.RAMPING, 0.0
+                arm_state = ArmState.RAMPING
         elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
             if present_fault:
                 arm_state, fault, state_time, blend_factor = ArmState.DAMPING, present_fault, 0.0, 0.0
             else:
                 blend_factor = min(blend_factor + self._period / self._limits.ramp_time, 1.0)
                 if arm_state == ArmState.RAMPING and blend_factor == 1.0:
-                    arm_state, state_time = ArmState.RUNNING, 0.0
+                    arm_state = ArmState.RUNNING
         elif arm_state == ArmState.DAMPING and state_time >= self._limits.damping_time:
             arm_state, state_time = ArmState.OFF, 0.0
         discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor])
@@ -312,8 +310,7 @@ class TorqueSafetyLimiter(LeafSystem):
         torque = np.zeros(self._num_joints)
         if is_active and not self._present_fault.Eval(context):
             torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
-            if blend_factor < 1.0:
-                torque = torque + (1.0 - blend_factor) * self._damping_torque(context)
+            torque = torque + (1.0 - blend_factor) * self._damping_torque(context)
         elif is_active or arm_state == ArmState.DAMPING:
             torque = self._damping_torque(context)
         torque = np.where(np.isfinite(torque), torque, 0.0)

@@ -53,7 +53,6 @@ class SafetyMonitor:
         driver: Driver,
         plant: MultibodyPlant,
         limits: SafetyLimits,
-        max_silence: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Construct the monitor.
@@ -62,24 +61,22 @@ class SafetyMonitor:
             driver: The monitor's own connection to the robot.
             plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
             limits: Torque limits, and durations of the phases of a stop.
-            max_silence: Largest accepted time between commands [s]; default: `MAX_MISSED_MESSAGES` driver periods.
             clock: Function that returns the local time [s].
         """
         driver.check_usable()
         self.state, self.fault = MonitorState.IDLE, Fault.NO_STATUS
         self._driver, self._plant, self._limits, self._clock = driver, plant, limits, clock
         self._dynamics = JointDynamics(plant)
-        self._max_silence = MAX_MISSED_MESSAGES * driver.period if max_silence is None else max_silence
         self._context = plant.CreateDefaultContext()
         self._estimator = StateEstimator(status_limits(plant, driver), torque_tolerance(limits), period=driver.period)
         self._estimated = EstimatorState.initial(plant.num_positions())
         self._torque_limits = np.array(limits.torque)
         self._command: np.ndarray | None = None  # torques that the driver repeats
         self._commands = CommandSequence(driver.period)
-        self._num_repeats = 0  # since the last check
         # Local times [s]: last command, last change of state, last check.
         self._commanded_at = self._entered_at = self._checked_at = -np.inf
-        self._sender, self._num_heartbeats = secrets.randbits(48), 0
+        self._sender = secrets.randbits(48)
+        self._num_heartbeats = self._num_repeats = 0  # repetitions of the torque since the last check
         driver.add_listener(self._on_command)
 
     def receive(self, timeout: float = 0.0) -> None:
@@ -145,7 +142,7 @@ class SafetyMonitor:
             self.state = MonitorState.WATCHING
 
     def _update_state(self, now: float) -> None:
-        is_silent = now - self._commanded_at > self._max_silence
+        is_silent = now - self._commanded_at > MAX_MISSED_MESSAGES * self._driver.period
         has_fault = self.fault in STOP_FAULTS
         if self.state == MonitorState.WATCHING and (is_silent or has_fault):
             has_torque = self._command is not None and bool(np.any(self._command))

@@ -105,7 +105,7 @@ class LastValidPose:
         output.SetAtIndex(0, float(not self._is_valid(context)))
 
     def _is_valid(self, context: Context) -> bool:
-        return self._validity.is_valid(context, float(context.get_discrete_state(self._check_time).value()[0]))
+        return self._validity.is_valid(context, context.get_discrete_state(self._check_time).value().item())
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._last_pose, self._measured_pose(context))

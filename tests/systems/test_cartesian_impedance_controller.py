@@ -1,10 +1,12 @@
 """Physics of the impedance of an arm in free space: statics, energy, limits and command timeout."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.geometry import Sphere
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
     AddMultibodyPlantSceneGraph,
@@ -12,7 +14,7 @@ from pydrake.multibody.plant import (
     ExternallyAppliedSpatialForce,
     MultibodyPlant,
 )
-from pydrake.multibody.tree import FixedOffsetFrame, SpatialInertia
+from pydrake.multibody.tree import FixedOffsetFrame, JacobianWrtVariable, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
@@ -20,7 +22,8 @@ from scipy.spatial.transform import Rotation
 from guiderail.diagrams.stations.arm import add_arm, controller_model
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.cartesian_impedance import damping_matrix, spring_wrench
+from guiderail.models.control.cartesian_impedance import damping_matrix, impedance_torques, spring_wrench
+from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 
@@ -124,6 +127,118 @@ def displacement(before, after):
     X, Y = pose_to_transform(before), pose_to_transform(after)
     turn = (Y.rotation() @ X.rotation().inverse()).ToAngleAxis()
     return np.concatenate([Y.translation() - X.translation(), turn.angle() * turn.axis()])
+
+
+class Law:
+    """Controller of an arm in a random state, without a simulation, and the arguments of its law."""
+
+    def __init__(self, seed=0, *, turned_axes=None, **options):
+        rng = np.random.default_rng(seed)
+        self.q, self.v = np.array(POSTURES[1]), 0.2 * rng.standard_normal(7)
+        gains = {"wrench_limits": np.full(6, 1e3), "posture": self.q + 0.1 * rng.standard_normal(7)}
+        self.gains = ImpedanceGains(STIFFNESS, **(gains | {k: options.pop(k) for k in [*options] if k in FIELDS}))
+        if turned_axes is None:
+            model, arm = controller_model(WORKCELL)
+        else:
+            model, arm = _with_axes(turned_axes)
+            options["stiffness_frame"] = model.GetFrameByName("axes")
+        context = model.CreateDefaultContext()
+        model.SetPositionsAndVelocities(context, [*self.q, *self.v])
+        X_WT, X_WP = arm.target.CalcPoseInWorld(context), arm.tool_center.CalcPoseInWorld(context)
+        self.X_TP = X_WT.inverse() @ X_WP
+        self.desired = transform_to_pose(self.X_TP) + 0.01 * rng.standard_normal(6)
+        X_TPd = pose_to_transform(self.desired)
+        eta, epsilon = orientation_error(X_TPd.rotation(), self.X_TP.rotation())
+        world, R_TW = model.world_frame(), X_WT.rotation().inverse()
+        J_W = model.CalcJacobianSpatialVelocity(
+            context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), world, world
+        )
+        M = model.CalcMassMatrix(context)
+        self.arguments = {
+            "K": STIFFNESS,
+            "damping_ratio": self.gains.damping_ratio,
+            "wrench_limits": self.gains.wrench_limits,
+            "R_axes": None if turned_axes is None else (R_TW @ turned_axes).matrix(),
+            "p_error": X_TPd.translation() - self.X_TP.translation(),
+            "eta": eta,
+            "epsilon": epsilon,
+            "J": np.vstack([R_TW.matrix() @ J_W[3:], R_TW.matrix() @ J_W[:3]]),
+            "M": M,
+            "v": self.v,
+            "posture_torque": self.gains.posture_stiffness * (self.gains.posture - self.q)
+            - self.gains.posture_damping * (M @ self.v),
+            "gravity_torque": -model.CalcGravityGeneralizedForces(context),
+            "torque_limits": model.GetEffortUpperLimits(),
+        }
+        self.system = CartesianImpedanceController(
+            model, arm.target, arm.tool_center, self.gains, period=0.005, **options
+        )
+        self.context = self.system.CreateDefaultContext()
+        self.fix(desired_pose=self.desired, estimated_state=[*self.q, *self.v])
+
+    def fix(self, **inputs):
+        for name, value in inputs.items():
+            self.system.GetInputPort(name).FixValue(self.context, value)
+
+    def __getitem__(self, port):
+        return self.system.GetOutputPort(port).Eval(self.context)
+
+    def check(self, **changed):
+        """Compare the outputs with the law."""
+        expected = impedance_torques(**(self.arguments | changed))
+        np.testing.assert_allclose(self["generalized_force"], expected.torque, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(self["impedance_wrench"], expected.wrench, rtol=1e-7, atol=1e-7)
+        assert self["saturation"].tolist() == [expected.is_saturated]
+        return expected
+
+
+FIELDS = [field.name for field in fields(ImpedanceGains)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("turned_axes", [None, RotationMatrix(RollPitchYaw(0.4, -0.3, 0.7))], ids=["T", "turned"])
+def test_torques_are_those_of_the_law(seed, turned_axes):
+    law = Law(seed, turned_axes=turned_axes)
+    assert not law.check().is_saturated
+    np.testing.assert_array_equal(law["pose"], transform_to_pose(law.X_TP))
+    limited = Law(seed, turned_axes=turned_axes, wrench_limits=np.full(6, 3.0))
+    assert limited.check().is_saturated
+
+
+def test_gains_have_their_documented_defaults():
+    gains = Law().gains
+    assert (gains.damping_ratio, gains.posture_stiffness, gains.posture_damping) == (1.0, 10.0, 5.0)
+
+
+def test_gravity_is_compensated_unless_the_robot_does_it():
+    Law(compensate_gravity=False).check(gravity_torque=np.zeros(7))
+    Law(compensate_gravity=True).check()
+
+
+def test_bound_replaces_the_limits_of_the_wrench():
+    bound = WrenchBound(np.full(6, 3.0), 4.0, 2.0, contact_stiffness=1e4)
+    Law(bound=bound).check(bound=bound)
+
+
+def test_requested_bound_lowers_the_configured_one():
+    requested = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0, 2.5, 1.1])
+    bound = WrenchBound(np.array([3.0, 1.0, 3.0, 3.0, 0.5, 3.0]), 4.0, 1.0, contact_stiffness=1e4)
+    law = Law(bound=bound)
+    law.fix(max_wrench=requested)
+    law.check(bound=WrenchBound(np.array([2.0, 1.0, 2.0, 1.0, 0.5, 1.0]), 2.5, 1.0, contact_stiffness=1e4))
+    without = Law(wrench_limits=np.array([3.0, 1.0, 3.0, 3.0, 0.5, 3.0]))
+    without.fix(max_wrench=requested)
+    without.check(bound=WrenchBound(np.array([2.0, 1.0, 2.0, 1.0, 0.5, 1.0]), 2.5, 1.1))
+
+
+@pytest.mark.parametrize(
+    ("age", "timeout", "command_timed_out"),
+    [(0.1, {}, 0.0), (0.10005, {}, 1.0), (0.2, {"timeout": 0.2}, 0.0), (0.2001, {"timeout": 0.2}, 1.0)],
+)
+def test_command_times_out_after_the_timeout(age, timeout, command_timed_out):
+    law = Law(**timeout)
+    law.fix(command_time=[-age])
+    assert law["command_timed_out"].tolist() == [command_timed_out]
 
 
 @pytest.mark.parametrize("q", POSTURES)
@@ -294,12 +409,28 @@ def test_damping_gives_every_mode_its_damping_ratio():
         {"posture_damping": np.inf},
         {"posture": np.full(7, np.nan)},
         {"posture": np.array([0.0] * 6 + [np.inf])},
+        {"stiffness": np.eye(6) + np.eye(6, k=1)},
+        {"stiffness": np.diag([1.0, 1, 1, 1, 1, 0])},
+        {"stiffness": np.diag([1.0005e8, 1, 1, 1, 1, 1])},
+        {"wrench_limits": np.ones(5)},
+        {"wrench_limits": np.array([1.0, 1, 1, 1, 1, 0])},
     ],
 )
 def test_constructor_refuses_arguments_out_of_range(wrong):
     valid = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
     with pytest.raises(InputError):
         ImpedanceGains(**(valid | wrong))
+
+
+def test_gains_at_their_limits_are_accepted():
+    stiffest, zero = np.diag([1e8, 1e-9, 1, 1, 1, 1]), {"posture_stiffness": 0.0, "posture_damping": 0.0}
+    ImpedanceGains(stiffest.tolist(), [1e-9] * 6, np.zeros(7), damping_ratio=1e-9, **zero)
+
+
+def test_constructor_refuses_a_posture_of_another_arm():
+    (model, arm), gains = controller_model(WORKCELL), ImpedanceGains(STIFFNESS, LIMITS, np.zeros(6))
+    with pytest.raises(InputError, match="7 joints"):
+        CartesianImpedanceController(model, arm.target, arm.tool_center, gains, period=0.005)
 
 
 def test_ports_and_feedthrough():

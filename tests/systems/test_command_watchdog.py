@@ -14,8 +14,8 @@ START, FIRST, SECOND = np.zeros(6), np.full(6, 1.0), np.full(6, 2.0)
 class Rig:
     """Watchdog of a robot at `START`, with its inputs fixed by the test."""
 
-    def __init__(self, command, time=None, start=START):
-        self.system = CommandWatchdog(PERIOD, TIMEOUT, pose_size=len(start))
+    def __init__(self, command, time=None, start=START, timeout=(TIMEOUT,)):
+        self.system = CommandWatchdog(PERIOD, *timeout, pose_size=len(start))
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.pristine = self.system.CreateDefaultContext()
@@ -101,6 +101,23 @@ def test_command_is_ignored_when_its_time_stamp_is_not_finite():
     rig.check(START, command_timed_out=1)
 
 
+@pytest.mark.parametrize(
+    ("age", "command_timed_out"),
+    [(TIMEOUT, 0), (1.0005 * TIMEOUT, 1), (-(PERIOD + 1e-6), 0), (-(PERIOD + 1.0005e-6), 1)],
+)
+def test_age_of_a_command_is_checked_at_its_limits(age, command_timed_out):
+    rig = Rig(FIRST, time=-age)
+    rig.check(START if command_timed_out else FIRST, command_timed_out)
+
+
+@pytest.mark.parametrize(("size", "command_timed_out"), [(1e6, 0), (1.0005e6, 1)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_coordinate_is_checked_at_its_limit(sign, size, command_timed_out):
+    command = np.array([0.0, 0.0, 0.0, sign * size, 0.0, 0.0])
+    rig = Rig(command)
+    rig.check(START if command_timed_out else command, command_timed_out)
+
+
 @pytest.mark.parametrize("nonsense", [np.nan, np.inf])
 def test_measured_pose_is_output_before_the_first_command(nonsense):
     rig = Rig(np.full(6, nonsense))
@@ -143,6 +160,12 @@ def test_validity_uses_the_start_time_before_the_first_check(age, command_timed_
     rig.command(FIRST, time=start - age)
     rig.simulator.Initialize()
     rig.check(START if command_timed_out else FIRST, command_timed_out)
+
+
+@pytest.mark.parametrize(("age", "command_timed_out"), [(0.1, 0), (0.10005, 1)])
+def test_commands_time_out_after_a_tenth_of_a_second_by_default(age, command_timed_out):
+    rig = Rig(FIRST, time=-age, timeout=())
+    assert rig.system.get_command_timed_out_output_port().Eval(rig.context) == [command_timed_out]
 
 
 def test_outputs_are_not_computed_again_between_two_checks():

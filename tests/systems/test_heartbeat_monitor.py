@@ -13,8 +13,8 @@ PERIOD, TIMEOUT = 0.125, 0.5
 class Rig:
     """Monitor with a heartbeat input that is set before each step."""
 
-    def __init__(self):
-        self.system = HeartbeatMonitor(period=PERIOD, timeout=TIMEOUT)
+    def __init__(self, period=PERIOD):
+        self.system, self.period = HeartbeatMonitor(period=period, timeout=TIMEOUT), period
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.heartbeats = self.system.get_heartbeats_input_port().FixValue(self.context, Value[object]())
@@ -30,12 +30,12 @@ class Rig:
         self.set(*heartbeats)
         fault = self.fault
         self.num_steps += 1
-        self.simulator.AdvanceTo(self.num_steps * PERIOD)
+        self.simulator.AdvanceTo(self.num_steps * self.period)
         return fault
 
     @property
     def fault(self):
-        return Fault(int(self.system.get_fault_output_port().Eval(self.context)[0]))
+        return Fault(int(self.system.get_fault_output_port().Eval(self.context).item()))
 
     @property
     def is_alive(self):
@@ -69,6 +69,19 @@ def test_fault_is_raised_when_the_heartbeat_times_out():
     assert rig.is_alive
 
 
+@pytest.mark.parametrize(("age", "is_alive"), [(TIMEOUT, True), (1.0005 * TIMEOUT, False)])
+def test_monitor_is_alive_up_to_the_timeout(age, is_alive):
+    rig = Rig(period=age)
+    rig.step(Heartbeat(1, False))
+    assert rig.is_alive == is_alive
+    assert rig.fault == (Fault.NONE if is_alive else Fault.MONITOR_STOP)
+
+
+def test_next_heartbeat_of_many_is_a_sign_of_life():
+    rig = Rig()
+    assert {rig.step(Heartbeat(5000 + k, False)) for k in range(10)} == {Fault.NONE}
+
+
 @pytest.mark.parametrize("sequence", [4, 5])
 def test_repeated_or_older_heartbeat_is_no_sign_of_life(sequence):
     rig = Rig()
@@ -91,6 +104,13 @@ def test_missing_monitor_is_noticed_while_another_is_alive():
     rig.step(Heartbeat(2, False, 7), Heartbeat(90, False, 8))
     faults = [rig.step(Heartbeat(2, False, 7), Heartbeat(91 + k, False, 8)) for k in range(5)]
     assert faults == [Fault.NONE] * 4 + [Fault.MONITOR_STOP]
+
+
+@pytest.mark.parametrize(("age", "fault"), [(1.0, Fault.MONITOR_STOP), (1.0005, Fault.NONE)])
+def test_silent_monitor_is_forgotten_after_the_forget_time(age, fault):
+    rig = Rig(period=age)
+    rig.step(Heartbeat(1, False, 7), Heartbeat(1, False, 8))
+    assert rig.step(Heartbeat(1, False, 7), Heartbeat(2, False, 8)) == fault
 
 
 def test_last_monitor_is_never_forgotten():

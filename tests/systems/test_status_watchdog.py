@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.common.value import Value
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
@@ -28,7 +29,8 @@ def plant():
     for number in range(2):
         inertia = SpatialInertia(1.0, [0.2, 0.0, 0.0], UnitInertia(0.5, 0.6, 0.7))
         body = plant.AddRigidBody(f"link{number}", inertia)
-        joint = RevoluteJoint(f"joint{number}", parent.body_frame(), body.body_frame(), [0.0, 0.0, 1.0], damping=0.5)
+        end = plant.AddFrame(FixedOffsetFrame(f"end{number}", parent.body_frame(), RigidTransform([0.4, 0.0, 0.0])))
+        joint = RevoluteJoint(f"joint{number}", end, body.body_frame(), [0.0, 0.0, 1.0], damping=0.5)
         plant.AddJoint(joint)
         parent = body
     plant.Finalize()
@@ -157,10 +159,18 @@ def test_unchanged_clock_input_is_not_used_twice(plant):
     assert rig.fault == Fault.NONE  # it would be in the future of the previous check
 
 
-def test_initialization_resets_the_state(plant):
-    rig = Rig(plant).settle()
+def test_infinite_clock_input_is_not_used(plant):
+    rig = Rig(plant, has_clock=True).settle()
+    rig.wall = np.inf
+    assert rig.check(rig.status()) == Fault.NONE
+
+
+@pytest.mark.parametrize(("has_clock", "fault"), [(False, Fault.NO_STATUS), (True, Fault.DEADLINE_MISSED)])
+def test_initialization_resets_the_state(plant, has_clock, fault):
+    """The clock input is used although it has not changed; by it the first check, due at time zero, is late."""
+    rig = Rig(plant, has_clock=has_clock).settle()
     rig.simulator.Initialize()
-    assert rig.fault == Fault.NO_STATUS
+    assert rig.fault == fault
 
 
 def test_ports_have_their_documented_sizes(plant):

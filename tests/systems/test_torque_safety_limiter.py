@@ -30,9 +30,9 @@ def plant():
 class Rig:
     """Limiter of a moving arm without faults, in state RUNNING by default."""
 
-    def __init__(self, plant, running=True, can_hold=False):
+    def __init__(self, plant, running=True, **options):
         self.plant = plant
-        self.system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD, can_hold=can_hold)
+        self.system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD, **options)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         ok = {
@@ -127,7 +127,7 @@ def test_fault_stops_the_arm_at_once_until_resume(plant, fault):
     assert not np.isclose(rig["safe_torque"], COMMANDED).any()
     rig.advance(2 * PERIOD)
     rig.set(**{name: rig.ok[name] for name in WRONG[fault]})
-    assert (rig.arm_state, rig.fault) == (ArmState.DAMPING, fault)
+    assert (rig.arm_state, rig.fault, rig["blend_factor"][0]) == (ArmState.DAMPING, fault, 0.0)
     np.testing.assert_allclose(rig["safe_torque"], np.clip(rig.damping(), -20.0, 20.0), atol=1e-12)
     with pytest.raises(InputError, match="is damping"):
         rig.system.resume(rig.context)
@@ -151,6 +151,7 @@ def test_desired_pose_outside_the_workspace_stops_the_arm(plant):
 POSITION, VELOCITY = [*([np.nan] * n), *SPEED], [*POSTURE, *([np.nan] * n)]
 NOT_FINITE = {
     "torque": ({"torque": np.full(n, np.nan)}, Fault.TORQUE_NOT_FINITE),
+    "infinite torque": ({"torque": [*COMMANDED[:-1], np.inf]}, Fault.TORQUE_NOT_FINITE),
     "positions": ({"estimated_state": POSITION}, Fault.NOT_FINITE),
     "velocities": ({"estimated_state": VELOCITY}, Fault.NOT_FINITE),
     "infinite velocity": ({"estimated_state": [*POSTURE, *SPEED[:-1], np.inf]}, Fault.NOT_FINITE),
@@ -175,7 +176,8 @@ def test_non_finite_input_is_a_fault_with_finite_torque(plant, what, blend_facto
     rig.set(**wrong)
     assert np.isfinite(rig["safe_torque"]).all()
     if blend_factor == "none" and what == "desired_pose":
-        return  # the desired pose is not followed yet
+        assert rig.fault == Fault.NONE  # the desired pose is not followed yet
+        return
     assert rig.fault == fault
     for _ in range(round(LIMITS.damping_time / PERIOD) + 4):
         rig.advance(PERIOD)
@@ -192,6 +194,24 @@ def test_unknown_velocity_or_posture_is_not_damped(plant, wrong):
         np.testing.assert_array_equal(rig["safe_torque"], 0.0)
         rig.advance(PERIOD)
     assert rig.arm_state == ArmState.DAMPING
+
+
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
+def test_commanded_torque_is_passed_when_the_velocity_is_unknown(plant, unknown):
+    rig = Rig(plant)
+    rig.set(velocity=[*SPEED[:-1], unknown])
+    np.testing.assert_array_equal(rig["safe_torque"], COMMANDED)
+
+
+def test_torque_that_overflows_is_zero(plant):
+    rig = Rig(plant)
+    velocity = 1e308 * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
+    rig.set(velocity=velocity, status_fault=[Fault.FROZEN])
+    with np.errstate(all="ignore"):
+        torque = rig.damping(velocity)
+        assert not np.isfinite(torque).all()
+        expected = np.where(np.isfinite(torque), np.clip(torque, -20.0, 20.0), 0.0)
+        np.testing.assert_array_equal(rig["safe_torque"], expected)
 
 
 def test_stop_damps_the_estimated_velocity_and_not_the_reported(plant):
@@ -273,7 +293,7 @@ def test_stop_sends_nothing_to_a_waiting_arm(plant):
     rig.advance(10 * PERIOD)
     assert rig.arm_state == ArmState.WAITING
     rig.system.stop(rig.context)
-    assert (rig.arm_state, rig.fault) == (ArmState.OFF, Fault.USER_STOP)
+    assert (rig.arm_state, rig.fault, rig["blend_factor"][0]) == (ArmState.OFF, Fault.USER_STOP, 0.0)
     for _ in range(100):
         rig.advance(PERIOD)
         assert rig["is_sending"][0] == 0.0
@@ -369,6 +389,14 @@ def test_arm_waits_before_the_initialization(plant):
     np.testing.assert_array_equal(rig["safe_torque"], 0.0)
 
 
+def test_initialization_resets_the_arm_state(plant):
+    rig = Rig(plant)
+    rig.set(status_fault=[Fault.STALE])
+    rig.advance(PERIOD)
+    rig.simulator.Initialize()
+    assert (rig.arm_state, rig["blend_factor"][0], rig["is_sending"][0]) == (ArmState.WAITING, 0.0, 0.0)
+
+
 def test_ramping_damps_the_estimated_velocity(plant):
     rig = Rig(plant, running=False)
     rig.simulator.Initialize()
@@ -429,12 +457,20 @@ def test_damping_lasts_for_its_time(plant, state):
 
 @pytest.mark.parametrize(("steps", "is_sending"), [(12, 1.0), (13, 0.0)])
 def test_zero_torque_is_sent_for_its_time(plant, steps, is_sending):
-    assert 12 * PERIOD <= ZERO_TORQUE_TIME < 13 * PERIOD
+    assert 12 * PERIOD <= ZERO_TORQUE_TIME == 0.05 < 13 * PERIOD
     rig = Rig(plant)
     rig.set(status_fault=[Fault.STALE])
     while rig.arm_state != ArmState.OFF:
         rig.advance(PERIOD)
     rig.advance(steps * PERIOD)
+    assert rig["is_sending"][0] == is_sending
+
+
+@pytest.mark.parametrize(("seconds", "is_sending"), [(0.05, 1.0), (0.05002, 0.0)])
+def test_sending_ends_just_after_the_zero_torque_time(plant, seconds, is_sending):
+    rig = Rig(plant)
+    rig.set(status_fault=[Fault.STALE])
+    rig.context.SetDiscreteState(np.array([ArmState.OFF, Fault.STALE, seconds, 0.0]))
     assert rig["is_sending"][0] == is_sending
 
 

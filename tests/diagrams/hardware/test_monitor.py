@@ -1,5 +1,7 @@
 """Safety monitor on a bus in memory, by a clock of the test."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_status
@@ -10,7 +12,8 @@ from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.hardware.monitor import MAX_REPEATS, MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault, damping_torque
 from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME
 
@@ -77,8 +80,10 @@ class Bus:
             self.settle()
 
     def settle(self):
-        while self.lcm.HandleSubscriptions(0):
-            pass
+        for _ in range(100):
+            if not self.lcm.HandleSubscriptions(0):
+                return
+        raise AssertionError("messages answer each other without end")
 
     def watch(self):
         """Command the arm until the monitor accepts its statuses."""
@@ -137,6 +142,8 @@ def test_monitor_is_idle_without_a_torque_to_stop(arm):
     bus.settle()
     bus.commands.clear()
     assert bus.monitor.state == MonitorState.WATCHING
+    bus.go(1, joint_velocity_estimated=[np.nan] * 7)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NOT_FINITE)
     bus.go(50)
     assert (bus.monitor.state, bus.commands) == (MonitorState.IDLE, [])
 
@@ -265,6 +272,12 @@ def test_monitors_heartbeats_have_its_number(arm):
     assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
 
 
+def test_monitor_sends_heartbeats_before_the_first_status(arm):
+    bus = Bus(arm)
+    bus.go(1, status=False)
+    assert (len(bus.heartbeats), bus.monitor.fault, bus.commands) == (1, Fault.NO_STATUS, [])
+
+
 def test_monitor_checks_once_per_period_without_a_new_status(arm):
     bus = Bus(arm)
     bus.go(1)
@@ -273,6 +286,88 @@ def test_monitor_checks_once_per_period_without_a_new_status(arm):
     assert len(bus.heartbeats) == 1
     bus.go(1, status=False)
     assert len(bus.heartbeats) == 2
+
+
+class Clocked:
+    """Monitor without a robot, by a clock that a test sets, after a command that turns one joint."""
+
+    def __init__(self, arm, commanded_at):
+        self.now, self.lcm = commanded_at, DrakeLcm("memq://")
+        limits = replace(safety_limits(arm.plant, IiwaDriver), damping_time=0.25)
+        self.monitor = SafetyMonitor(IiwaDriver(self.lcm), arm.plant, limits, clock=lambda: self.now)
+        self.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(PUSH * (np.arange(7) == 3), commanded_at))
+        self.lcm.HandleSubscriptions(0)
+
+    def state_at(self, now):
+        self.now = now
+        self.monitor.check()
+        return self.monitor.state
+
+
+@pytest.mark.parametrize(("share", "state"), [(1.0, MonitorState.WATCHING), (1.0005, MonitorState.DAMPING)])
+def test_commands_may_be_silent_for_their_time(arm, share, state):
+    assert Clocked(arm, 0.0).state_at(share * MAX_MISSED_MESSAGES * PERIOD) == state
+
+
+@pytest.mark.parametrize(("seconds", "state"), [(0.05, MonitorState.RESTING), (0.05002, MonitorState.IDLE)])
+def test_states_of_a_stop_last_for_their_times(arm, seconds, state):
+    clocked = Clocked(arm, -0.5)
+    assert clocked.state_at(-0.25) == MonitorState.DAMPING
+    assert clocked.state_at(-0.005) == MonitorState.DAMPING
+    assert clocked.state_at(0.0) == MonitorState.RESTING
+    assert clocked.state_at(seconds) == state
+
+
+@pytest.mark.parametrize(("gap", "is_due"), [(0.9895, False), (0.99, True), (1.0, True)])
+def test_check_without_a_status_is_due_after_a_period(arm, gap, is_due):
+    """The tolerance is for the rounding of a clock."""
+    bus, times = Bus(arm), [0.0]
+    bus.monitor = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: times[-1])
+    bus.monitor.receive()
+    times.append(gap * PERIOD)
+    bus.monitor.receive()
+    bus.settle()
+    assert len(bus.heartbeats) == 1 + is_due
+
+
+def test_new_status_is_checked_at_once(arm):
+    bus = Bus(arm)
+    bus.go(1)
+    now = bus.now
+    bus.monitor = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: now)
+    bus.heartbeats.clear()
+    bus.go(3)
+    assert len(bus.heartbeats) == 3
+
+
+@pytest.mark.parametrize(("timeout", "expected"), [((), 0.0), ((0.25,), 0.25)])
+def test_monitor_waits_for_messages_only_when_asked(arm, timeout, expected):
+    timeouts = []
+
+    class Recording(IiwaDriver):
+        def receive(self, timeout):
+            timeouts.append(timeout)
+
+    monitor = SafetyMonitor(Recording(DrakeLcm("memq://")), arm.plant, safety_limits(arm.plant, Recording))
+    monitor.receive(*timeout)
+    assert timeouts == [expected]
+
+
+def test_damping_is_that_of_the_arm_in_its_posture(arm):
+    bus = Bus(arm).watch()
+    bus.go(MAX_MISSED_MESSAGES)
+    bus.plant.SetPositions(bus.context, bus.positions)
+    bus.go(1)
+    M, limits = bus.plant.CalcMassMatrix(bus.context), np.array(bus.limits.torque)
+    expected = damping_torque(M, bus.velocities, bus.limits.decay_time, period=PERIOD)
+    np.testing.assert_allclose(bus.commands[-1], np.clip(expected, -limits, limits), rtol=1e-5)
+
+
+def test_velocity_is_predicted_by_the_model_of_the_arm(arm):
+    bus = Bus(arm, velocity=5.0 * MOVING).watch()
+    bus.go(MAX_MISSED_MESSAGES, status=False)
+    assert bus.monitor.fault == Fault.NONE
+    np.testing.assert_allclose(bus.monitor._estimated.velocity, bus.velocities, atol=4e-3)
 
 
 def test_monitor_asks_the_driver_to_hold_after_a_status_fault(arm):
@@ -287,13 +382,24 @@ def test_monitor_asks_the_driver_to_hold_after_a_status_fault(arm):
     bus = Bus(arm)
     bus.monitor = SafetyMonitor(Holding(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
     bus.watch()
-    bus.go(3, joint_velocity_estimated=[np.nan] * 7)
-    assert (len(held), bus.commands) == (3, [])
+    bus.go(2, joint_velocity_estimated=[np.nan] * 7)
+    assert bus.commands == []
+    bus.go(1, command=True, joint_velocity_estimated=[np.nan] * 7)
+    assert (len(held), bus.monitor.state) == (3, MonitorState.DAMPING)
     bus.go(100)
     bus.go(10, command=True)
     bus.commands.clear()
     bus.go(MAX_MISSED_MESSAGES + 2)  # no fault of the status: damped
     assert (len(held) <= 3 + round(0.5 / PERIOD), len(bus.commands)) == (True, 2)
+
+
+def test_monitor_refuses_a_driver_that_is_not_usable(arm):
+    class Unusable(IiwaDriver):
+        def check_usable(self):
+            raise InputError("not usable")
+
+    with pytest.raises(InputError, match="not usable"):
+        SafetyMonitor(Unusable(DrakeLcm("memq://")), arm.plant, safety_limits(arm.plant, Unusable))
 
 
 def test_torque_tolerances_are_a_share_of_the_limits(arm):

@@ -104,9 +104,7 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str) -> N
             before.__code__ = value.__code__
             before.__defaults__ = _grafted(before.__defaults__, value.__defaults__)
             kept, defaults = before.__kwdefaults__ or {}, value.__kwdefaults__ or {}
-            before.__kwdefaults__ = {
-                k: v if isinstance(v, int | float) else kept.get(k, v) for k, v in defaults.items()
-            }
+            before.__kwdefaults__ = {k: v if _is_numeric(v) else kept.get(k, v) for k, v in defaults.items()}
         elif isinstance(value, type) and isinstance(before, type) and value.__module__ == module:
             if not issubclass(value, Enum):
                 _graft_all(vars(before), vars(value), module)
@@ -120,7 +118,12 @@ def _grafted(before: tuple | None, after: tuple | None) -> tuple | None:
     """Return defaults with the numbers of a mutant."""
     if before is None or after is None or len(before) != len(after):
         return after
-    return tuple(b if isinstance(b, int | float) else a for a, b in zip(before, after, strict=True))
+    return tuple(b if _is_numeric(b) else a for a, b in zip(before, after, strict=True))
+
+
+def _is_numeric(value: Any) -> bool:
+    """Return True for a number, or a tuple of numbers."""
+    return all(map(_is_numeric, value)) if isinstance(value, tuple) else isinstance(value, int | float)
 
 
 def _function(value: Any) -> Any:

@@ -54,8 +54,10 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
         for i, operator in enumerate(node.ops):
             for other in ORDER[type(operator)]:
                 yield _with(node, ops=[*node.ops[:i], other(), *node.ops[i + 1 :]])
-            right = node.comparators[i]
-            if isinstance(operator, LIMITS) and not isinstance(right, ast.Constant | ast.UnaryOp):
+            left, right = ([node.left, *node.comparators][j] for j in (i, i + 1))
+            # A factor changes neither infinity nor the sign of a value that is compared with zero.
+            is_same = ast.unparse(right) == "np.inf" or (isinstance(left, ast.Constant) and left.value == 0)
+            if isinstance(operator, LIMITS) and not is_same and not isinstance(right, ast.Constant | ast.UnaryOp):
                 wider = ast.copy_location(ast.BinOp(right, ast.Mult(), ast.Constant(1.001)), right)
                 yield _with(node, comparators=[*node.comparators[:i], wider, *node.comparators[i + 1 :]])
     elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:

@@ -7,12 +7,14 @@ from hypothesis import strategies as st
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.control import cartesian_impedance as module
 from guiderail.models.control.cartesian_impedance import (
     damping_matrix,
     impedance_torques,
     reachable_inertia,
     spring_wrench,
 )
+from guiderail.models.control.wrench import WrenchBound, bounded_wrench
 
 SEEDS = st.integers(0, 2**32 - 1)
 UNLIMITED = np.full(6, 1e9)
@@ -160,6 +162,65 @@ def test_rotated_axes_give_the_rotated_law(seed):
     np.testing.assert_allclose(turned.wrench, R6 @ straight.wrench, atol=1e-6 * scale)
     np.testing.assert_allclose(turned.torque, straight.torque, atol=1e-6 * scale)
     assert turned.is_saturated == straight.is_saturated
+
+
+STIFF = {"contact_stiffness": 1e5}
+BOUNDS = {
+    "wide": WrenchBound(np.full(6, 1e6), 1e6, 1e6),
+    "narrow": WrenchBound(np.array([4.0, 5.0, 6.0, 0.4, 0.5, 0.6]), 6.0, 0.7),
+    "approach": WrenchBound(np.full(6, 1e6), 30.0, 1e6, **STIFF),
+}
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+@pytest.mark.parametrize("name", BOUNDS)
+@given(seed=SEEDS)
+def test_bound_limits_spring_and_damper_along_the_axes(name, is_turned, seed):
+    given_, bound = arm(seed), BOUNDS[name]
+    R = Rotation.random(rng=np.random.default_rng([seed, 1])).as_matrix() if is_turned else np.eye(3)
+    R6 = np.kron(np.eye(2), R)
+    Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T) + 1e-9 * np.eye(6)
+    V, K = given_["J"] @ given_["v"], R6 @ given_["K"] @ R6.T
+    spring = spring_wrench(K, given_["p_error"], given_["eta"], given_["epsilon"])
+    damping = damping_matrix(K, Lambda_inverse, 0.7) @ V
+    mass = (V[:3] @ V[:3]) / (V[:3] @ Lambda_inverse[:3, :3] @ V[:3])
+    expected = bounded_wrench(R6.T @ spring, R6.T @ damping, R.T @ V[:3], mass, bound)
+    result = impedance_torques(**given_ | {"R_axes": R if is_turned else None, "bound": bound})
+    np.testing.assert_allclose(R6.T @ result.wrench, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    assert result.is_saturated == (np.abs(expected - R6.T @ (spring - damping)).max() > 1e-6)
+    if name == "wide":
+        assert not result.is_saturated
+
+
+@pytest.mark.parametrize(("excess", "is_saturated"), [(0.9995e-9, False), (1.0005e-9, True)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_rounding_by_a_bound_is_no_saturation(sign, excess, is_saturated):
+    """At rest, where the mass of an approach is not needed."""
+    K = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    given_ = arm(0, K=K, v=np.zeros(7), p_error=np.array([0.0, 0.5 * sign, 0.0]), eta=1.0, epsilon=np.zeros(3))
+    axes = np.ones(6)
+    axes[1] -= excess
+    result = impedance_torques(**given_ | {"bound": WrenchBound(axes, np.inf, np.inf, **STIFF)})
+    assert result.is_saturated == is_saturated
+
+
+def test_thresholds_have_their_documented_values():
+    assert (module.LIGHT, module.HEAVY, module.LEVER) == (300.0, 3000.0, 0.25)
+    np.testing.assert_array_equal(module._REGULARIZATION, 1e-9 * np.eye(6))
+
+
+@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("size", [1.0, 1.0005])
+def test_wrench_at_its_limit_is_saturated(number, size):
+    K = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+    error = 1.0 * (np.arange(6) == number)
+    given_ = arm(0, K=K, v=np.zeros(7), p_error=error[:3], eta=0.0, epsilon=error[3:], wrench_limits=np.full(6, size))
+    assert impedance_torques(**given_).is_saturated == (size == 1.0 and number < 3)
+
+
+def test_law_refuses_an_inertia_that_is_not_positive():
+    with pytest.raises(np.linalg.LinAlgError, match="tool"):
+        damping_matrix(np.eye(6), -np.eye(6), 1.0)
 
 
 def test_singular_arm_gets_finite_torques():
