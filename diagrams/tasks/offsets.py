@@ -19,8 +19,8 @@ def reference_of_file(
     path: Path,
     components: int | None,
     floor: tuple[float, ...],
-    prior_std: tuple[float, ...] | None = None,
     count: int | None = None,
+    **fit: Any,
 ) -> ReferenceTrajectory:
     """Fit a reference trajectory to a file's demonstrations; its duration is their mean duration.
 
@@ -28,8 +28,8 @@ def reference_of_file(
         path: File .npz or .csv with poses (N, 6) in the target frame.
         components: Number of components of the Gaussian mixture; None: chosen by the Bayesian information criterion.
         floor: Standard deviation (6,) of a hand's repeatability; its square is added to the fitted variances.
-        prior_std: As in `ReferenceTrajectory.from_demonstrations`.
         count: Number of demonstrations that are used, from the first on; None: all.
+        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`, as of `ReferenceOptions.fit_arguments`.
 
     Raises:
         InputError: If there is no such file, or its demonstrations are not poses.
@@ -37,9 +37,9 @@ def reference_of_file(
     if not path.is_file():
         raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
     with path.open("rb") as file:
-        key = hashlib.file_digest(file, "sha256").digest(), components, floor, prior_std, count
+        key = hashlib.file_digest(file, "sha256").digest(), components, floor, count, *sorted(fit.items())
     if key not in _REFERENCES:
-        _REFERENCES[key] = _fit(path, components, floor, prior_std, count)
+        _REFERENCES[key] = _fit(path, components, floor, count, fit)
     return _REFERENCES[key]
 
 
@@ -51,8 +51,8 @@ def _fit(
     path: Path,
     components: int | None,
     floor: tuple[float, ...],
-    prior_std: tuple[float, ...] | None,
     count: int | None,
+    fit: dict[str, Any],
 ) -> ReferenceTrajectory:
     demonstrations = Demonstrations.load(path).first(count)
     if demonstrations.num_outputs != POSE_SIZE:
@@ -63,7 +63,7 @@ def _fit(
     duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
     num_steps = round(duration / CONTROL_PERIOD) + 1
     fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), prior_std=prior_std
+        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), **fit
     )
     return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
 

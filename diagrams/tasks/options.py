@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -38,8 +38,33 @@ class FixtureOffsetOptions(Options):
         return value
 
 
-class PriorOptions(Options):
-    """Option of a task with demonstrations of poses that may be a single one."""
+class ReferenceOptions(Options):
+    """Options of a task whose demonstrations a reference trajectory is fitted to."""
+
+    reference_model: Literal["gmr", "promp"] = Field(
+        "gmr",
+        description="model of the demonstrations' mean and covariance: Gaussian mixture regression, or a probabilistic "
+        "movement primitive",
+    )
+
+    def fit_arguments(self) -> dict[str, Any]:
+        """Return the arguments of `ReferenceTrajectory.from_demonstrations` that differ from their defaults."""
+        arguments = {"reference_model": "model", "gap_scale": "gap_scale", "prior_std": "prior_std"}
+        fields = type(self).model_fields
+        given = {name: getattr(self, name) for name in arguments if name in fields}
+        return {arguments[name]: value for name, value in given.items() if value != fields[name].default}
+
+
+class PriorOptions(ReferenceOptions):
+    """Options of a task with recorded demonstrations of poses, which may have gaps or be a single one."""
+
+    gap_scale: Number = Field(
+        1.0,
+        ge=0.01,
+        le=100,
+        description="factor of the standard deviation, and so of exploration, where all demonstrations have a gap: "
+        "below 1 it stops exploration there, above 1 it widens it",
+    )
 
     prior_std: Numbers | None = Field(
         None,

@@ -14,6 +14,7 @@ from .poses import pose_rotation as pose_rotation
 from .prediction import BatchPrediction as BatchPrediction
 from .prediction import Modification as Modification
 from .prediction import Prediction as Prediction
+from .promp import ProMp as ProMp
 from .qp import UnsolvableError as UnsolvableError
 from .reference import ReferenceTrajectory as ReferenceTrajectory
 from .stepper import Command as Command

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel
+from guiderail.models.primitives.promp import ProMp
 
 # Importing scikit-learn takes over a second, and reading a file does not need it.
 if TYPE_CHECKING:
@@ -78,27 +79,39 @@ class ReferenceTrajectory:
         num_steps: int | None = None,
         floor: float | np.ndarray = 0.0,
         prior_std: float | Sequence[float] | np.ndarray | None = None,
+        model: Literal["gmr", "promp"] = "gmr",
+        gap_scale: float = 1.0,
+        kernel: Kernel | None = None,
     ) -> ReferenceTrajectory:
-        """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR).
+        """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR), or fit a ProMP.
 
         The covariance of a single demonstration holds only what the mixture does not resolve, such as a circling
         search; `prior_std` adds the variance that other demonstrations would have shown.
 
         Args:
             demonstrations: Demonstrations, resampled to one clock if their clocks differ.
-            components: Number of components C; chosen by the Bayesian information criterion by default.
+            components: Number of components C of the mixture; chosen by the Bayesian information criterion by default.
             seed: Seed of the mixture's initialization.
             num_steps: Number of steps N; that of the longest demonstration by default.
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
                 such as the resolution of a sensor or a controller if demonstrations differ by less.
             prior_std: Standard deviations (O,) of a single demonstration, a scalar, or rows as in `interpolate_prior`;
                 required for one demonstration, refused for several.
+            model: "gmr", or "promp" with the default number of basis functions (`ProMp`).
+            gap_scale: Factor of the standard deviation in a gap of all recordings, positive: below 1 it stops
+                exploration there, above 1 it widens it. At the step n the factor is `gap_scale` to the power of
+                `unobserved_share`.
+            kernel: Kernel of `unobserved_share`; `SquaredExponential()` by default.
 
         Raises:
             InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is
                 singular.
         """
-        number = demonstrations.num_demonstrations
+        if model not in ("gmr", "promp"):
+            raise InputError(f"the model of a reference is gmr or promp, not {model!r}")
+        if not 0.0 < gap_scale < np.inf:
+            raise InputError(f"gap_scale is a factor of the standard deviation and must be positive, not {gap_scale}")
+        recordings, number = demonstrations, demonstrations.num_demonstrations
         if prior_std is None and number == 1:
             raise InputError(
                 "a single demonstration has no variance: give prior_std, the standard deviation of each output"
@@ -113,12 +126,65 @@ class ReferenceTrajectory:
         floor = np.broadcast_to(np.asarray(floor, dtype=float), outputs.shape[-1:])
         if not (np.isfinite(floor).all() and (floor >= 0).all()):
             raise InputError(f"floor is a standard deviation and must not be negative: {floor}")
-        mixture = fit_mixture(times, outputs, components, seed)
-        means, covariances = regress(mixture, times)
+        if model == "promp":
+            means, covariances = ProMp.fit(demonstrations).moments(np.linspace(0.0, 1.0, len(times)))
+        else:
+            means, covariances = regress(fit_mixture(times, outputs, components, seed), times)
         covariances = covariances + np.diag(floor**2)
         if prior_std is not None:
             covariances += np.eye(len(floor)) * (interpolate_prior(prior_std, len(times), len(floor)) ** 2)[:, None]
-        return cls(times, means, covariances)
+        reference = cls(times, means, covariances)
+        if gap_scale == 1.0:
+            return reference
+        scale = gap_scale ** unobserved_share(reference, recordings, kernel)
+        return cls(times, means, scale[:, :, None] * reference.covariances * scale[:, None, :])
+
+    @classmethod
+    def from_promp(cls, promp: ProMp, times: np.ndarray, floor: float | np.ndarray = 0.0) -> ReferenceTrajectory:
+        """Return the means and covariances of a probabilistic movement primitive.
+
+        Args:
+            promp: Primitive, with or without via-points (`ProMp.conditioned`).
+            times: Times (N,) of the phases from 0 to 1, strictly increasing [s].
+            floor: Standard deviation, (O,) or scalar, as in `from_demonstrations`.
+
+        Raises:
+            InputError: If the times are wrong, or a covariance is singular: give a floor.
+        """
+        times = as_numbers(times, "times")
+        if times.ndim != 1 or len(times) < 2 or not times[-1] > times[0]:
+            raise InputError(f"a reference trajectory needs at least two increasing times (N,), not {times.shape}")
+        means, covariances = promp.moments((times - times[0]) / (times[-1] - times[0]))
+        return cls(times, means, covariances + np.eye(promp.num_outputs) * np.square(floor))
+
+    def blended(self, other: ReferenceTrajectory, share: float | np.ndarray) -> ReferenceTrajectory:
+        """Blend two references by the normalized product of their Gaussians to the powers 1 − a and a.
+
+            Σ⁻¹ = (1 − a) Σ₁⁻¹ + a Σ₂⁻¹,    Σ⁻¹ μ = (1 − a) Σ₁⁻¹ μ₁ + a Σ₂⁻¹ μ₂
+
+        The more certain one dominates (Paraschos et al., 2013).
+
+        Args:
+            other: Reference with the same times and outputs.
+            share: a in [0, 1], one number or (N,): 0 gives this reference, 1 the other.
+
+        Raises:
+            InputError: If times or numbers of outputs differ, or the share is out of range.
+        """
+        if self.means.shape != other.means.shape or not np.allclose(self.times, other.times, rtol=0.0, atol=1e-9):
+            raise InputError("only references with the same times and outputs can be blended: resample one of them")
+        a = np.asarray(share, dtype=float)
+        if a.shape not in ((), (self.num_steps,)) or not ((a >= 0.0) & (a <= 1.0)).all():
+            raise InputError(f"the share of a blend is one number in [0, 1], or one for each of {self.num_steps} steps")
+        a = np.broadcast_to(a, self.num_steps)[:, None, None]
+        # With M = (1 − a) Σ₂ + a Σ₁ the covariance is Σ₁ M⁻¹ Σ₂ = Σ₂ M⁻¹ Σ₁, and a share of 0 or 1 is exact.
+        both = (1.0 - a) * other.covariances + a * self.covariances
+        first = np.linalg.solve(both, self.covariances).transpose(0, 2, 1)
+        second = np.linalg.solve(both, other.covariances).transpose(0, 2, 1)
+        means = (1.0 - a[..., 0]) * np.einsum("nop,np->no", second, self.means)
+        means += a[..., 0] * np.einsum("nop,np->no", first, other.means)
+        covariances = first @ other.covariances
+        return ReferenceTrajectory(self.times, means, (covariances + covariances.transpose(0, 2, 1)) / 2)
 
     @property
     def num_steps(self) -> int:
@@ -219,6 +285,32 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
         raise InputError(f"the phases of prior_std must increase from 0 to 1, not {phases.tolist()}")
     at = np.linspace(0.0, 1.0, num_steps)
     return np.column_stack([np.interp(at, phases, column) for column in deviations.T])
+
+
+def unobserved_share(
+    reference: ReferenceTrajectory, recordings: Demonstrations, kernel: Kernel | None = None
+) -> np.ndarray:
+    """Compute the epistemic variance (N, O) of a reference, as a share of that far from all demonstrations.
+
+    It is the diagonal of equation 2.18 with λ_c = 1, without its factor N/λ_c, over k(ζ, ζ). Reference points are the
+    steps at which at least one recording has a sample. The share is close to 0 there and approaches 1 in a gap that is
+    long compared with the kernel's length scale.
+
+    Args:
+        reference: Reference of the demonstrations.
+        recordings: Demonstrations as they were recorded, before `Demonstrations.resampled` fills their gaps.
+        kernel: Kernel over the reference's times; `SquaredExponential()` by default.
+    """
+    from guiderail.models.primitives.kernels import SquaredExponential
+    from guiderail.models.primitives.kmp import Kmp
+
+    kernel, times = SquaredExponential() if kernel is None else kernel, reference.times
+    phases = np.concatenate([(t - t[0]) / (t[-1] - t[0]) for t in recordings.times])
+    seen = np.unique(np.rint(phases * (reference.num_steps - 1)).astype(int))
+    kmp = Kmp(times[seen], reference.means[seen], reference.covariances[seen], kernel)
+    prior = np.array([kernel(t[None], t[None])[0, 0] for t in times])
+    variances = np.einsum("noo->no", kmp.covariance(times)) / len(seen)
+    return np.clip(variances / prior[:, None], 0.0, 1.0)
 
 
 def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel: Kernel) -> ReferenceTrajectory:

@@ -54,19 +54,23 @@ DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_sear
 LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
 
 
-def reference_trajectory(
-    demonstrations: str, count: int | None = None, prior_std: tuple[float, ...] | None = None
-) -> ReferenceTrajectory:
-    """Return the Gaussian mixture regression of demonstrations, shipped or in a file, fitted once per process."""
-    return _fit_reference(demonstrations, count, prior_std)
+def reference_trajectory(demonstrations: str, count: int | None = None, **fit: Any) -> ReferenceTrajectory:
+    """Return the reference of demonstrations, shipped or in a file, fitted once per process.
+
+    Args:
+        demonstrations: Name of shipped demonstrations, or path of a file.
+        count: Number of demonstrations that are used; None: all.
+        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`.
+    """
+    return _fit_reference(demonstrations, count, tuple(sorted(fit.items())))
 
 
 @cache  # its arguments are positional, so that omitted and default arguments share a fit
-def _fit_reference(demonstrations: str, count: int | None, prior_std: tuple[float, ...] | None) -> ReferenceTrajectory:
+def _fit_reference(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
     if demonstrations not in DEMONSTRATIONS:
-        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), prior_std, count)
+        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **dict(fit))
     loaded = DEMONSTRATIONS[demonstrations]().first(count)
-    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, prior_std=prior_std)
+    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, **dict(fit))
 
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
@@ -157,7 +161,9 @@ class BncConnector(DemonstratedInsertion):
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the chosen demonstrations."""
         o = self.options
-        return self.on_clock(reference_trajectory(o.demonstrations, o.num_demonstrations, o.prior_std), o.time_scale)
+        return self.on_clock(
+            reference_trajectory(o.demonstrations, o.num_demonstrations, **o.fit_arguments()), o.time_scale
+        )
 
     def constraints(self) -> LinearConstraints:
         """Return |x|, |y| ≤ `bound`: 2 mm in equation 4.26."""

@@ -7,7 +7,8 @@ from typing import Any
 
 from pydantic import Field
 
-from guiderail.diagrams.envs.options import Number, Options
+from guiderail.diagrams.envs.options import Number
+from guiderail.diagrams.tasks.options import ReferenceOptions
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 DEFAULT_GEOMETRY = PassageGeometry()
@@ -23,7 +24,7 @@ HARD: Mapping[str, Any] = {
 """Options of difficulty="hard": half the gap, and two obstacles on sampled sides that end the episode when touched."""
 
 
-class NarrowPassageOptions(Options):
+class NarrowPassageOptions(ReferenceOptions):
     """Options of NarrowPassage."""
 
     gap_width: Number = Field(

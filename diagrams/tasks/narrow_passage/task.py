@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -142,10 +142,12 @@ MAX_DEVIATIONS = 4.0  # limit of a sampled start along x and y [standard deviati
 MAX_START = 2.0  # [m] largest coordinate of a given start
 
 
-@lru_cache(maxsize=1)
-def reference_trajectory() -> ReferenceTrajectory:
-    """Return the Gaussian mixture regression of the nine demonstrations, fitted once per process."""
-    return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
+@cache
+def reference_trajectory(model: Literal["gmr", "promp"] = "gmr") -> ReferenceTrajectory:
+    """Return the reference of the nine demonstrations, fitted once per process and model."""
+    return ReferenceTrajectory.from_demonstrations(
+        demonstrations.load(), components=COMPONENTS, floor=FLOOR, model=model
+    )
 
 
 @register_task("NarrowPassage")
@@ -196,7 +198,7 @@ class NarrowPassage(Task):
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the nine demonstrations."""
-        return self.on_clock(reference_trajectory())
+        return self.on_clock(reference_trajectory(**self.options.fit_arguments()))
 
     def constraints(self) -> LinearConstraints:
         """Return the constraint that keeps commands out of the restricted zone."""

@@ -179,6 +179,24 @@ def test_single_demonstration_needs_its_prior_std(tmp_path):
     assert (shipped.standard_deviations[:, :2] >= 1.73 * MM).all()
 
 
+def test_gap_of_a_recording_scales_its_reference(tmp_path):
+    """Both models interpolate the gap; `gap_scale` narrows the covariance there alone."""
+    loaded = Demonstrations.load(inserting.PATH)
+    kept = [(t - t[0] < 2.0) | (t - t[0] > 5.0) for t in loaded.times]
+    cut = [np.array([one[k] for one, k in zip(many, kept, strict=True)]) for many in (loaded.times, loaded.outputs)]
+    Demonstrations(*cut).save(tmp_path / "gap.npz")
+    options = {"demonstrations": str(tmp_path / "gap.npz"), "reference_model": "promp"}
+    plain, scaled = (
+        make_prior_knowledge("BncConnector", **options | further).demonstrations.reference
+        for further in ({}, {"gap_scale": 0.1})
+    )
+    ratio = (scaled.standard_deviations / plain.standard_deviations)[:, :3]
+    np.testing.assert_allclose(ratio[[10, 350]], 1.0, atol=0.05)
+    np.testing.assert_allclose(ratio[175], 0.1, atol=0.02)
+    gmr = make_prior_knowledge("BncConnector", **options | {"reference_model": "gmr"}).demonstrations.reference
+    assert np.abs(gmr.means - plain.means).max() > 1e-4
+
+
 def test_action_reaches_the_offset_that_the_prior_declares():
     """An action of 1 displaces the command by √3 standard deviations: 3 mm for a prior of 1.73 mm."""
     env = make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=PRIOR, bound=6.0 * MM)
