@@ -104,10 +104,10 @@ def action_cells(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
             f"the corners of {len(moved)} actions are too many to enumerate: explore {MAX_ACTIONS} at most"
         )
     along = CELLS.get(len(moved), 1)
-    places = list(itertools.product(range(along + 1), repeat=len(moved)))
-    index = {place: i for i, place in enumerate(places)}
-    raw = np.zeros((len(places), len(gains)))
-    raw[:, moved] = (2.0 * np.array(places).reshape(len(places), len(moved)) / along - 1.0) * gains[moved]
+    nodes = list(itertools.product(range(along + 1), repeat=len(moved)))
+    index = {node: i for i, node in enumerate(nodes)}
+    raw = np.zeros((len(nodes), len(gains)))
+    raw[:, moved] = (2.0 * np.array(nodes).reshape(len(nodes), len(moved)) / along - 1.0) * gains[moved]
     cells = [
         [index[tuple(np.add(first, step))] for step in itertools.product((0, 1), repeat=len(moved))]
         for first in itertools.product(range(along), repeat=len(moved))

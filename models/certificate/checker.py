@@ -145,8 +145,8 @@ def forward(L: np.ndarray, B: np.ndarray) -> np.ndarray:
 def extended(matrix: np.ndarray) -> np.ndarray:
     """Convert a matrix of decimal numbers to extended precision."""
     result = np.zeros(matrix.shape, dtype=Real)
-    for place, value in np.ndenumerate(matrix):
-        result[place] = Real(str(value))
+    for index, value in np.ndenumerate(matrix):
+        result[index] = Real(str(value))
     return result
 
 
@@ -243,7 +243,7 @@ class Primitive:
         middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
         corrected, maps = np.full((2, N, outs), np.nan), np.zeros((N, outs, P * outs), dtype=Real)
         echo = np.zeros((P + N, outs, N * outs))
-        wrong, made = np.zeros((P + N, outs)), np.zeros(N * outs)  # errors of commands, and errors added at each step
+        errors, added = np.zeros((P + N, outs)), np.zeros(N * outs)  # errors of commands, and errors added at each step
         require(claimed.sum() == len(witness["multipliers"]) or P > 0, "there are not multipliers for each active step")
         for n in range(N):
             history, action, offset, L, rows, c, error, action_error = self.window(n)
@@ -251,26 +251,26 @@ class Primitive:
             by, size = (action[:, moved] * p["gains"][moved]).astype(float), np.abs(reached).astype(float).sum(axis=1)
             maps[n], y, first = history[:outs], history @ past + offset, history[:outs] @ reached
             first[:, n * A : (n + 1) * A] += by[:outs]
-            far, fault = np.abs(history).astype(float), error(past, reached)
+            H, bound = np.abs(history).astype(float), error(past, reached)
             pushed = np.abs(p["gains"][moved]) @ np.linalg.norm(L[moved], axis=1)
-            fault += action_error * pushed + EPS * np.abs(by).sum(axis=1)
+            bound += action_error * pushed + EPS * np.abs(by).sum(axis=1)
             # An error at one step reaches a later one by the impulse responses of the loop.
             earlier = echo[n : P + n, :, : n * outs].reshape(P * outs, n * outs)
             echo[P + n, :, : n * outs] = history[:outs].astype(float) @ earlier
             echo[P + n, np.arange(outs), np.arange(n * outs, (n + 1) * outs)] = 1
-            made[n * outs : (n + 1) * outs] = 2 * fault[:outs]
-            middle[P + n], spread[P + n], wrong[P + n] = y[:outs], first, np.abs(echo[P + n]) @ made
+            added[n * outs : (n + 1) * outs] = 2 * bound[:outs]
+            middle[P + n], spread[P + n], errors[P + n] = y[:outs], first, np.abs(echo[P + n]) @ added
             # The rest of the window is computed in double precision.
             history, y = history.astype(float), y.astype(float)
             g = history @ reached.astype(float)
             g[:, n * A : (n + 1) * A] += by
             terms = np.abs(y) + np.abs(g).sum(axis=1)
-            fault += far @ wrong[n : P + n].ravel() + (P * outs + 4) * EPS * (far @ size) + (N * A + outs) * EPS * terms
-            away, reach = rows @ y - c, np.abs(rows @ g).sum(axis=1)
-            slack, about = away - reach, np.abs(away) + reach
-            room = np.abs(rows) @ fault + 4 * (N * A + outs) * EPS * (np.abs(rows) @ terms + np.abs(c))
+            bound += H @ errors[n : P + n].ravel() + (P * outs + 4) * EPS * (H @ size) + (N * A + outs) * EPS * terms
+            center, reach = rows @ y - c, np.abs(rows @ g).sum(axis=1)
+            slack, scale = center - reach, np.abs(center) + reach
+            room = np.abs(rows) @ bound + 4 * (N * A + outs) * EPS * (np.abs(rows) @ terms + np.abs(c))
             require(claimed[n] or (slack >= room).all(), f"step {n}: a constraint can be active there")
-            require(not claimed[n] or (slack <= room + BORDER * about).any(), f"step {n}: no constraint can be active")
+            require(not claimed[n] or (slack <= room + BORDER * scale).any(), f"step {n}: no constraint can be active")
             if claimed[n] and P == 0:
                 alphas = witness["multipliers"][claimed[:n].sum()]
                 corrected[:, n] = cells(n, y, by, L[:outs], (rows @ L, rows, c, room), alphas)
@@ -281,21 +281,21 @@ class Primitive:
             reached = np.linalg.matrix_power(tied + np.eye(outs), outs) @ reached > 0
             unknown = np.logical_or.accumulate(claimed)[:, None] & reached
             corrected[0, unknown], corrected[1, unknown] = -np.inf, np.inf
-        return middle, spread, wrong, corrected, maps
+        return middle, spread, errors, corrected, maps
 
     def bounds(self, p: Arrays, reached: tuple[np.ndarray, ...], period: float) -> dict[str, Arrays]:
         """Compute the quantities (N, outs) of the regimes "free" and "always"."""
-        (middle, spread, wrong, corrected, _), P, N, outs = reached, self.past, self.steps, self.outputs
-        wrong = wrong + 4 * spread.shape[2] * EXTENDED * (np.abs(middle) + np.abs(spread).sum(axis=2))
-        size, is_corrected, (least, greatest) = np.abs(spread).sum(axis=2) + wrong, ~np.isnan(corrected[0]), self.caps()
+        (middle, spread, error, corrected, _), P, N, outs = reached, self.past, self.steps, self.outputs
+        error = error + 4 * spread.shape[2] * EXTENDED * (np.abs(middle) + np.abs(spread).sum(axis=2))
+        size, is_corrected, (least, greatest) = np.abs(spread).sum(axis=2) + error, ~np.isnan(corrected[0]), self.caps()
         free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
         for order, name in ((1, "speed"), (2, "acceleration")):
             change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(spread, order, axis=0)).sum(axis=2)
             for k, times in enumerate(((1, 1), (1, 2, 1))[order - 1]):
-                change += times * wrong[k : len(wrong) - order + k]
+                change += times * error[k : len(error) - order + k]
             free[name] = np.concatenate([np.zeros((order, outs)), change])[-N:] / period**order
-        low = np.where(is_corrected, np.maximum(corrected[0] - wrong[P:], least), free["lower"])
-        high = np.where(is_corrected, np.minimum(corrected[1] + wrong[P:], greatest), free["upper"])
+        low = np.where(is_corrected, np.maximum(corrected[0] - error[P:], least), free["lower"])
+        high = np.where(is_corrected, np.minimum(corrected[1] + error[P:], greatest), free["upper"])
         always = {"lower": low, "upper": high}
         low, high = (np.vstack([p["start"] + side * p["start_within"]] * 2 + [y]) for side, y in ((-1, low), (1, high)))
         is_corrected = np.vstack([np.zeros((2, outs), bool), is_corrected])
@@ -309,9 +309,9 @@ class Primitive:
 
     def budgeted(self, p: Arrays, w: Arrays, budgets: list[np.ndarray], reached: Any, period: float) -> Arrays:
         """Compute the quantities of the regime "budgeted"; any multipliers of constraints prove valid bounds."""
-        (middle, spread, wrong, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
+        (middle, spread, errors, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
         first, U = int(np.argmax(w["active"])), np.flatnonzero(p["gains"] == 0)
-        A, late, more = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)), dtype=Real)
+        A, steps_left, residues = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)), dtype=Real)
         (at, of, alphas), (low, high) = (w[f"lagrange_{k}"] for k in ("steps", "outputs", "multipliers")), self.caps()
         valid = [at >= 0, at < N, of >= 0, of < outs, P > 0, w["active"].any(), (budgets[0][1] >= budgets[0][0]).all()]
         valid += [budgets[0][0] >= 0.01, budgets[1][0] >= 0, budgets[1][1] >= budgets[1][0]]
@@ -319,9 +319,9 @@ class Primitive:
         require(all(np.all(each) for each in valid), "invalid budgets or multipliers")
         budgets = [budgets[0], budgets[1][:, U]]
         for n in range(first, N):
-            more[P + n] = maps[n] @ more[n : P + n].reshape(P * outs, more.shape[2])
-            more[P + n, U, (n - first) * len(U) + np.arange(len(U))] = 1
-        spread, most = np.concatenate([spread, more], axis=2), np.zeros((3, 2, N, outs))
+            residues[P + n] = maps[n] @ residues[n : P + n].reshape(P * outs, residues.shape[2])
+            residues[P + n, U, (n - first) * len(U) + np.arange(len(U))] = 1
+        spread, most = np.concatenate([spread, residues], axis=2), np.zeros((3, 2, N, outs))
         changes = [np.diff(spread, order, axis=0).astype(float) for order in range(3)]
         moved, sizes = [np.diff(middle, order, axis=0) for order in range(3)], np.abs(changes[0]).sum(axis=2)
         for order, side, n in itertools.product(range(3), range(2), range(first, N)):
@@ -331,26 +331,26 @@ class Primitive:
             margin = np.where(alpha > 0, high[k, o], low[k, o]) - middle[P + k, o]
             value = sign * moved[order][row] + np.abs(g[:, : N * A + outs]).sum(axis=1)
             value += (alpha * np.where(alpha == 0, 0, margin)).sum(axis=1)
-            faults = wrong[row : P + n + 1].sum(axis=0) * (1, 1, 2)[order]
-            value += faults + (np.abs(alpha) * wrong[P + k, o]).sum(axis=1)
+            row_errors = errors[row : P + n + 1].sum(axis=0) * (1, 1, 2)[order]
+            value += row_errors + (np.abs(alpha) * errors[P + k, o]).sum(axis=1)
             terms = np.abs(changes[order][row]).sum(axis=1) + (np.abs(alpha) * sizes[P + k, o]).sum(axis=1)
             value += 8 * g.shape[1] * EPS * terms
             for part, budget in zip((g[:, first * A : N * A], g[:, N * A + outs :]), budgets, strict=True):
-                spent = np.clip(budget[1] - np.arange(late)[:, None] * budget[0], 0, budget[0])
-                value += (np.sort(np.abs(part).reshape(outs, late, -1), axis=1)[:, ::-1] * spent).sum(axis=(1, 2))
+                spent = np.clip(budget[1] - np.arange(steps_left)[:, None] * budget[0], 0, budget[0])
+                value += (np.sort(np.abs(part).reshape(outs, steps_left, -1), axis=1)[:, ::-1] * spent).sum(axis=(1, 2))
             most[order, side, n] = value
         moves = [most[order].max(axis=0) / period**order for order in (1, 2)]
         return dict(zip(QUANTITIES, (np.maximum(-most[0, 1], low), np.minimum(most[0, 0], high), *moves), strict=True))
 
 
-def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
+def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, limits: Any, alphas: np.ndarray) -> tuple[Any, Any]:
     """Bound the commands of step n by cells: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², with v̄ interpolated from a cell's corners."""
-    (rows_L, rows, c, room), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
+    (rows_L, rows, c, room), outs, A, alphas = limits, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / max(A, 1))) - 1
-    fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
-    require(fine, f"step {n}: these are not the multipliers of every corner of the actions")
-    places = np.array(list(itertools.product(range(along + 1), repeat=A)))
-    free = y + (2.0 * places / along - 1.0) @ by.T
+    is_complete = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
+    require(is_complete, f"step {n}: these are not the multipliers of every corner of the actions")
+    nodes = np.array(list(itertools.product(range(along + 1), repeat=A)))
+    free = y + (2.0 * nodes / along - 1.0) @ by.T
     v, short = alphas @ rows_L, c - free @ rows.T
     # The corrections at corners are feasible in spite of rounding; then their interpolation is feasible in the cell.
     sizes = np.abs(alphas) @ (np.abs(rows_L) @ np.abs(rows_L).T)
@@ -361,7 +361,7 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
     least = least - alphas @ room[:, None] - 8 * len(c) * EPS * alphas @ np.abs(short).T
     weights = (along + 1) ** np.arange(A)[::-1]
     near = np.array(list(itertools.product((0, 1), repeat=A))) @ weights
-    i = (places[(places < along).all(axis=1)] @ weights)[:, None] + near  # corners of every cell
+    i = (nodes[(nodes < along).all(axis=1)] @ weights)[:, None] + near  # corners of every cell
     squared, apart = (v[i] ** 2).sum(axis=2), ((v[i][:, :, None] - v[i][:, None]) ** 2).sum(axis=3)
     dual = least[i[:, :, None], i[:, None]]
     d = dual * (dual >= 0).all(axis=2, keepdims=True) / np.maximum(np.sqrt(squared), 1e-300)[..., None]

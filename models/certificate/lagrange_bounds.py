@@ -170,10 +170,10 @@ class MultiplierSearch:
         margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]
         margin = np.where(multipliers == 0.0, 0.0, margins)
         value = np.abs(rest[:, : self._free]).sum(axis=1) + (np.abs(multipliers) * margin).sum(axis=1)
-        late = self._steps - self._first
-        excess = rest[:, self._actions - late * self._budgets[0].shape[1] : self._actions]
+        steps_left = self._steps - self._first
+        excess = rest[:, self._actions - steps_left * self._budgets[0].shape[1] : self._actions]
         for response, (per_step, total) in zip((excess, rest[:, self._free :]), self._budgets, strict=True):
-            spent = np.clip(total - np.arange(late)[:, None] * per_step, 0.0, per_step)
-            sizes = np.sort(np.abs(response).reshape(len(rest), late, len(total)), axis=1)[:, ::-1]
+            spent = np.clip(total - np.arange(steps_left)[:, None] * per_step, 0.0, per_step)
+            sizes = np.sort(np.abs(response).reshape(len(rest), steps_left, len(total)), axis=1)[:, ::-1]
             value += (sizes * spent).sum(axis=(1, 2))
         return value

@@ -35,15 +35,15 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
             double cannot represent them.
     """
     try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "fiubO":
-            raise InputError(f"{what} is not an array of numbers: it holds {given.dtype}")
-        array = np.array(given, dtype=float)
+        raw = np.asarray(values)
+        if raw.dtype.kind not in "fiubO":
+            raise InputError(f"{what} is not an array of numbers: it holds {raw.dtype}")
+        array = np.array(raw, dtype=float)
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is not an array of numbers: {error}") from error
-    if given.dtype.kind in "iu" and given.dtype.itemsize == 8 and (np.abs(array) >= _EXACT).any():
+    if raw.dtype.kind in "iu" and raw.dtype.itemsize == 8 and (np.abs(array) >= _EXACT).any():
         raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
     return array
 

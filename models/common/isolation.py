@@ -54,8 +54,8 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
 def _child(
     sender: Any, function: Callable[..., Any], arguments: tuple[Any, ...], cpu_seconds: int, max_bytes: int | None
 ) -> None:
-    used = int(sum(os.times()[:2])) + 1
-    resource.setrlimit(resource.RLIMIT_CPU, (used + cpu_seconds, used + cpu_seconds + 1))
+    used_seconds = int(sum(os.times()[:2])) + 1
+    resource.setrlimit(resource.RLIMIT_CPU, (used_seconds + cpu_seconds, used_seconds + cpu_seconds + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if max_bytes is not None:
         pages = int(Path("/proc/self/statm").read_text().split()[0])  # address space inherited from the parent

@@ -185,10 +185,10 @@ def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, An
                 continue
             name = node.args[0]
             if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                shown = dict(_assignments(statement.body)) if isinstance(statement, ast.ClassDef) else {}
-                shown |= {str(argument.arg): argument.value for argument in node.keywords}
+                assigned = dict(_assignments(statement.body)) if isinstance(statement, ast.ClassDef) else {}
+                assigned |= {str(argument.arg): argument.value for argument in node.keywords}
                 values: dict[str, Any] = {}
-                for attribute, value in shown.items():
+                for attribute, value in assigned.items():
                     if isinstance(value, ast.Name) and value.id in imported:
                         values[attribute] = imported[value.id]
                     with suppress(ValueError):

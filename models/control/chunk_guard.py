@@ -195,8 +195,8 @@ class ChunkGuard:
             rows.append(block.reshape(-1, steps * size))
             low.append(-bounds - offset)
             high.append(bounds - offset)
-        used = (self.constraints.G[:, group] != 0).any(axis=1)
-        G, c = self.constraints.G[used][:, group], self.constraints.c[used]
+        is_involved = (self.constraints.G[:, group] != 0).any(axis=1)
+        G, c = self.constraints.G[is_involved][:, group], self.constraints.c[is_involved]
         scaled = G * self._step[group]  # for variables in units of v T
         slack = (c - chunk[:, group] @ G.T).ravel()
         rows.append(np.kron(np.eye(steps), scaled))
@@ -206,11 +206,11 @@ class ChunkGuard:
         if (lower <= 0.0).all() and (upper >= 0.0).all():
             return np.zeros((steps, size))
         length = np.linalg.norm(A, axis=1)
-        kept = length > 0
-        if (lower[~kept] > 0.0).any() or (upper[~kept] < 0.0).any():
+        used = length > 0
+        if (lower[~used] > 0.0).any() or (upper[~used] < 0.0).any():
             raise UnsolvableError("the executed outputs violate a limit")
         v, _ = solve_least_norm(
-            A[kept] / length[kept, None], lower[kept] / length[kept], upper[kept] / length[kept], self._solve
+            A[used] / length[used, None], lower[used] / length[used], upper[used] / length[used], self._solve
         )
         return self._step[group] * v.reshape(steps, size)
 

@@ -129,13 +129,13 @@ class KeepOut:
             margin = min(clearance, self.margin)
             enter, leave = -math.inf, math.inf
             for a, b, x, y in zip(lower, upper, start, end, strict=True):
-                a, b, way = a - margin, b + margin, y - x
-                if way == 0:
+                a, b, displacement = a - margin, b + margin, y - x
+                if displacement == 0:
                     # The line is parallel to two faces: always between them, or never.
                     if not a < x < b:
                         leave = -math.inf
                     continue
-                first, second = (a - x) / way, (b - x) / way
+                first, second = (a - x) / displacement, (b - x) / displacement
                 enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
             # The start is outside the box: a negative `enter` is a rounding error, or the box is behind the start.
             if -1e-9 <= enter < min(leave, free):

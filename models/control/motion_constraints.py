@@ -80,10 +80,10 @@ class MotionConstraints:
         if any(shape.num_dims > self.num_outputs for shape in (*self.outside, *self.inside)):
             raise InputError(f"a shape has more dimensions than a command has outputs, {self.num_outputs}")
         for name in ("max_speed", "max_acceleration"):
-            given = getattr(self, name)
-            limit = np.full(self.num_outputs, np.inf) if given is None else as_numbers(given, name)
+            value = getattr(self, name)
+            limit = np.full(self.num_outputs, np.inf) if value is None else as_numbers(value, name)
             if limit.shape != (self.num_outputs,) or not (limit > 0.0).all():
-                raise InputError(f"{name} is {self.num_outputs} positive numbers, not {brief(given)}")
+                raise InputError(f"{name} is {self.num_outputs} positive numbers, not {brief(value)}")
             object.__setattr__(self, name, limit)
 
     @property
@@ -160,14 +160,14 @@ class MotionConstraintFilter:
         last, velocity = state[: self.num_outputs], state[self.num_outputs :]
         share, rest_share = self._braking(velocity)
         brake, rest = last + share * velocity, last + rest_share * velocity
-        held = np.concatenate([brake, brake - last]), True
+        braking = np.concatenate([brake, brake - last]), True
         if not is_finite(desired):
-            return held
+            return braking
         G, c = self._linearize(last, rest)
         slack = np.minimum(G @ last, G @ rest) - c
         is_shape = np.arange(len(c)) < len(self.constraints.outside) + len(self.constraints.inside)
         aim, keep = (np.where(is_shape, *pair) for pair in zip(_SHAPE, _PLANE, strict=True))
-        kept = c + np.minimum(keep, slack)
+        required = c + np.minimum(keep, slack)
         lower = np.minimum(np.maximum(last - self._max_step, last + velocity - self._max_change), brake)
         upper = np.maximum(np.minimum(last + self._max_step, last + velocity + self._max_change), brake)
         goals = [c + aim]
@@ -175,11 +175,11 @@ class MotionConstraintFilter:
             # A violated constraint is approached almost as fast as possible, or at least not violated more.
             best = np.where(G > 0.0, G, 0.0) @ _finite(upper) + np.where(G < 0.0, G, 0.0) @ _finite(lower)
             towards = 0.9 * np.minimum(best, c + aim) + 0.1 * (c + slack)
-            goals = [np.where(is_outside, towards, c + aim), kept]
+            goals = [np.where(is_outside, towards, c + aim), required]
         attempts = (self._nearest(desired, G, goal, lower, upper) for goal in goals)
         nearest = next((command for command in attempts if command is not None), None)
         if nearest is None:
-            return held
+            return braking
         inside = [(shape, max(-_SHAPE[1], shape.distance(rest[: shape.num_dims]))) for shape in self.constraints.inside]
         further = [(one, max(0.0, one.violation(rest))) for one in self.constraints.state]
 
@@ -190,7 +190,7 @@ class MotionConstraintFilter:
             end = command + rest_share * displacement
             each_state = (command, end) if rest_share else (command,)
             return (
-                bool((G @ end >= kept).all())
+                bool((G @ end >= required).all())
                 and all(shape.distance(end[: shape.num_dims]) <= bound for shape, bound in inside)
                 and all(one.violation(each) <= bound for one, bound in further for each in each_state)
             )
@@ -221,15 +221,15 @@ class MotionConstraintFilter:
 
     def _linearize(self, last: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return constraints G y ≥ c, G (F, O) and c (F,), for the way from the last command to where braking ends."""
-        given = self.constraints
-        shapes = (*given.outside, *given.inside)
+        constraints = self.constraints
+        shapes = (*constraints.outside, *constraints.inside)
         rows, bounds = np.zeros((len(shapes), self.num_outputs)), np.zeros(len(shapes))
         for k, shape in enumerate(shapes):
-            sign, D = 1.0 if k < len(given.outside) else -1.0, shape.num_dims
+            sign, D = 1.0 if k < len(constraints.outside) else -1.0, shape.num_dims
             half_space = shape.separate(last[:D], rest[:D]) if sign > 0.0 else shape.half_space(last[:D])
             rows[k, :D], bounds[k] = sign * half_space[0], sign * half_space[1]
-        further = [one.linearize(last) for one in given.state]
-        G, c = zip((rows, bounds), (given.linear.G, given.linear.c), *further, strict=True)
+        further = [one.linearize(last) for one in constraints.state]
+        G, c = zip((rows, bounds), (constraints.linear.G, constraints.linear.c), *further, strict=True)
         return np.concatenate(G), np.concatenate(c)
 
     def _nearest(

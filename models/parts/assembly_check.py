@@ -173,15 +173,15 @@ def check_target(plug: Part, socket: Part) -> None:
         return
     depth = measure_depth(plug_solids, socket_solids)
     needed = 1e-5 * np.ceil((depth + _SPARE) / 1e-5 - 1e-3)
-    place = (
+    overlap = (
         f"overlap at the target by about {1e3 * depth:.2g} mm, around {np.round(1e3 * where, 1)} mm in the target frame"
     )
     if needed > MAX_SHRINK:
         raise OverlapError(
-            f"the parts {place}: draw them assembled in one frame, or place the plug with --plug-pose", None
+            f"the parts {overlap}: draw them assembled in one frame, or place the plug with --plug-pose", None
         )
     raise OverlapError(
-        f"the parts {place}: --shrink {1e3 * needed:.2f} makes the plug smaller by that much; else correct the "
+        f"the parts {overlap}: --shrink {1e3 * needed:.2f} makes the plug smaller by that much; else correct the "
         "drawing, or place the plug with --plug-pose",
         float(needed),
     )

@@ -50,14 +50,14 @@ def accepted_pieces(pieces: Sequence[Piece]) -> list[Piece] | None:
     Returns:
         The pieces; None if one can be neither rounded nor left out.
     """
-    bad = _refused(pieces)
-    if not bad:
+    refused = _refused(pieces)
+    if not refused:
         return list(pieces)
-    if any(pieces[number].suffix != ".obj" for number in bad):
+    if any(pieces[number].suffix != ".obj" for number in refused):
         return None
     total, accepted = sum(map(_hull_volume, pieces)), []
     for number, piece in enumerate(pieces):
-        if number not in bad:
+        if number not in refused:
             accepted.append(piece)
             continue
         for rounded in _rounded(piece):

@@ -72,18 +72,18 @@ class Part:
         return Part(self.path, tuple((v @ rotation.T + translation, t) for v, t in self.bodies), self.repair)
 
 
-def find_unit(path: Path, given: str | None) -> str | None:
-    """Return the unit of a file, from its format or as given; None if neither determines it.
+def find_unit(path: Path, unit: str | None) -> str | None:
+    """Return the unit of a file, which its format or `unit` determines; None if neither does.
 
     Raises:
-        InputError: If the given unit is unknown, or contradicts the format.
+        InputError: If `unit` is unknown, or contradicts the format.
     """
-    if given is not None and given not in UNITS:
-        raise InputError(f"there is no unit {given!r}: choose one of {', '.join(UNITS)}")
+    if unit is not None and unit not in UNITS:
+        raise InputError(f"there is no unit {unit!r}: choose one of {', '.join(UNITS)}")
     known = _KNOWN.get(path.suffix.lower())
-    if known and given not in (None, known):
-        raise InputError(f"{path.name} is read in meters, as its format defines: remove --unit {given}")
-    return known or given
+    if known and unit not in (None, known):
+        raise InputError(f"{path.name} is read in meters, as its format defines: remove --unit {unit}")
+    return known or unit
 
 
 def load_part(path: Path, unit: str) -> Part:

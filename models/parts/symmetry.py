@@ -38,12 +38,12 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
         motion: Motion of the plug, which is turned by -`turn` on the rim.
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
-    fixed, held = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]
+    socket_solids, plug_solids = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]
     radius = _AROUND * 1e3 * float(np.hypot(*plug.corners[:, :2].T).max())
     heights = np.linspace(low, rim, _SECTIONS + 2)[1:-1]
-    entering = [_outline(held, height) for height in heights]
-    holes = [_hole(fixed, height, radius) for height in heights]
-    tip, mouth = _outline(held, low + BELOW), _hole(fixed, rim - BELOW, radius)
+    entering = [_outline(plug_solids, height) for height in heights]
+    holes = [_hole(socket_solids, height, radius) for height in heights]
+    tip, mouth = _outline(plug_solids, low + BELOW), _hole(socket_solids, rim - BELOW, radius)
     same, near = [], []
     for name, move in SYMMETRIES.items():
         if motion.turn == 0.0 and min(_similarity(one, move) for one in (*entering, *holes)) >= SAME:

@@ -74,7 +74,7 @@ def compute_bounds(
         end = start + 1.0 / phases
         inside = np.concatenate([y[(at >= start - border) & (at <= end + border)] for at, y in curves])
         low, high = inside.min(axis=0), inside.max(axis=0)
-        room = np.maximum(margin * (high - low), min_margin)
-        lower[k, indices], upper[k, indices] = (low - room)[indices], (high + room)[indices]
+        margins = np.maximum(margin * (high - low), min_margin)
+        lower[k, indices], upper[k, indices] = (low - margins)[indices], (high + margins)[indices]
     rates = [np.abs(np.diff(y, axis=0) / np.diff(t)[:, None]).max(axis=0) for t, y in samples]
     return DemonstratedBounds(demonstrations.names, starts, lower, upper, np.max(rates, axis=0))

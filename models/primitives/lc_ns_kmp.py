@@ -249,7 +249,7 @@ class LcNsKmp:
         Arguments are those of `predict`, and the window's `means` (H+1, O) and positive definite `covariances`
         (H+1, O, O), the executed point first. Errors are those of `predict`.
         """
-        window = Window.checked(means, covariances, *self.constraints.window(self._held(step, self.horizon)))
+        window = Window.checked(means, covariances, *self.constraints.window(self._window_steps(step, self.horizon)))
         factor = StepFactor(window, self._features(step), self.lambda_, self.beta)
         return self._finish(factor, self._stack(null_space_action, history))
 
@@ -397,8 +397,8 @@ class LcNsKmp:
             raise InputError(f"steps are whole numbers from 0 on, one for each prediction, not {brief(steps)}")
         actions = None if null_space_actions is None else np.asarray(null_space_actions, dtype=float)
         past = np.zeros(0) if histories is None else np.asarray(histories, dtype=float)
-        given = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
-        size = len(given[0]) if given else at.size
+        batched = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
+        size = len(batched[0]) if batched else at.size
         if actions is not None and actions.shape != (size, self.num_outputs):
             raise InputError(f"null-space actions have shape ({size}, {self.num_outputs}), not {actions.shape}")
         if self.history == 0:
@@ -438,11 +438,11 @@ class LcNsKmp:
         return (self.lambda_ + self.beta) * self.history_variance
 
     def _window(self, step: int, horizon: int) -> Window:
-        held = self._held(step, horizon)
-        G, c = self.constraints.window(held)
-        return Window(self.reference.means[held], self.reference.covariances[held], G, c)
+        steps = self._window_steps(step, horizon)
+        G, c = self.constraints.window(steps)
+        return Window(self.reference.means[steps], self.reference.covariances[steps], G, c)
 
-    def _held(self, step: int, horizon: int) -> np.ndarray:
+    def _window_steps(self, step: int, horizon: int) -> np.ndarray:
         """Return the steps of a window (horizon+1,), clipped to the last one."""
         return np.minimum(np.arange(step, step + horizon + 1), self.num_steps - 1)
 

@@ -228,9 +228,9 @@ class ReferenceTrajectory:
         if number < 2:
             raise InputError(f"a motion of {self.num_steps * step * time_scale:g} s has no two steps of {period:g} s")
         clock = period * np.arange(number)
-        nodes, place = np.arange(self.num_steps), np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
+        nodes, at = np.arange(self.num_steps), np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
         columns = np.hstack([self.means, self.covariances.reshape(self.num_steps, -1)])
-        resampled = np.column_stack([np.interp(place, nodes, column) for column in columns.T])
+        resampled = np.column_stack([np.interp(at, nodes, column) for column in columns.T])
         outputs = self.num_outputs
         covariances = resampled[:, outputs:].reshape(number, outputs, outputs)
         return ReferenceTrajectory(self.times[0] + clock, resampled[:, :outputs], covariances)
@@ -244,12 +244,12 @@ class ReferenceTrajectory:
         self.covariances = (self.covariances + self.covariances.transpose(0, 2, 1)) / 2
         # Singularity is tested on correlations: outputs may have very different units.
         deviations = np.sqrt(np.maximum(np.einsum("noo->no", self.covariances), 0))
-        bad = (deviations <= 0).any(axis=1)
-        scaled = self.covariances / np.where(bad[:, None, None], 1, deviations[:, :, None] * deviations[:, None, :])
-        bad |= np.linalg.eigvalsh(scaled)[:, 0] <= _SINGULAR
-        if bad.any():
+        singular = (deviations <= 0).any(axis=1)
+        scaled = self.covariances / np.where(singular[:, None, None], 1, deviations[:, :, None] * deviations[:, None])
+        singular |= np.linalg.eigvalsh(scaled)[:, 0] <= _SINGULAR
+        if singular.any():
             raise InputError(
-                f"the covariance at step {int(np.argmax(bad))} is singular or not positive definite; add a small "
+                f"the covariance at step {int(np.argmax(singular))} is singular or not positive definite; add a small "
                 "variance to its diagonal (from_demonstrations has floor= for that)"
             )
 

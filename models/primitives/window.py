@@ -290,15 +290,15 @@ def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         −1 if there is no opposite row.
     """
     directions, opposites = [], []
-    taken: set[int] = set()
+    paired: set[int] = set()
     for f in range(G.shape[1]):
-        if f in taken:
+        if f in paired:
             continue
         opposite = next(
-            (k for k in range(f + 1, G.shape[1]) if k not in taken and np.abs(G[:, k] + G[:, f]).max() <= _OPPOSITE),
+            (k for k in range(f + 1, G.shape[1]) if k not in paired and np.abs(G[:, k] + G[:, f]).max() <= _OPPOSITE),
             -1,
         )
-        taken |= {f, opposite}
+        paired |= {f, opposite}
         directions.append(f)
         opposites.append(opposite)
     return np.array(directions, dtype=int), np.array(opposites, dtype=int)

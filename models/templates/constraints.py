@@ -214,21 +214,21 @@ class Sector(PositionConstraint):
 
     @override
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
-        least, most = math.radians(self.min_deg), math.radians(self.max_deg)
-        azimuth = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
-        if least <= azimuth <= most:
+        lower, upper = math.radians(self.min_deg), math.radians(self.max_deg)
+        azimuth = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (lower + upper))
+        if lower <= azimuth <= upper:
             return p_FE
         # Moved inside by a rounding error, so that projecting is idempotent.
-        nudge = min(1e-12, 0.25 * (most - least))
-        azimuth = least + nudge if azimuth < least else most - nudge
+        nudge = min(1e-12, 0.25 * (upper - lower))
+        azimuth = lower + nudge if azimuth < lower else upper - nudge
         radius = math.hypot(p_FE[0], p_FE[1])
         return np.array([radius * math.cos(azimuth), radius * math.sin(azimuth), p_FE[2]])
 
 
-def _nudge_inside(bound: float, direction: np.ndarray, least: float, most: float) -> np.ndarray:
-    """Return bound · direction, moved inside [least, most] by a rounding error so that projecting is idempotent."""
-    nudge = min(1e-12, 0.25 * (most - least))
-    return (bound + (nudge if bound == least else -nudge)) * direction
+def _nudge_inside(bound: float, direction: np.ndarray, lower: float, upper: float) -> np.ndarray:
+    """Return bound · direction, moved inside [lower, upper] by a rounding error so that projecting is idempotent."""
+    nudge = min(1e-12, 0.25 * (upper - lower))
+    return (bound + (nudge if bound == lower else -nudge)) * direction
 
 
 @register(ACTIVE_CONSTRAINTS, "keep_above")
@@ -326,9 +326,9 @@ class TiltConstraint(FrameConstraint):
     @override
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         R_FH = self._heading(p_FE)
-        least, most = (math.radians(limit) for limit in self.limits_deg(math.sqrt(p_FE @ p_FE)))
-        tilt = nearest_turn(self._tilt(R_FH, R_FE), 0.5 * (least + most))
-        tilt = min(max(tilt, least), most)
+        lower, upper = (math.radians(limit) for limit in self.limits_deg(math.sqrt(p_FE @ p_FE)))
+        tilt = nearest_turn(self._tilt(R_FH, R_FE), 0.5 * (lower + upper))
+        tilt = min(max(tilt, lower), upper)
         c, s = math.cos(tilt), math.sin(tilt)
         R = R_FH @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return (R if self.turns_along else R @ R_FH.T) @ matrix_deg(self.rpy_deg), p_FE
@@ -412,9 +412,9 @@ class Arc(FrameConstraint):
 
     @override
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        least, most = math.radians(self.min_deg), math.radians(self.max_deg)
-        angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
-        angle = min(max(angle, least), most)
+        lower, upper = math.radians(self.min_deg), math.radians(self.max_deg)
+        angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (lower + upper))
+        angle = min(max(angle, lower), upper)
         c, s = math.cos(angle), math.sin(angle)
         # A matrix, because Drake's rotations refuse a NaN angle.
         R_FArc = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

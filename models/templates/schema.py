@@ -275,13 +275,13 @@ class TemplateFile(_Entry):
 
     @field_validator("parameters")
     @classmethod
-    def _replace_given(cls, declared: dict[str, float], info: ValidationInfo) -> dict[str, float]:
+    def _replace_defaults(cls, declared: dict[str, float], info: ValidationInfo) -> dict[str, float]:
         context: Any = info.context
-        for name in context["given"]:
+        for name in context["overrides"]:
             _check_known("there is no parameter", name, declared)
-        given = TypeAdapter(dict[str, Number]).validate_python(context["given"], context=context)
-        context["parameters"] = declared | given
-        return declared | given
+        overrides = TypeAdapter(dict[str, Number]).validate_python(context["overrides"], context=context)
+        context["parameters"] = declared | overrides
+        return declared | overrides
 
     @field_validator("frames")
     @classmethod
@@ -291,10 +291,10 @@ class TemplateFile(_Entry):
         return frames
 
 
-def _read(data: Any, where: str, given: Mapping[str, float]) -> SharedControlTemplate:
+def _read(data: Any, where: str, overrides: Mapping[str, float]) -> SharedControlTemplate:
     """Build the template of a file with the content `data`."""
     try:
-        file = TemplateFile.model_validate(data, context={"given": given, "parameters": None})
+        file = TemplateFile.model_validate(data, context={"overrides": overrides, "parameters": None})
         states = tuple(state.build(TemplateState, name=name) for name, state in file.states.items())
         first = states[0].name if file.initial_state is None else file.initial_state
         _check_known("initial_state: there is no state", first, file.states)

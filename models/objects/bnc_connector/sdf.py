@@ -52,13 +52,13 @@ def jack_sdf(
     """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
-    place = at(z=d.barrel_height / 2)
+    center = at(z=d.barrel_height / 2)
     radius = equal_area_radius(d.barrel_radius, barrel_sides(d)) if equal_area else d.barrel_radius
     pad = (at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), cylinder(d.pad_radius, d.pad_thickness))
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", place, cylinder(radius, d.barrel_height), barrel_material)
-    contents += visual("barrel_visual", place, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
+    contents = collision("barrel", center, cylinder(radius, d.barrel_height), barrel_material)
+    contents += visual("barrel_visual", center, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
         lug = (at(x=side * lug_center, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
