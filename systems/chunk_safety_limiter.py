@@ -85,7 +85,7 @@ class ChunkSafetyLimiter(LeafSystem):
     get_chunk_input_port = input_getter("chunk", "requested outputs, (K*O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,), read at initialization")
     get_desired_pose_output_port = output_getter("desired_pose", "command within the limits, (O,)")
-    get_rate_output_port = output_getter("rate", "speed along the chunk relative to the chunk's, (1,)")
+    get_rate_output_port = output_getter("rate", "executed speed relative to the requested one, (1,)")
     get_fallback_output_port = output_getter("fallback", "flag that the previous chunk is executed further, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:

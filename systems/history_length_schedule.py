@@ -56,7 +56,7 @@ class HistoryLengthSchedule(LeafSystem):
             raise InputError(f"history lengths are whole numbers from 1, at least one of them, not {list(lengths)}")
         if not 0.0 <= release_threshold <= contact_threshold:
             raise InputError(
-                f"contact must end at a force from 0 to the one where it begins, {contact_threshold} N, "
+                f"contact begins at {contact_threshold} N and must end at a force from 0 to this one, "
                 f"not at {release_threshold} N"
             )
         if dwell_steps < 1 or wrench_size < 1:

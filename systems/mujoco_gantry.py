@@ -110,7 +110,7 @@ class MujocoGantry(LeafSystem):
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
         self.model, self._data = model, self._mujoco.MjData(model)
-        # Warnings of divergence, or of a full buffer, with which the engine would ignore further contacts.
+        # Warnings of divergence, or of a full buffer: the engine would ignore further contacts.
         failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
         self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
         # Stored parts of the engine's state, including the warm start, so that a restored state continues identically.

@@ -133,7 +133,7 @@ _MAX_RESOLVED = 512  # entries before the cache is emptied
 
 
 def _cache_key(task: type[Task], options: Mapping[str, Any]) -> Hashable:
-    """Return a key that is equal for the same options of the same task; a new one if an option is not comparable.
+    """Return a key of a task and its options, equal for equal options; unique if an option is not comparable.
 
     It contains the registered names and the working directory, because defaults and relative paths depend on them.
     """
@@ -204,7 +204,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
 
 
 def _check_declared_options(task: type[Task], known: set[str]) -> None:
-    """Refuse an option in the defaults or a difficulty that no guidance and no station of the task has."""
+    """Refuse defaults and difficulties with an option that no guidance and no station of the task has."""
     for context, settings in {"defaults": task.defaults, **task.difficulties}.items():
         for option in set(settings) - known:
             anywhere = {

@@ -19,7 +19,7 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """Station whose desired pose is a system's (6,) output, sampled once per control period, with a recorder."""
+    """Station and recorder; the desired pose (6,) is the output of a system, sampled once per control period."""
 
     def __init__(
         self,

@@ -59,7 +59,7 @@ class Guidance(Diagram):
         """Set the poses of objects in this episode, by name; guidance without objects does nothing."""
 
     def make_reference(self, observation_size: int) -> System | None:
-        """Return the system that computes ``reference_window`` from the observation (n,), if that is an input.
+        """Return the system that computes ``reference_window`` from the observation (n,); None without this input.
 
         The system has an input ``observation`` and an output ``reference_window``, and no direct feedthrough, because
         an observation may contain the command.

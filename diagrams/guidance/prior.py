@@ -45,7 +45,7 @@ class ScriptedApproach:
     Attributes:
         heights: First and last height [m].
         speed: Speed [m/s].
-        reach: Displacement of the command along each axis at an action of 1 [m].
+        reach: Displacement of the command [m] along each axis at an action of 1.
     """
 
     heights: tuple[float, float]

@@ -199,7 +199,7 @@ def _min_norms(
 
 
 def _squared_radius(corrections: np.ndarray, min_norms: np.ndarray) -> float:
-    """Return a bound on ‖v − v̄‖², with a correction v in a cell and the interpolation v̄ of those at the corners."""
+    """Return a bound on ‖v − v̄‖², with a correction v in a cell and the interpolation v̄ of the corners' corrections."""
     squared = np.sum(corrections**2, axis=1)
     distances = np.sum((corrections[:, None] - corrections) ** 2, axis=2)
     between = 0.5 * max(float(np.max((min_norms[:, None] - min_norms) ** 2 - distances)), 0.0)
@@ -220,7 +220,7 @@ def _find_coupled(primitive: LcNsKmp) -> np.ndarray:
 
 
 def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarray) -> Bounds:
-    """Combine the bounds without constraints and those of corrected commands (2, N, O), NaN at other commands."""
+    """Combine the bounds without constraints with those of corrected commands (2, N, O), which are NaN elsewhere."""
     is_corrected = ~np.isnan(corrected_bounds[0])
     low, high = single_output_bounds(loop)
     lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)

@@ -5,7 +5,7 @@ It bounds the commands y for all actions a. W h is the window's mean given the h
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
 must leave room for these errors (see docs/concepts/robustness.md). `guiderail certify SKILL --verify FOLDER` also
-compares with the skill what this program only reads: the certificate's subject, primitive, impedance and budget.
+compares subject, primitive, impedance and budget with those of the skill; this program only reads them.
 The digest detects accidental changes only, as anyone can compute it; a signature needs the key.
 """
 
@@ -62,12 +62,12 @@ def require(condition: Any, words: str) -> None:
 
 
 def canonical(claims: dict[str, Any], *left_out: str) -> str:
-    """Return the canonical text of claims, the only accepted one, without the fields `left_out`."""
+    """Return the canonical text of claims without the fields `left_out`; no other text is accepted."""
     return json.dumps({k: v for k, v in claims.items() if k not in left_out}, sort_keys=True, allow_nan=False)
 
 
 def read(folder: Path, key: bytes | None) -> tuple[Arrays, Arrays, dict[str, Any]]:
-    """Return primitive and constraints, witness and claims; reject files that are not exactly as they must be."""
+    """Return primitive and constraints, witness and claims; reject files of any other format."""
     text = (folder / "certificate.json").read_text(encoding="utf-8")
     claims = json.loads(text)
     require(type(claims) is dict and text == canonical(claims), "certificate.json is not in canonical form")

@@ -75,7 +75,7 @@ def parse_yaml(text: str, where: str = "text") -> Any:
 
 
 def check_yaml(text: str, where: str, tags: Collection[str]) -> None:
-    """Check that YAML for another reader is within the limits of `parse_yaml` and has no tags but the given ones.
+    """Check that a document is within the limits of `parse_yaml`, and that it has only tags in `tags`.
 
     Raises:
         InputError: As `parse_yaml`, except for duplicate keys.

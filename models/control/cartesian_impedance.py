@@ -13,8 +13,8 @@ from guiderail.models.control.wrench import WrenchBound, bounded_wrench
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 
-# Towards a singular posture, the effective mass at the tool grows in the lost direction. In a direction with a mass up
-# to LIGHT [kg] only the impedance acts, above HEAVY [kg] only the posture's torque; masses are usually 1 to 50 kg.
+# Towards a singular posture, the effective mass at the tool, usually 1 to 50 kg, grows in the lost direction. Up to
+# LIGHT [kg], only the impedance acts in this direction; above HEAVY [kg], only the posture's torque.
 LIGHT, HEAVY = 300.0, 3000.0
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
 _ROUNDING = 1e-9  # [N, Nm] a wrench that changes by no more than this is not limited

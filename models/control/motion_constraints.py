@@ -21,7 +21,7 @@ from guiderail.models.primitives.qp import solve_least_norm
 # Distances from a shape and from the plane of a linear constraint: that at which the QP aims, and the smaller one that
 # every command keeps. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
-_CUTS = 4  # number of times that the shapes to stay inside of are linearized
+_CUTS = 4  # number of linearizations of the `inside` shapes
 _BISECTIONS = 12  # number of bisections between the braking command and the nearest command
 
 
@@ -42,7 +42,7 @@ class Violations(NamedTuple):
 
     Attributes:
         linear: max(c − G y) with rows of unit norm [unit of the output].
-        shapes: Largest distance into a shape to stay outside of, or out of one to stay inside of [m].
+        shapes: Largest depth inside an `outside` shape, or distance outside an `inside` shape [m].
         state: Largest violation of state constraints, such as joint limits [rad].
     """
 
@@ -114,7 +114,7 @@ class MotionConstraints:
 class MotionConstraintFilter:
     """Filter that finds the nearest command within `MotionConstraints` from which the motion can still stop.
 
-    In one step all constraints are linear. The shapes to stay outside of become half-spaces, linearized at the last
+    In one step all constraints are linear. The `outside` shapes become half-spaces, linearized at the last
     command, so that the true constraint also holds between two commands. Speed and acceleration become boxes
 
         |y − p| ≤ v h        |y − 2 p + p'| ≤ a h²
@@ -220,7 +220,7 @@ class MotionConstraintFilter:
         return 1.0 - share, steps - 0.5 * share * steps * (steps + 1)
 
     def _linearize(self, last: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return constraints G y ≥ c, G (F, O) and c (F,), for the way from the last command to where braking ends."""
+        """Return constraints G y ≥ c, G (F, O) and c (F,), for the path from the last command to where braking ends."""
         constraints = self.constraints
         shapes = (*constraints.outside, *constraints.inside)
         rows, bounds = np.zeros((len(shapes), self.num_outputs)), np.zeros(len(shapes))
@@ -260,7 +260,7 @@ class MotionConstraintFilter:
         return command
 
     def _cut(self, command: np.ndarray) -> list[tuple[np.ndarray, float]]:
-        """Return half-spaces that contain the shapes to stay inside of and exclude a command outside of them."""
+        """Return half-spaces that contain the `inside` shapes and exclude a command outside them."""
         cuts = []
         for shape in self.constraints.inside:
             distance, normal = shape.surface(command[: shape.num_dims])

@@ -370,7 +370,7 @@ class StateEstimator:
         return np.clip(bias, -limit, limit)
 
     def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the effect of recent torques that the reported velocity lacks, (n,) [rad/s], and where it lacks any.
+        """Return the effect of recent torques that the reported velocity lacks, (n,) [rad/s], and a mask (n,) of where.
 
         A wrong velocity lacks the effect of the torques both with and without the external ones; the smaller effect
         counts. If only one of the two effects is missing, or they differ in sign, the external torque is wrong.

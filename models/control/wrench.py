@@ -57,7 +57,7 @@ class WrenchBound:
     def lowered_to(self, max_wrench: np.ndarray) -> WrenchBound:
         """Return the element-wise minimum of this bound and another (8,), whose negative or NaN numbers count as 0.
 
-        A bound that arrives at run time can therefore only lower the one that a robot was configured with.
+        A bound that arrives at run time can therefore only lower the configured one.
         """
         return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
 
@@ -129,8 +129,8 @@ def bounded_wrench(
 ) -> np.ndarray:
     """Compute s − β D v, with the clipped spring s and the largest share β ≤ 1 of the damper that the bound allows.
 
-    The clipped spring has a potential, and the damper only dissipates, whatever its share: for a constant bound and
-    rest position the law is passive.
+    The clipped spring has a potential, and the damper only dissipates at every share: for a constant bound and rest
+    position the law is passive.
 
     Args:
         spring: Wrench of the spring (6,).

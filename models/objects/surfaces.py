@@ -6,9 +6,9 @@ import numpy as np
 
 from guiderail.models.common.transforms import MM
 
-# A seam between convex pieces that only meet would catch a sliding body, because the shortest way out of a piece is
-# sideways there. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, at an angle
-# of nine degrees.
+# If neighbouring convex pieces only touched, their seam would catch a sliding body: there, the shortest way out of a
+# piece is sideways. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, at an
+# angle of nine degrees.
 SHOULDER, BELOW = 0.3 * MM, 0.05 * MM
 
 

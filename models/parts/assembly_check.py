@@ -1,4 +1,4 @@
-"""Geometric checks of a plug and its socket: overlap and its remedy, clearance between walls, the way to the target."""
+"""Geometric checks of a plug and its socket: overlap and its remedy, clearance between walls, path to the target."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list[tuple[float, float]]:
-    """Return the largest overlap with the socket on the way [m] and its height [m] for each body of the plug."""
+    """Return each plug body's largest overlap with the socket on its path [m], and the height there [m]."""
     fixed, obstructions = make_solids(socket), []
     for body in make_solids(plug):
         overlaps = [(measure_overlap([move_solid(body, z, a)], fixed)[0], z) for z, a in motion.path()]

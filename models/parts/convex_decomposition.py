@@ -74,7 +74,7 @@ def _with_large_faces(convex: Any) -> Any:
 
 
 def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
-    """Return the area [mm²] of the smallest triangle of faces cut into fans, as in Drake, and its flattest corner.
+    """Cut faces into fans of triangles, as Drake does; return the smallest triangle's area [mm²] and flattest corner.
 
     `faces` holds the number of corners and the corners of each polygon.
     """

@@ -1,7 +1,7 @@
 """Scripted demonstrator of an insertion: a straight motion for tests, and a search for demonstrations.
 
-A pose [x y z Rz Ry Rx] is the plug's in the target frame. A command lies below the surface that stops the plug: under
-impedance control the difference is the push.
+Poses [x y z Rz Ry Rx] are those of the plug in the target frame. A command lies below the surface that stops the plug:
+under impedance control the difference is the push.
 """
 
 import numpy as np

@@ -119,7 +119,7 @@ def _unite(solids: Sequence[Any]) -> Any:
 
 
 def _reduce(solid: Any, tolerance: float) -> tuple[Any, float]:
-    """Return a solid with few triangles, or its hull if that deviates little, and the deviation [mm]."""
+    """Return a solid with few triangles, or its hull if the hull deviates little, and the deviation [mm]."""
     simpler, moved = simplify(solid, tolerance, _FIRST_FRACTION)
     hull, filled = as_hull_if_near(simpler, tolerance - moved)
     return hull, moved + filled

@@ -51,7 +51,7 @@ class Repair:
 def close_surface(
     name: str, vertices: np.ndarray, triangles: np.ndarray
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Repair]:
-    """Return the bodies of a mesh as closed surfaces with outward faces, and what was repaired.
+    """Return the bodies of a mesh as closed surfaces with outward faces, and the repair.
 
     Triangles of no area must not be removed before: they close T-junctions.
 
@@ -116,7 +116,7 @@ def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
 
 
 def _wrap(name: str, vertices: np.ndarray, triangles: np.ndarray, open_edges: int, where: np.ndarray) -> Any:
-    """Return the solid of any triangles, crossing ones included: the boundary of their tetrahedral mesh."""
+    """Return the solid of triangles that may cross or leave gaps: the boundary of their tetrahedral mesh."""
     if find_spec("pytetwild") is None or find_spec("pyvista") is None:
         raise InputError(
             f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}): close it in the "

@@ -132,7 +132,7 @@ class LinearConstraints:
         return float((self.c[step] - self.G[step] @ output).max())
 
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
-        """Compute the output (O,) within the constraints of a step that is nearest to `output` (O,).
+        """Compute the output (O,) nearest to `output` (O,) within the constraints of a step.
 
         If the solver does not find it, the result is the first allowed point on the straight line to a point inside
         the constraints, so that there is a result for every finite output.

@@ -98,7 +98,7 @@ class Demonstrations:
         """Return the first `count` demonstrations, or all if it is None.
 
         Raises:
-            InputError: If there are not as many.
+            InputError: If there are fewer.
         """
         if count is None:
             return self

@@ -122,7 +122,7 @@ def _read_npz(data: bytes) -> Recording:
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, NotImplementedError) as error:
-        raise InputError(f"it is damaged or no .npz file: {brief(str(error))}") from error
+        raise InputError(f"it is damaged or not an .npz file: {brief(str(error))}") from error
 
 
 def _check_directory(data: bytes) -> None:
@@ -131,7 +131,7 @@ def _check_directory(data: bytes) -> None:
         raise InputError("it is a single array (.npy): save `times` and `outputs` with numpy.savez")
     end = data[-22:]
     if data[:4] != b"PK\x03\x04" or end[:4] != b"PK\x05\x06":
-        raise InputError("it is damaged or no .npz file: its beginning or its end is missing")
+        raise InputError("it is damaged or not an .npz file: its beginning or its end is missing")
     if int.from_bytes(end[12:16], "little") > _MAX_DIRECTORY_SIZE or data[-42:-38] == b"PK\x06\x07":
         raise InputError("it holds too many arrays: save `times` and `outputs` alone")
 

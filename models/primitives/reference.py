@@ -224,9 +224,10 @@ class ReferenceTrajectory:
         if not (0.0 < period < np.inf and 0.0 < time_scale < np.inf):
             raise InputError(f"a period and a time scale must be positive, not {period} s and {time_scale}")
         step = (self.times[-1] - self.times[0]) / (self.num_steps - 1)
-        number = round(self.num_steps * step * time_scale / period)
+        duration = self.num_steps * step * time_scale
+        number = round(duration / period)
         if number < 2:
-            raise InputError(f"a motion of {self.num_steps * step * time_scale:g} s has no two steps of {period:g} s")
+            raise InputError(f"a motion of {duration:g} s has fewer than two steps of {period:g} s")
         clock = period * np.arange(number)
         nodes, at = np.arange(self.num_steps), np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
         columns = np.hstack([self.means, self.covariances.reshape(self.num_steps, -1)])

@@ -100,8 +100,8 @@ class JointRange:
     def violation(self, output: np.ndarray) -> float:
         """Return the largest violation of a pose (6,), negative inside; infinite if it cannot be reached.
 
-        A violation of a joint limit is an angle [rad]. That of the singular value [m] is converted to an angle by
-        `LEVER`, as rotations are in the scaled Jacobian.
+        The violation of a joint limit is an angle [rad]. The violation of the singular value [m] is converted to an
+        angle by `LEVER`, like rotations in the scaled Jacobian.
         """
         q = self.solve(output)
         if q is None:

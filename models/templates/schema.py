@@ -206,7 +206,7 @@ _UNLIMITED: Any = Field(None)
 
 
 class _State(_Entry):
-    """A state without the fields that have the unit of its transition distance in their names."""
+    """State without the fields whose names contain the unit of its transition distance."""
 
     transition_distance: AnyDistance
     input_mapping: tuple[AnyMapping, ...] = Field(max_length=MAX_PARTS)
@@ -242,15 +242,15 @@ def _state_model(unit: str) -> Any:
     )
 
 
-class _MeasuredState(BaseModel):
-    """Field of a state that determines the unit of the other fields."""
+class _StateDistance(BaseModel):
+    """Transition distance of a state, which determines the unit of other fields."""
 
     transition_distance: AnyDistance
 
 
 def _state(entry: Any, info: ValidationInfo) -> Any:
     """Read one state."""
-    unit = _MeasuredState.model_validate(entry, context=info.context).transition_distance.unit
+    unit = _StateDistance.model_validate(entry, context=info.context).transition_distance.unit
     state = _state_model(unit).model_validate(entry, context=info.context)
     if state.ends_at is None and not state.transitions:
         raise ValueError(f"ends_at_{unit} is missing; give it a value")

@@ -90,7 +90,7 @@ class PreflightChecks:
         return check_robot(self._station, self.simulator.get_context(), self._start, num_commands)
 
     def repeat(self) -> list[Check]:
-        """Repeat the checks on fresh statuses, because time has passed in which none was received."""
+        """Repeat the checks on new statuses, after a time without any."""
         self._clock.begin()
         self._clock.advance(self.simulator, self._station, self._num_steps)
         # A new simulator accepts the arm's position at once, even if it was moved by hand in the meantime.

@@ -67,7 +67,7 @@ class Motion(EnvCallback):
         self._actions = []
 
     def on_step(self, transition: Transition) -> None:
-        """Record the action for every control step since the last one."""
+        """Record the action for each of its control steps."""
         steps = len(self.base.trace) - len(self._actions)
         self._actions += steps * [np.clip(np.asarray(transition.action, float).ravel(), -1.0, 1.0)]
 
@@ -273,7 +273,7 @@ def find_report(html: Path, run: Path | None) -> str | None:
 
 
 def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:
-    """Return the return and the largest constraint violations of a row, with `scale` units per m or rad."""
+    """Format a row's return and its largest constraint violations, with `scale` units per m or rad."""
     violations = (
         f"{name} {'none' if row[key] <= TOLERANCE else f'{scale * row[key]:.2g} {unit}'}"
         for name, key in (("commanded", "max_commanded_violation"), ("measured", "max_measured_violation"))

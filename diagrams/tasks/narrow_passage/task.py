@@ -62,7 +62,7 @@ def reward_terms(reward: str, geometry: PassageGeometry, has_sampled_obstacles: 
     """Return the terms of a reward.
 
     "sparse" is the thesis's reward (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
-    With `has_sampled_obstacles`, each obstacle of the signal `obstacles`, which holds their positions, adds a cost.
+    With `has_sampled_obstacles`, the signal `obstacles` holds the obstacles' positions, and each obstacle adds a cost.
     """
     two_poses = {"pose": 2, "last_pose": 2}
 
