@@ -38,7 +38,7 @@ PHASE = np.linspace(0.0, 1.0, STEPS)
 
 
 def skill(history, bound=None, tied=0.0):
-    """Return a loop of two outputs, of which the first is explored and may be constrained to ±bound."""
+    """Return a loop of two outputs; the first is explored, and constrained to ±bound if a bound is given."""
     means = np.column_stack([0.2 * np.sin(np.pi * PHASE), PHASE])
     width = 0.05 + 0.1 * np.sin(np.pi * PHASE)
     covariances = np.zeros((STEPS, 2, 2))

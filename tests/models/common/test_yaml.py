@@ -99,7 +99,7 @@ def test_file_with_a_byte_order_mark_is_read(tmp_path):
     assert load_yaml(tmp_path / "a.yaml") == {"name": "ψ"}
 
 
-def test_file_that_is_no_text_is_refused(tmp_path):
+def test_load_refuses_files_that_are_not_text_or_too_large(tmp_path):
     (tmp_path / "latin.yaml").write_bytes(b"name: \xe9")
     (tmp_path / "large.yaml").write_bytes(b"#" * 100_001)
     for name, said in [("latin", "UTF-8"), ("large", "larger"), ("missing", "there is no study"), ("x" * 300, "study")]:

@@ -167,12 +167,12 @@ def test_rate_conflicts_above_its_limit():
     """Two programs with the same clock: 2 commands per period, of which 1.2 are expected."""
     times = PERIOD * (0.5 * np.arange(60))
     sequence = CommandSequence(PERIOD)
-    result = None
+    first_conflict = None
     for n, time in enumerate(times):
         sequence.add(TORQUE + n, time, time)
-        result = n if result is None and sequence.num_conflicts else result
+        first_conflict = n if first_conflict is None and sequence.num_conflicts else first_conflict
     # The level rises by 1 − 0.6 with each command after the first, up to 8.
-    assert result == int((module.MAX_LEVEL - 1.0) / 0.4) + 1
+    assert first_conflict == int((module.MAX_LEVEL - 1.0) / 0.4) + 1
     assert count(PERIOD / 1.19 * np.arange(1000)) == 0
     assert count(PERIOD / 1.25 * np.arange(1000)) > 0
     assert (module.LEAK, module.MAX_LEVEL) == (1.2, 8)

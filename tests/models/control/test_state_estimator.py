@@ -192,7 +192,6 @@ def test_velocity_is_predicted_and_then_unknown_without_status():
             assert predicted.any()
         else:
             np.testing.assert_array_equal(predicted, 0.0)
-    assert module.MAX_PREDICTION_TIME == 0.1
 
 
 def test_prediction_is_exact_without_external_torque():
@@ -500,14 +499,12 @@ def test_velocity_change_within_a_period_is_no_contradiction():
     for share in (0.0, 0.5, 1.0):
         rig = Rig().settle()
         change = np.array([-0.8, 0.0])
-        impact = rig.status()
         rig.v = rig.v + change
         rig.balance = DAMPING * rig.v - rig.external
         rig.torque = rig.balance
         rig.q = rig.q - share * PERIOD * change
         assert rig.check() == Fault.NONE, share
         assert rig.estimate.state.residual[0] == pytest.approx(0.0, abs=1e-9)
-        assert impact.is_readable
 
 
 # A second robot, a second program.
@@ -596,8 +593,8 @@ def test_reacting_joint_is_no_fault():
     np.testing.assert_allclose(rig.estimate.state.predicted, rig.estimate.state.measured, atol=0.02)
 
 
-@pytest.mark.parametrize(("delay", "is_fault"), [(1, False), (2, False)])
-def test_delayed_torque_is_no_fault(delay, is_fault):
+@pytest.mark.parametrize("delay", [1, 2])
+def test_delayed_torque_is_no_fault(delay):
     rig, rng = Rig(velocity=np.zeros(2)).settle(), np.random.default_rng(1)
     queue = [rig.balance] * delay
     faults = set()
@@ -605,19 +602,18 @@ def test_delayed_torque_is_no_fault(delay, is_fault):
         queue.append(rig.balance + (rng.uniform(-5.0, 5.0, 2) if rig.step % 10 == 0 else queue[-1] - rig.balance))
         faults.add(rig.check(torque=queue[-1]))
         rig.torque = queue.pop(0)  # the torque that acts on the robot
-    assert (faults != {Fault.NONE}) == is_fault
+    assert faults == {Fault.NONE}
 
 
 @pytest.mark.parametrize(("speed", "is_fault"), [(1.4, False), (2.2, True)])
 def test_collision_is_no_fault_up_to_the_velocity_jump(speed, is_fault):
     """The velocity jumps without a measured torque, as in a collision whose external torque is reported later."""
     rig = Rig(velocity=np.zeros(2), limits=replace(LIMITS, velocity_jump=1.5)).settle()
-    pushes = [speed / 2, speed / 2]
     faults = []
-    for push in pushes:
-        rig.v = rig.v + [push, 0.0]
+    for _ in range(2):
+        rig.v = rig.v + [speed / 2, 0.0]
         rig.torque = DAMPING * rig.v - rig.external
-        faults.append(rig.check(torque=DAMPING * rig.v - rig.external))
+        faults.append(rig.check(torque=rig.torque))
     assert Fault.VELOCITY_JUMP not in faults
     assert (Fault.NOT_REACTING in faults) == is_fault
 
@@ -757,11 +753,11 @@ def test_jumped_position_is_not_accepted_before_settling():
 # Stop with one wrong signal.
 
 SIGNALS = {
-    "position step": lambda rng, t: {"positions": rng.uniform(-0.5, 0.5, 2)},
-    "velocity bias": lambda rng, t: {"velocities": rng.uniform(-2.0, 2.0, 2)},
-    "small velocity bias": lambda rng, t: {"velocities": rng.uniform(-0.05, 0.05, 2)},
-    "external torque": lambda rng, t: {"external_torque": rng.uniform(-30.0, 30.0, 2)},
-    "clock": lambda rng, t: {"time": rng.uniform(-0.5, 0.5)},
+    "position step": lambda rng: {"positions": rng.uniform(-0.5, 0.5, 2)},
+    "velocity bias": lambda rng: {"velocities": rng.uniform(-2.0, 2.0, 2)},
+    "small velocity bias": lambda rng: {"velocities": rng.uniform(-0.05, 0.05, 2)},
+    "external torque": lambda rng: {"external_torque": rng.uniform(-30.0, 30.0, 2)},
+    "clock": lambda rng: {"time": rng.uniform(-0.5, 0.5)},
 }
 
 
@@ -781,7 +777,7 @@ def test_no_single_wrong_signal_adds_energy_to_a_stop(signal, seed):
     rng = np.random.default_rng(seed)
     rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
     before = 0.5 * rig.v @ M @ rig.v
-    energy, speed = stop(rig, shifted(**SIGNALS[signal](rng, 0)))
+    energy, speed = stop(rig, shifted(**SIGNALS[signal](rng)))
     assert energy <= before * (1.0 + 1e-9)
     assert speed < 0.1
 

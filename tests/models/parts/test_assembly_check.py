@@ -1,4 +1,4 @@
-"""Parts are checked for overlap, clearance between walls and a free way to the target."""
+"""Parts are checked for overlap, clearance between walls and a free path to the target."""
 
 from pathlib import Path
 

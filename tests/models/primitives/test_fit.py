@@ -110,8 +110,7 @@ def test_share_is_low_when_a_primitive_leaves_the_spread():
     too_strong = LcNsKmp(hook(), SquaredExponential(0.1), 1e5, 1e5, max_deviation=np.inf)
     assert share_within_spread(too_strong) < 0.2
     for primitive in (good, too_wide, too_strong):
-        kernel, hbar = primitive.kernel, primitive.lambda_
-        estimate = estimated_share(primitive.reference, kernel, hbar, hbar)
+        estimate = estimated_share(primitive.reference, primitive.kernel, primitive.lambda_, primitive.beta)
         assert estimate == pytest.approx(share_within_spread(primitive), abs=0.1)
 
 

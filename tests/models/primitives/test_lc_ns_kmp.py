@@ -110,8 +110,7 @@ def test_predict_agrees_with_a_qp_over_kernel_weights(seed):
     solver.settings.verbose = False
     solver.settings.eps_abs = solver.settings.eps_rel = 1e-13
     solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-13
-    n = len(free)
-    solver.setup(np.eye(n), np.zeros(n), None, None, rows / size[:, None], bounds / size, None, None, None)
+    solver.setup(np.eye(len(free)), 0.0 * free, None, None, rows / size[:, None], bounds / size, None, None, None)
     assert solver.solve().name == "PIQP_SOLVED"
     expected = (Phi[P * num_outputs :] @ (free + unit @ solver.result.x)).reshape(H + 1, num_outputs)
     np.testing.assert_allclose(problem.solve().trajectory / scale, expected, rtol=0, atol=1e-8)
@@ -128,7 +127,7 @@ def ring_loading() -> ReferenceTrajectory:
 
 
 def real_problem(history, seed) -> Problem:
-    """Demonstrations of loading a bearing ring, with constraints ±1 cm around the mean."""
+    """Return a problem with recorded demonstrations; positions must stay above their mean minus 2 cm."""
     reference = ring_loading()
     inside = reference.means.mean(axis=0)
     rng = np.random.default_rng(seed)
@@ -208,7 +207,7 @@ def test_special_cases_are_the_other_members_of_the_family():
 
 
 def small(**changes) -> dict:
-    """Return a simple primitive: two outputs, twenty steps, x ≤ 0.5."""
+    """Return the arguments of a simple primitive: two outputs, twenty steps, x ≤ 0.5."""
     t = np.linspace(0, 1, 20)
     means = np.column_stack([t, np.sin(t)])
     covariances = np.tile(0.01 * np.eye(2), (20, 1, 1))
@@ -288,8 +287,7 @@ def test_bounds_hold_in_badly_scaled_problems(variances, period, history):
 
 def test_constraints_of_each_step_apply_at_that_step():
     t = np.linspace(0, 1, 20)
-    upper = np.where(t[:, None] < 0.5, np.inf, 0.3) * np.ones(2)
-    upper[t < 0.5] = 10.0
+    upper = np.where(t[:, None] < 0.5, 10.0, 0.3) * np.ones(2)
     p = LcNsKmp(**small(constraints=LinearConstraints.box(np.full((20, 2), -10.0), upper)))
     assert p.predict(2).output[0] < 0.2
     assert p.predict(15).output[0] <= 0.3 + 1e-9

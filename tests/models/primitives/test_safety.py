@@ -129,8 +129,8 @@ def test_repeated_and_opposite_constraints_are_satisfied():
 
 
 @given(SEEDS)
-def test_command_moves_with_a_tightened_bound(seed):
-    """Scaling all units by two scales the command by two: the law has no unit of its own."""
+def test_command_scales_with_the_unit_of_the_outputs(seed):
+    """In millimeters instead of meters, a command is 1000 times as large: the law has no unit of its own."""
     rng = np.random.default_rng(seed)
     t = 0.02 * np.arange(30)
     means = np.cumsum(0.01 * rng.standard_normal((30, 2)), axis=0)

@@ -34,7 +34,7 @@ def test_wrist_wrench_at_rest_is_the_external_wrench():
     np.testing.assert_allclose(external_wrench(F_reaction, M, np.zeros(6), np.zeros(6), gravity), pushed_up, atol=1e-12)
 
 
-def test_wrist_wrench_is_zero_in_free_fall_with_spin(arm):
+def test_wrist_wrench_is_zero_in_free_fall_with_spin():
     """A free body with an offset center of mass, compared with Drake's dynamics."""
     plant = MultibodyPlant(0.0)
     model = add_model(plant, CONNECTOR_TOOL.model)

@@ -24,7 +24,7 @@ ROBOTS = ("iiwa14", "panda", "ur5e")
 
 
 class Alone:
-    """Return a plant with a robot without a tool."""
+    """Plant of a robot without a tool."""
 
     def __init__(self, name):
         self.robot = find_robot(name)
@@ -196,7 +196,7 @@ def test_limits_equal_published_ones(alone):
 def test_panda_gravity_equals_the_identified_model():
     """Compare gravity torques at Franka's ready posture with the coefficients published by Gaz et al.
 
-    The feasible masses and centers of mass reproduce what they were retrieved from to 0.15 Nm.
+    The feasible masses and centers of mass that were computed from the coefficients reproduce the torques to 0.15 Nm.
     """
     alone = Alone("panda")
     alone.plant.SetPositions(alone.context, [0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])

@@ -221,7 +221,7 @@ OUTSIDE = [
 
 
 @pytest.mark.parametrize("constraint", OUTSIDE, ids=lambda constraint: type(constraint).__name__)
-def test_way_between_commands_is_outside_of_a_shape(constraint):
+def test_path_between_commands_is_outside_of_a_shape(constraint):
     rng, s = np.random.default_rng(0), template(state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3), constraint]))
     frames = {"f": pose(rng, 0.01)}
     last, nearest, touching, center = RigidTransform([0.0, 0.06, 0.0]), np.inf, 0, frames["f"].translation()

@@ -19,7 +19,7 @@ EXACT = 1e-11
 
 
 def scene(seed, spread=0.3):
-    """Yield random generators, poses of the end effector and an object, and the name of the object or the world."""
+    """Return a random generator, X_WE, the pose of an object by name, and the name of the object or of the world."""
     rng = np.random.default_rng(seed)
 
     def pose():
@@ -237,7 +237,7 @@ class Tilted(ac.ActiveConstraint):
         )
 
 
-def test_violation_is_the_larger_of_metres_and_radians():
+def test_violation_is_the_larger_of_meters_and_radians():
     X_WE = RigidTransform(RotationMatrix.MakeYRotation(0.7), [0.1, -0.2, 0.5])
     assert Tilted(0.1).violation(X_WE, {}) == pytest.approx(0.3)
     assert Tilted(0.5).violation(X_WE, {}) == pytest.approx(0.5)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pydrake.geometry import Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import Simulator
@@ -66,8 +65,7 @@ def test_contains_is_true_inside():
 
 def test_mug_holds_two_balls():
     volume = MUG.depth * np.pi * (MUG.inner_diameter / 2) ** 2
-    ball = Sphere(Ball().diameter / 2)
-    assert volume > 4 * 2 * np.pi * ball.radius() ** 3
+    assert volume > 3 * 2 * np.pi / 6 * Ball().diameter ** 3  # balls do not fill a vessel
 
 
 @pytest.mark.parametrize("wrong", [{"inner_diameter": 0.0}, {"depth": -1.0}, {"wall": float("nan")}, {"mass": np.inf}])
