@@ -71,14 +71,36 @@ def time_per_action(teacher: RunFolder, student: Path) -> dict[str, float]:
     The teacher's is that of its network and of a constrained primitive in every control step, the student's that of its
     network.
     """
-    config = teacher.config()
-    prior = make_prior_knowledge(config.task, **beyond_defaults(config.task, config.environment)).demonstrations
+    config, policy, base = teacher.config(), Policy.load(teacher.path), find_base_policy(str(student))
+    options = beyond_defaults(config.task, config.environment)
+    teach, observations, num_outputs = teacher_actions(config.task, options, config.action_repeat, policy)
+
+    def imitate(index: int) -> None:
+        chunk_samples(base, observations[index], num_outputs)
+
+    return {"teacher": median_time(teach), "student": median_time(imitate)}
+
+
+def teacher_actions(
+    task: str, options: Mapping[str, Any], repeat: int, policy: Policy
+) -> tuple[Callable[[int], None], np.ndarray, int]:
+    """Return a function that computes an action of a KGRL policy and its commands, for one of several observations.
+
+    Args:
+        task: Name of the task.
+        options: Options of the teacher's environment.
+        repeat: Control steps of an action.
+        policy: Policy of the teacher.
+
+    Returns:
+        The function of the observation's index, the observations (n, …), and the number of outputs O of a command.
+    """
+    prior = make_prior_knowledge(task, **options).demonstrations
     if prior is None:
-        raise InputError(f"{config.task} has no demonstrations")
-    primitive, policy, base = prior.primitive(history=False), Policy.load(teacher.path), find_base_policy(str(student))
+        raise InputError(f"{task} has no demonstrations")
+    primitive = prior.primitive(history=False)
     gains, size = prior.null_space_gains(primitive), policy.description["observation_shape"][0]
     observations = np.random.default_rng(0).uniform(-0.5, 0.5, (MEASURED, size)).astype(np.float32)
-    repeat = config.action_repeat
     starts = (np.arange(MEASURED) * repeat) % (primitive.reference.num_steps - repeat)
 
     def teach(index: int) -> None:
@@ -86,13 +108,11 @@ def time_per_action(teacher: RunFolder, student: Path) -> dict[str, float]:
         for step in range(starts[index], starts[index] + repeat):
             primitive.predict(int(step), action)
 
-    def imitate(index: int) -> None:
-        chunk_samples(base, observations[index], prior.num_outputs)
-
-    return {"teacher": _median_time(teach), "student": _median_time(imitate)}
+    return teach, observations, prior.num_outputs
 
 
-def _median_time(act: Callable[[int], None]) -> float:
+def median_time(act: Callable[[int], None]) -> float:
+    """Return the median time of an action [ms], for a function of its index."""
     for index in range(MEASURED):  # factors of the primitive's steps are computed at first use
         act(index)
     times = []

@@ -1,0 +1,68 @@
+"""Student trained alongside a teacher: the equivalent task-space actions, and the comparison."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import research.alongside as alongside
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.rollout import rollout
+
+
+class RecordingStudent:
+    """Student that records the transitions that it gets."""
+
+    def __init__(self):
+        self.transitions, self.episodes = [], 0
+
+    def actor(self):
+        return None
+
+    def start_recorded(self, is_greedy, actor):
+        self.episodes += 1
+
+    def on_step(self, transition):
+        self.transitions.append(transition)
+
+
+@pytest.mark.parametrize("action", [[0.0, 0.0], [0.6, -0.3]])
+def test_equivalent_actions_command_nearly_the_same(action):
+    """The student's environment, driven by the equivalent actions, commands what the teacher commanded."""
+    teacher, student = (make_environment(alongside.TASK, one) for one in (alongside.TEACHER, alongside.STUDENT))
+    recorder = RecordingStudent()
+    callback = alongside.TaskSpaceTransitions(teacher, recorder, alongside.STUDENT)
+    rollout(teacher, lambda observation: np.array(action, np.float32), callback, seed=3)
+    commanded = teacher.unwrapped.trace.commanded.copy()
+    assert recorder.episodes == 1
+    assert recorder.transitions[-1].is_last
+    actions = iter([one.action for one in recorder.transitions])
+    rollout(student, lambda observation: next(actions, np.zeros(2, np.float32)), seed=3)
+    other = student.unwrapped.trace.commanded[: len(commanded)]
+    size = min(len(commanded), len(other))
+    # Within an action the teacher's displacement changes, the student's does not.
+    np.testing.assert_allclose(other[:size, :2], commanded[:size, :2], atol=2.5e-4)
+    np.testing.assert_allclose(other[:size, 2:], commanded[:size, 2:], atol=2e-2)
+
+
+def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, monkeypatch):
+    evaluated = []
+
+    def evaluate(out, variant, episodes, seed, run_seed):
+        evaluated.append((variant, episodes))
+        columns = ("peak_force", "jerk_commanded_linear", "max_commanded_violation")
+        return pd.DataFrame([{"success": 1, **dict.fromkeys(columns, 1.0)}] * episodes)
+
+    def train(out, *arguments):
+        out.mkdir()
+        (out / "training.csv").write_text("")
+
+    monkeypatch.setattr(alongside, "evaluate_variant", evaluate)
+    monkeypatch.setattr(alongside, "train_both", train)
+    monkeypatch.setattr(alongside, "times_per_action", lambda out: {"teacher": 1.0})
+    for _ in range(2):
+        rows = alongside.compare(tmp_path / "out", episodes=11)
+        assert [row["variant"] for row in rows] == list(alongside.VARIANTS)
+        assert len(evaluated) == 2 * len(alongside.VARIANTS)
+    with pytest.raises(InputError, match="at least one"):
+        alongside.compare(tmp_path / "out", episodes=0)
