@@ -91,11 +91,14 @@ def describe_task_options(name: str) -> dict[str, str]:
     for model in (CommonOptions, *map(type, config.parts.values())):
         for row in describe_options(model):
             texts[row["name"]] = _describe_option(row, config.options[row["name"]], choices.get(row["name"], ()))
+    kinds: dict[tuple[str, str], list[str]] = {}  # names of guidance, by option and text
     for kind in map(GUIDANCE.get, choices["guidance"]):
         if kind.name != config.guidance:
             for row in describe_options(kind.options):
-                text = f"with guidance={kind.name}: {_describe_option(row, row['default'])}"
-                texts[row["name"]] = f"{texts[row['name']]}; {text}" if row["name"] in texts else text
+                kinds.setdefault((row["name"], _describe_option(row, row["default"])), []).append(kind.name)
+    for (name, text), names in kinds.items():
+        text = f"with guidance={' or '.join(names)}: {text}"
+        texts[name] = f"{texts[name]}; {text}" if name in texts else text
     for difficulty, settings in declared.difficulties.items():
         if settings:
             pairs = ", ".join(f"{key}={_format_value(value)}" for key, value in settings.items())
@@ -111,10 +114,12 @@ def describe_task_options(name: str) -> dict[str, str]:
 def _describe_option(row: Mapping[str, Any], default: Any, choices: Collection[str] = ()) -> str:
     """Return an option's meaning, its range or choices, and its default."""
     allowed = row.get("choices") or choices
-    values = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
+    values = [f"one of {', '.join(map(str, allowed))}"] if allowed else []
     if {"minimum", "maximum"} <= row.keys():
-        values = f"from {row['minimum']:g} to {row['maximum']:g}; "
-    return f"{row['description']}: {values}default {default!r}"
+        values = [f"from {row['minimum']:g} to {row['maximum']:g}"]
+    if default not in (None, (), "") or "default" not in row["description"]:  # else the description explains it
+        values.append(f"default {default!r}")
+    return ": ".join([str(row["description"]), *(["; ".join(values)] if values else [])])
 
 
 def _guidance(name: str) -> dict[str, Any]:

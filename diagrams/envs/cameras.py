@@ -1,7 +1,6 @@
 """Cameras for image observations and for pictures, and the browser view."""
 
 import ctypes
-import logging
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -183,7 +182,6 @@ def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisual
         raise InputError(
             f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"
         ) from error
-    logging.getLogger(__name__).info("browser view at %s", meshcat.web_url())
     parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=PUBLISH_PERIOD)
     return meshcat, MeshcatVisualizer(meshcat, parameters)
 

@@ -238,7 +238,9 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any])
     if kind in bounds:
         (bound,) = context.values()
         return f"{name} must be {bounds[kind]} {bound:g}, not {brief(value)}"
-    if kind in ("tuple_type", "too_short", "too_long") and (example := _example(model.model_fields[name])):
+    if kind in ("tuple_type", "too_short", "too_long", *_NUMBER_ERRORS) and (
+        example := _example(model.model_fields[name])
+    ):
         return f"{name} must be {example}, not {brief(value)}"
     if kind in _NUMBER_ERRORS:
         return f"{name} must be a {_NUMBER_ERRORS[kind]}, not {brief(value)}"
@@ -249,7 +251,7 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any])
 def _example(field: FieldInfo) -> str:
     """Return a phrase with the number of entries of a tuple of numbers and an example; "" for any other field."""
     annotations = repr(field.annotation)
-    if "float" not in annotations and "int" not in annotations:
+    if "tuple" not in annotations or ("float" not in annotations and "int" not in annotations):
         return ""
     lengths = {getattr(item, "min_length", None) for item in (*field.metadata, *_metadata_of(field.annotation))}
     (number,) = (lengths - {None}) or {0}

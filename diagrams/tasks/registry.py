@@ -61,6 +61,8 @@ def check_task_name(name: object) -> None:
         InputError: If there is no such task.
     """
     if name not in known_tasks():
+        if str(name).startswith((".", "/", "~")):
+            raise InputError(f"there is no task.yaml in {name}: name a folder that guiderail create-task made")
         raise InputError(f"there is no task {brief(name)}: {did_you_mean(name, known_tasks(), IMPORT_HINT)}")
 
 

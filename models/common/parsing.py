@@ -29,12 +29,19 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
     """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.yaml), to a plant.
 
     Directives may refer to packages (folders with a `package.xml`) in the folder of their file.
+
+    Raises:
+        InputError: If the file, or a mesh that it names, cannot be read.
     """
     with _allow_package_map():
         parser = _make_parser(plant)
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
-        return parser.AddModels(str(path))
+        try:
+            return parser.AddModels(str(path))
+        except RuntimeError as error:
+            words = " ".join(str(error).split())
+            raise InputError(f"the model {path}, or a mesh in it, can't be read: {words}") from error
 
 
 def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective]) -> None:

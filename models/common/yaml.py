@@ -56,7 +56,7 @@ def load_yaml(path: str | Path, what: str = "file") -> Any:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the {what} '{path}' can't be read: it is not text in UTF-8") from error
-    return parse_yaml(text, path.name)
+    return parse_yaml(text, str(path))
 
 
 def parse_yaml(text: str, where: str = "text") -> Any:

@@ -139,7 +139,10 @@ def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
     """
     import trimesh
 
-    mesh: Any = trimesh.load(io.BytesIO(data), file_type=ending, force="mesh", process=False, skip_materials=True)
+    try:
+        mesh: Any = trimesh.load(io.BytesIO(data), file_type=ending, force="mesh", process=False, skip_materials=True)
+    except ImportError:  # trimesh tries to detect the encoding of a text
+        raise ValueError(f"it is damaged or no {ending.upper()} file") from None
     number = 0 if mesh is None else max(len(mesh.faces), len(mesh.vertices) // 3)
     if not 0 < number <= MAX_TRIANGLES:
         return np.empty((0, 3)), np.empty((0, 3), dtype=int), number

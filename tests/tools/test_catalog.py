@@ -17,4 +17,5 @@ def test_options_of_a_registered_guidance_are_described(monkeypatch):
     register_guidance("pace_of_mine", options=Clock)(lambda known: None)
     after = describe_task_options("NarrowPassage")
     assert after["reach"] == "with guidance=pace_of_mine: motion of a full action [m]: from 0 to 1; default 0.05"
+    assert "default None" not in "".join(text for text in before.values() if "default: " in text)
     assert after["history"].startswith(f"{before['history']}; with guidance=pace_of_mine: number of past outputs")

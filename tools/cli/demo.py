@@ -10,11 +10,12 @@ import pandas as pd
 from rich.console import Console
 
 from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Paths, rollout
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Paths, check_seed, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume
@@ -37,13 +38,16 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     Raises:
         InputError: If the folder contains something else than a demo, or a number is out of range.
     """
+    if episodes < 1:
+        raise InputError(f"a run needs at least one episode, not {episodes}")
+    check_seed(seed)
+    _clear(out)
     started = time.perf_counter()
     console = Console(soft_wrap=True, highlight=False)
     console.print(
         "A robot has nine demonstrations of the way through a narrow passage. Then an obstacle and a forbidden zone\n"
         "were added. It now learns by trial and error to avoid the obstacle, and never enters the forbidden zone."
     )
-    _clear(out)
     write_atomically(out / MARK, b"")
     run = start_or_resume(
         "NarrowPassage",
@@ -63,7 +67,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     for line in (
         f"{rows['success'].sum()} of {len(rows)} training episodes reached the goal, "
         f"{violations} violated the constraint, {(rows['collisions'] > 0).sum()} touched a wall.",
-        "It did not learn to avoid the obstacle: try more --episodes."
+        "While exploring, it did not yet avoid the obstacle in five episodes in a row: try more --episodes."
         if avoided is None
         else f"From episode {avoided} on it avoided the obstacle while still exploring.",
         f"The policy on {HELD_OUT} held-out starts: {_outcome(after)}.",

@@ -239,7 +239,7 @@ def certify(
             if name == "attack":
                 continue
             text = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
-            typer.echo(f"{name.replace('_', ' ')}: {text}")
+            typer.echo(f"{'accepted by the checker' if name == 'checker' else name.replace('_', ' ')}: {text}")
         if rows:
             typer.echo(Path(result["certificate"]).with_name("attack.md").read_text(encoding="utf-8"))
     if result["checker"] != "yes" or any(row["violations"] for row in rows):

@@ -49,9 +49,9 @@ def visualize(
     if html is None and image is None and video is None:
         html = default_page(Path(subject) if episode.run is None else episode.run, environment)
     if html is not None:
+        write_page(html, episode, episodes=episodes)
         if episode.run is not None:
             typer.echo(plot_run(episode.run))
-        write_page(html, episode, episodes=episodes)
         typer.echo(html)
     for path, write in ((image, write_image), (video, write_video)):
         if path is not None:

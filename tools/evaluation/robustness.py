@@ -163,6 +163,7 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
     result, left_out = [], []
     for axis in axes:
         trained = axis.default if _is_default(axis, resolved) else None
+        reasons: dict[str, list[str]] = {}
         for value in axis.values:
             try:
                 changes = {} if value == trained else axis.change(resolved, value)
@@ -173,7 +174,8 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
                 options = {"new_run": True} if axis.resamples and hides(task, {**resolved, **changed}) else {}
                 result.append(Point(axis, value, changed, trained, options))
             except InputError as error:
-                left_out.append(f"{axis.name} {value:g} is left out: {error}")
+                reasons.setdefault(str(error).partition(": choose one of")[0], []).append(f"{value:g}")
+        left_out += [f"{axis.name} {', '.join(values)} left out: {reason}" for reason, values in reasons.items()]
     return result, left_out
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import gymnasium
 
-from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
@@ -24,6 +24,7 @@ from guiderail.tools.evaluation.policies import (
     learned_policy,
     load_policy,
 )
+from guiderail.tools.evaluation.rollout import PolicyFn, is_compatible
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail.tools.visualization.style import is_demonstrated
@@ -140,6 +141,8 @@ def find_subject(
     if env is None:
         if not isinstance(policy, Path | str) or is_policy_file(policy):
             raise InputError("a policy without a run acts in a task: name it (--task)")
+        if str(policy) in known_tasks() and not Path(policy).is_dir():
+            raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
         run_config = folder.config()
         make_policy = learned_policy(folder.path, run_config.environment)
@@ -158,7 +161,18 @@ def find_subject(
     if is_policy_file(policy) or source.is_dir():
         make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
         return Subject(source.name.replace(":", "."), config, make_policy, digest=_digest(source))
-    return Subject(str(policy), config, make_baselines(config, {}, [str(policy)])[str(policy)])
+    name = str(policy)
+    return Subject(name, config, partial(_make_compatible, name, make_baselines(config, {}, [name])[name]))
+
+
+def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:
+    """Return a baseline or scripted policy for an environment, or refuse it if it does not fit."""
+    if not is_compatible(make_policy, env):
+        raise InputError(
+            f"the policy {name!r} does not fit the observations or actions of this environment: choose another one, or "
+            "the options that it is written for, such as difficulty=hard"
+        )
+    return make_policy(env)
 
 
 def _digest(source: Path) -> str:

@@ -105,8 +105,8 @@ class RobotConnection:
     def __post_init__(self) -> None:
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
-        if self.sim and (self.driver or self.robot) not in SIMULATED:
-            raise InputError(f"these drivers have a simulated robot: {', '.join(SIMULATED)}; not {self.robot}")
+        if self.sim and (driver := self.driver or self.robot) not in SIMULATED:
+            raise InputError(f"these drivers have a simulated robot: {', '.join(SIMULATED)}, not {driver}")
         if self.synchronous and self.driver:
             raise InputError(f"the simulated robot of the driver {self.driver} does not wait: leave --synchronous out")
         if self.sim and self.robot_url:

@@ -24,6 +24,7 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.drake_multibody import pose_to_transform
+from guiderail.tools.hardware.connection import SIMULATED
 from guiderail.tools.hardware.scenario import load_scenario
 
 DEFAULT_TASK = "BncConnector"
@@ -70,6 +71,8 @@ def run_sim_driver(
             raise InputError(f"{name} must be a positive number, not {value:g}")
     if rate is not None:
         check_rate(rate)
+    if driver and driver not in SIMULATED:
+        raise InputError(f"there is no simulated driver {driver!r}: choose one of {', '.join(SIMULATED)}")
     insertion = _insertion_task(task)
     if offset is not None and len(offset) != 2:
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")

@@ -17,7 +17,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.evaluation.metrics import own_episodes, summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress, PolicyFn, check_seed
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
@@ -68,12 +68,10 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Statistics of training, and the paths of the pictures."""
         rows = self.episodes
-        statistics = summary(rows, SUMMARY)
-        recent = min(len(rows), 10)
-        rate = statistics["success_rate_last_10"]
-        note = "there are only demonstrations" if rate is None else f"{rate:.2f} of the last {recent}, with exploration"
+        recent = own_episodes(rows)["success"].tail(10)
+        note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"
         note += f"; evaluate the deterministic policy with guiderail evaluate {self.path}"
-        return {"run": str(self.path), **statistics, "success_in_training": note, **self.pictures}
+        return {"run": str(self.path), **summary(rows, SUMMARY), "success_in_training": note, **self.pictures}
 
 
 def train(

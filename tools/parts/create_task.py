@@ -171,7 +171,7 @@ def create_task(
     prepared = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
         "deviation_mm": round(1e3 * deviation, 4),
-        "repair": [str(part.repair) for part in parts],
+        "repair": "; ".join(text for part in parts if (text := str(part.repair))) or "none",
         "triangles": [surface.num_triangles for surface in surfaces.values()],
         "preparation_s": clock.read(),
     }

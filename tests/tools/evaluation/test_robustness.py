@@ -128,7 +128,8 @@ def test_robustness_refuses_wrong_arguments(run, wrong):
 def test_points_cover_every_value_or_state_why_not(task):
     arguments = check_environment(task, {})
     result, left_out = points(task, arguments, AXES)
-    assert len(result) + len(left_out) == sum(len(axis.values) for axis in AXES)
+    values_left_out = sum(sentence.partition(" left out: ")[0].count(" ") for sentence in left_out)
+    assert len(result) + values_left_out == sum(len(axis.values) for axis in AXES)
     for axis in AXES:
         at = {point.value: point.environment for point in result if point.axis is axis}
         if axis.default in at:

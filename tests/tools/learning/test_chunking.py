@@ -36,7 +36,7 @@ def test_chunks_follow_the_commands_of_the_demonstrations(trained):
     across = 1  # the passage is crossed at the same speed on both sides of the obstacle
     assert np.abs(samples.mean(axis=0) - env.unwrapped.trace.commanded[80:84])[:, across].max() < 0.06
     assert samples.std(axis=0).max() > 0.0
-    assert run.summary["success_in_training"].startswith("there are only demonstrations")
+    assert run.summary["success_in_training"].startswith("only demonstrations")
 
 
 def test_same_seed_gives_the_same_policy_also_when_resumed(trained, tmp_path):
