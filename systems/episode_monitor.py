@@ -34,10 +34,10 @@ class TerminationTerm:
             signal share its port.
         condition: Pure function of these signals, called by name, that returns True if the condition is met.
         steps: Number of control steps in which the condition must be met before the episode ends, at least 1.
-        progress: Optional function of the same signals. With this function, the steps need not be consecutive, and the
-            count is reset when its value exceeds its maximum so far by more than `min_progress`. Without it, the steps
-            must be consecutive.
-        min_progress: Increase above the maximum of `progress` beyond which the count is reset.
+        progress: Optional function of the same signals. With this function, the steps need not be consecutive, and
+            progress resets their count: a value above the largest one so far by more than `min_progress`. Without it,
+            the steps must be consecutive.
+        min_progress: Largest increase of the value that is no progress.
     """
 
     termination: str

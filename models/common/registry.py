@@ -27,8 +27,8 @@ class Registry(Generic[Entry]):
     Args:
         noun: Kind of the entries for messages, such as "task".
         package: Import name of the package, or of each package, whose modules register entries.
-        decorator: Name of the function whose calls, with a name as first argument, register entries; the modules'
-            source is searched for it. Without it, all modules are imported at the first use.
+        decorator: Name of the function that registers an entry under its first argument; its calls are found in the
+            modules' source. Without it, all modules are imported at the first use.
         entry_points: Group of entry points of further entries.
     """
 

@@ -17,7 +17,7 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 # LIGHT [kg], only the impedance acts in this direction; above HEAVY [kg], only the posture's torque.
 LIGHT, HEAVY = 300.0, 3000.0
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
-_ROUNDING = 1e-9  # [N, Nm] a wrench that changes by no more than this is not limited
+_ROUNDING = 1e-9  # largest change of a wrench by a bound that is no saturation [N, Nm]
 _SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 
 

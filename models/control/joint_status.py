@@ -86,7 +86,7 @@ class JointStatus:
         velocities: Joint velocities, (n,) [rad/s].
         external_torque: External joint torques, (n,) [Nm].
         conflicts: Number of messages so far that contradict their predecessors, such as those of a second robot.
-        foreign_commands: Number of commands so far that contradict those of the one program that commands the arm.
+        foreign_commands: Number of commands so far that cannot be from the program that commands the arm.
     """
 
     time: float

@@ -71,7 +71,7 @@ class KeepOut:
     def half_spaces(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return half-spaces that exclude the boxes with their margin, selected at a position.
 
-        They are the constraints and, for each box, the half-space outside of its face with the most clearance.
+        They are the constraints and, for each box, the half-space outside the face with the most clearance.
 
         Args:
             position: Position (O,).

@@ -6,8 +6,8 @@ from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, JointStat
 
 REVERSAL = 1.5  # largest change of a joint velocity between statuses, in a collision [rad/s]
 RESOLUTION = 1e-4  # largest error of a position, from noise and resolution [rad]
-RETURN_TIME = 1.0  # time within which a return to the time stamps before a jump is a contradiction [s]
-EQUAL_TIME = 0.1  # time within which a second command with its predecessor's time stamp is a contradiction [s]
+RETURN_TIME = 1.0  # largest time between two jumps of the time stamps that count as a return [s]
+EQUAL_TIME = 0.1  # largest time between two repetitions of a time stamp that count as a contradiction [s]
 LEAK = 1.2  # largest mean number of commands of one program per period
 MAX_LEVEL = MAX_MISSED_MESSAGES + 2  # largest number of late commands that may arrive at once
 

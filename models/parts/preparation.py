@@ -25,7 +25,7 @@ _THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
 MAX_YAW = 0.1  # largest rotation of the plug about its axis in a search, which widens the margin [rad]
 CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
-_FIRST_FRACTION = 0.7  # fraction of the rest that is tried first, as the deviation may exceed the bound of `manifold3d`
+_FIRST_FRACTION = 0.7  # fraction of the remaining tolerance at the first attempt; `manifold3d` may exceed its bound
 
 KINDS = ("convex", "tetrahedra")
 """Kinds of pieces of a compliant part; tetrahedra are tried if no convex pieces let the plug reach its target."""
