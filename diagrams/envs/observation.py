@@ -81,7 +81,7 @@ class Observation(Diagram):
         """Construct the diagram.
 
         Args:
-            terms: Terms of the observation, at least term.
+            terms: Terms of the observation, at least one.
             sizes: Sizes of the signals by name.
             duration: Duration of an episode [s].
             clip: Largest absolute value of an entry, positive.
