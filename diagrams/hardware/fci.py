@@ -8,6 +8,8 @@ With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
 from __future__ import annotations
 
 import logging
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,18 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
-from guiderail.models.control.motion_limits import FRANKA_LIMITS
+from guiderail.models.control.motion_limits import MotionLimits
 
 logger = logging.getLogger(__name__)
 
-DYNAMICS_SHARE = 0.2  # share of the robot's motion limits that commands may use
+# Limits of the commands: a fifth of the robot's linear and four fifths of its angular velocity, and half of its
+# accelerations and jerks. An axis has 1/√3 of a limit, and a policy turns a bayonet at 1 rad/s about one axis.
+MOTION_LIMITS = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
+NO_ERRORS = "[]"  # the client's text of a robot without errors
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
 POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
+RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
 FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold relative to the largest wrench of the impedance
 MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
@@ -45,7 +51,7 @@ class FciDriver(PoseDriver):
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
     hold_off = 0.25  # not needed by the robot; statuses are checked before the arm is controlled
-    motion_limits = FRANKA_LIMITS.scaled(DYNAMICS_SHARE)
+    motion_limits = MOTION_LIMITS
 
     def __init__(self, url: str = "", *, client: Any = None):
         """Construct the driver; the first `read` connects to the robot.
@@ -70,23 +76,28 @@ class FciDriver(PoseDriver):
         """Set tool center, payload and collision thresholds, and the impedance of the next motion.
 
         During a motion nothing changes, because the robot would refuse it: the impedance stays that of the motion.
+        After a lost connection, `recover` configures the robot.
 
         Raises:
             InputError: If the robot refuses the configuration.
         """
         if self._motion is not None:
             return
-        robot = self._robot
-        X_NP = RigidTransform(robot.state.F_T_NE.matrix).InvertAndCompose(impedance.X_FlangeTool)
+        self._impedance = impedance
+        if self._is_lost:
+            return
+        robot, franky = self._robot, self._franky
         force = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3]))
         torque = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[3:]))
         try:
+            X_NP = RigidTransform(robot.state.F_T_NE.matrix).InvertAndCompose(impedance.X_FlangeTool)
             robot.set_ee(_flat(X_NP))
             robot.set_load(impedance.mass, impedance.center_of_mass.tolist(), impedance.inertia.ravel("F").tolist())
             robot.set_collision_behavior(list(TORQUE_THRESHOLD), [force] * 3 + [torque] * 3)
-        except (self._franky.Exception, RuntimeError, ValueError) as error:
+        except (franky.NetworkException, RuntimeError):
+            self._is_lost = True
+        except (franky.Exception, ValueError) as error:
             raise InputError(f"the robot at {self.url} refuses its configuration: {error}") from None
-        self._impedance = impedance
 
     def read(self) -> JointStatus | None:
         """Return the newest status, malformed after a reflex or a lost connection; None before the robot answers."""
@@ -99,11 +110,11 @@ class FciDriver(PoseDriver):
             except franky.NetworkException:
                 return None
         try:
-            if self.error:
-                return MALFORMED_STATUS
-            state = self._robot.state
-        except (franky.NetworkException, RuntimeError):  # a socket raises RuntimeError("Net Exception")
+            state = self._robot.state  # without a motion, each call waits for a new state
+        except (franky.Exception, RuntimeError):  # a socket raises RuntimeError("Net Exception")
             self._is_lost = True
+            return MALFORMED_STATUS
+        if str(state.current_errors) != NO_ERRORS:
             return MALFORMED_STATUS
         q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
         return JointStatus(state.time.to_sec(), q, v, -external)
@@ -111,7 +122,8 @@ class FciDriver(PoseDriver):
     @property
     def error(self) -> str:
         """Reason of a reflex of the robot, empty if there is none."""
-        return str(self._robot.state.current_errors) if self._robot.has_errors else ""
+        errors = str(self._robot.state.current_errors)
+        return "" if errors == NO_ERRORS else errors
 
     def check_setup(self) -> list[Check]:
         """Check mode, tool, payload and thresholds of the robot, and this machine's kernel."""
@@ -137,7 +149,11 @@ class FciDriver(PoseDriver):
                 f"at {FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3])):.0f} N of external force, and "
                 f"{list(TORQUE_THRESHOLD)} Nm of external torques",
             ),
-            Check("motion", f"commands up to {speed:.2f} m/s, {acceleration:.1f} m/s² and {jerk:.0f} m/s³"),
+            Check(
+                "motion",
+                f"commands up to {speed:.2f} m/s, {acceleration:.1f} m/s² and {jerk:.0f} m/s³, and "
+                f"{self.motion_limits.angular[0]:.1f} rad/s",
+            ),
             Check(
                 "kernel",
                 "with real-time priorities"
@@ -182,20 +198,42 @@ class FciDriver(PoseDriver):
             self._motion = None
             try:
                 self._robot.move(self._franky.TorqueStopMotion(max_duration=STOP_TIME), asynchronous=True)
-            except (self._franky.NetworkException, RuntimeError):
-                logger.warning("the robot at %s cannot be reached: it brakes by itself", self.url)
+            except (self._franky.Exception, RuntimeError) as error:
+                # The motion has ended by a reflex, or the connection is lost.
+                logger.warning("the robot at %s brakes by itself: %s", self.url, error)
 
     def recover(self) -> None:
-        """Clear the error of a reflex; the arm does not move.
+        """Clear the error of a reflex, or connect again after the connection was lost; the arm does not move.
 
         Raises:
-            InputError: If the error persists.
+            InputError: If the error persists, or the robot does not answer.
         """
         self._motion = None
+        if self._robot is not None:
+            with suppress(self._franky.Exception, RuntimeError):
+                self._robot.join_motion(STOP_TIME)  # raises the error that ended a motion; the next one would raise it
+        is_recovered = False
+        if not self._is_lost:
+            try:
+                is_recovered = self._robot.recover_from_errors()
+            except (self._franky.NetworkException, RuntimeError):
+                self._is_lost = True
         if self._is_lost:
-            raise InputError(f"the connection to the robot at {self.url} is lost: start the program again")
-        if not self._robot.recover_from_errors():
+            self._reconnect()
+            is_recovered = self._robot.recover_from_errors()
+        if not is_recovered:
             raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
+
+    def _reconnect(self) -> None:
+        self._is_lost, self._robot = False, None
+        end = time.monotonic() + RECONNECTION_TIME
+        while self.read() is None:
+            if time.monotonic() > end:
+                self._is_lost = True
+                raise InputError(f"the robot at {self.url} does not answer")
+            time.sleep(0.1)
+        if self._impedance is not None:
+            self.configure(self._impedance)
 
 
 def _flat(X: RigidTransform) -> list[float]:

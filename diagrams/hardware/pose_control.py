@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.multibody.tree import JacobianWrtVariable, SpatialInertia
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from guiderail.diagrams.hardware.driver import Driver, PoseDriver, RobotImpedance
@@ -41,6 +41,12 @@ def add_pose_publisher(
     builder.Connect(arm_state, publisher.get_arm_state_input_port())
 
 
+def payload_on_flange(model: ArmControllerPlant) -> SpatialInertia:
+    """Return the spatial inertia of tool and workpiece about the flange's origin, in the flange's axes."""
+    context, arm = model.plant.CreateDefaultContext(), model.arm
+    return model.plant.CalcSpatialInertia(context, arm.wrist.frame_on_parent(), [body.index() for body in arm.tool])
+
+
 def make_robot_impedance(model: ArmControllerPlant, impedance: Impedance) -> RobotImpedance:
     """Return the impedance for a robot's own controller, with the damping matrix of the nominal posture.
 
@@ -59,8 +65,7 @@ def make_robot_impedance(model: ArmControllerPlant, impedance: Impedance) -> Rob
         [3, 4, 5, 0, 1, 2]
     ]
     Lambda_inverse = J @ np.linalg.solve(plant.CalcMassMatrix(context), J.T)
-    flange = arm.wrist.frame_on_parent()
-    payload = plant.CalcSpatialInertia(context, flange, [body.index() for body in arm.tool])
+    flange, payload = arm.wrist.frame_on_parent(), payload_on_flange(model)
     about_center = payload.Shift(payload.get_com()).CalcRotationalInertia()
     return RobotImpedance(
         X_FlangeTool=model.tool_center.CalcPose(context, flange),

@@ -184,14 +184,25 @@ class InsertionTask(Task):
         """
         plant, workcell = station.plant, self.workcell()
         own = plant.GetMyMutableContextFromRoot(context)
-        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
-        tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
-        workcell.set_fixture_offset(plant, own, RigidTransform(turn, [*fixture[:2], 0.0]))
-        workcell.set_grasp_offset(plant, own, RigidTransform(tilt, [*workpiece[:2], 0.0]))
+        X_TTactual, X_PWorkpiece = part_poses(fixture, workpiece)
+        workcell.set_fixture_offset(plant, own, X_TTactual)
+        workcell.set_grasp_offset(plant, own, X_PWorkpiece)
 
     @abstractmethod
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return the pose at which an episode starts, (6,)."""
+
+
+def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransform, RigidTransform]:
+    """Return the actual target frame in the nominal one, and the workpiece in the tool, of a task's sampled offsets.
+
+    Args:
+        fixture: (x, y) of the fixture [m], and its turn about z [rad] if it has one.
+        workpiece: (x, y) of the workpiece in the tool [m], and its tilt about x and y [rad] if it has one.
+    """
+    turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
+    tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
+    return RigidTransform(turn, [*fixture[:2], 0.0]), RigidTransform(tilt, [*workpiece[:2], 0.0])
 
 
 WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pixels]

@@ -16,6 +16,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
+from guiderail.diagrams.hardware.fci import FciDriver
 from guiderail.diagrams.hardware.rtde import UR_MOTION_LIMITS
 from guiderail.models.control.motion_limits import FRANKA_LIMITS, MotionLimits
 from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
@@ -74,7 +75,7 @@ def oscillations(rng: np.random.Generator) -> Iterator[np.ndarray]:
 
 
 POLICIES: dict[str, Policy] = {one.__name__: one for one in (jumps, white, reversals, invalid, oscillations)}
-LIMITS = {"franka": FRANKA_LIMITS, "a fifth of franka": FRANKA_LIMITS.scaled(0.2), "ur": UR_MOTION_LIMITS}
+LIMITS = {"franka": FRANKA_LIMITS, "fci": FciDriver.motion_limits, "ur": UR_MOTION_LIMITS}
 
 
 def reached(poses: np.ndarray, period: float) -> np.ndarray:

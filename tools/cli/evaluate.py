@@ -125,9 +125,10 @@ def _evaluate_on_hardware(
     from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.evaluate import evaluate_on_robot
     from guiderail.tools.learning.run_folder import RunFolder
+    from guiderail.tools.pretrained import find_run
 
     robot = RobotConnection.from_scenario(scenario, **connection)
-    config = RunFolder(run).config()
+    config = RunFolder(find_run(run)).config()
     make_policy = None if policy is None else make_baseline(config.task, policy, config.seed)
     return evaluate_on_robot(
         run,

@@ -14,7 +14,7 @@ Url = Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's defau
 
 @cli.command("deploy runs/connector --sim --yes")
 def deploy(
-    run: cli.Run,
+    run: Annotated[Path, argument("Folder of a run, or pretrained:NAME ({pretrained}).", "RUN")],
     station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
     robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,
@@ -24,7 +24,9 @@ def deploy(
     rate: cli.Rate = None,
     scenario: cli.Scenario = None,
     yes: cli.Yes = False,
-    out: Annotated[Path | None, option("Folder of the recording.  [default: hardware in the run]")] = None,
+    out: Annotated[
+        Path | None, option("Folder of the recording.  [default: hardware in the run; NAME/hardware]")
+    ] = None,
     trust_imports: cli.TrustImports = False,
 ) -> None:
     """Execute a policy on a robot.

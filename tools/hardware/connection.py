@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.hardware.clock import Clock, WallClock, check_rate
+from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.lcm_simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
@@ -25,7 +26,8 @@ LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall cloc
 COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
 MAX_DURATION = 7 * 24 * 3600.0  # longest run of a simulated driver, by the robot's clock [s]
 DEFAULT_RATE = 0.2  # rate of a simulated robot's clock; simulating contact at 1 kHz is slower than real time
-SIMULATED = (DEFAULT_ROBOT, "fci")  # drivers that have a simulated robot
+FCI = "fci"  # driver of a Franka on its own protocol
+SIMULATED = (DEFAULT_ROBOT, FCI)  # drivers that have a simulated robot
 ROBOT_TIMEOUT = 60.0  # longest wait for the first status of a simulated driver, which has to start first [s]
 NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine the arm will be stopped because commands are late"
 
@@ -68,7 +70,8 @@ class RobotConnection:
         robot: Name of the arm.
         driver: Name of the driver; empty for the one with the robot's name.
         sim: Use a simulated driver, in a process of its own.
-        synchronous: Run station and simulated driver in lockstep instead of by the wall clock.
+        synchronous: Run station and simulated driver in lockstep instead of by the wall clock; always so for the driver
+            fci, whose robot at 1 kHz is slower than real time on most machines.
         rate: Rate of a simulated robot's clock relative to the wall clock.
         scenario: Scenario file with robot, address and surroundings.
 
@@ -107,14 +110,14 @@ class RobotConnection:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and (driver := self.driver or self.robot) not in SIMULATED:
             raise InputError(f"these drivers have a simulated robot: {', '.join(SIMULATED)}, not {driver}")
-        if self.synchronous and self.driver:
-            raise InputError(f"the simulated robot of the driver {self.driver} does not wait: leave --synchronous out")
         if self.sim and self.robot_url:
             raise InputError(
                 "a simulated driver has a bus of its own, so that no real driver receives its messages: leave "
                 "--robot-url out"
             )
         check_rate(self.rate)
+        if self.sim and self.driver == FCI:
+            object.__setattr__(self, "synchronous", True)
 
     def environment_options(self, station: str) -> dict[str, Any]:
         """Return the environment options of a hardware station on this connection."""
@@ -132,7 +135,8 @@ class RobotConnection:
         wall_clock = WallClock(station.driver, station.period, self.rate if self.sim else 1.0)
         if not self.synchronous:
             return wall_clock, wall_clock
-        assert isinstance(station.driver, LcmDriver)
+        if not isinstance(station.driver, LcmDriver):
+            return FciLockstepClock(station.driver.url, LOCKSTEP_TIMEOUT, station.period), wall_clock
         return LockstepClock(station.driver, LOCKSTEP_TIMEOUT, station.period), wall_clock
 
     def timing(self, station: HardwareStation, clock: WallClock) -> Mapping[str, Any]:
@@ -148,10 +152,12 @@ class RobotConnection:
         }
 
     @contextmanager
-    def simulated_driver(self, task: str, url: str, imports: Sequence[str] = ()) -> Iterator[None]:
+    def simulated_driver(
+        self, task: str, url: str, imports: Sequence[str] = ()
+    ) -> Iterator[subprocess.Popen[Any] | None]:
         """Run the simulated driver of an arm in front of a task's fixture; do nothing for a real robot."""
         if not self.sim:
-            yield
+            yield None
             return
         rate = None if self.synchronous else self.rate
         scenario = None if self.scenario is None else str(self.scenario.resolve())
@@ -163,5 +169,5 @@ class RobotConnection:
             f"sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "
             f"scenario={scenario!r} and Path({scenario!r}), driver={self.driver!r})"
         )
-        with subprocess_tied_to_parent(code):
-            yield
+        with subprocess_tied_to_parent(code) as process:
+            yield process

@@ -17,9 +17,10 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, EpisodeProgress, PolicyFn, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.hardware.connection import Log, RobotConnection
-from guiderail.tools.hardware.executor import hardware_environment
+from guiderail.tools.hardware.executor import hardware_environment, recordings_folder
 from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.pretrained import find_run
 from guiderail.tools.tables import table_text
 
 STATISTICS = (
@@ -51,14 +52,14 @@ def evaluate_on_robot(
     and the run's own hidden offset.
 
     Args:
-        run: Run folder.
+        run: Run folder, or `pretrained:NAME`.
         connection: Connection to the robot driver.
         episodes: Number of episodes.
         station: Name of a hardware station.
         policy: Name of the policy that replaces the run's own, for the file name.
         make_policy: Function that returns this policy for an environment.
         assume_yes: Do not ask for confirmation.
-        out: Folder of the rows; `hardware` in the run folder by default.
+        out: Folder of the rows; `recordings_folder` by default.
         log: Function that shows a message.
 
     Returns:
@@ -70,7 +71,7 @@ def evaluate_on_robot(
     """
     if episodes < 1:
         raise InputError(f"a number of episodes is at least one, not {episodes}")
-    folder = RunFolder(run)
+    folder = RunFolder(find_run(run))
     config = folder.config()
     own_policy = Policy.load(folder.path) if make_policy is None else None
     environment = hardware_environment(config.task, config.environment, station)
@@ -79,7 +80,7 @@ def evaluate_on_robot(
             f"mean_return is that of the reward {environment['reward']!r}, because the run's own needs simulation state"
         )
     config = replace(config, environment=environment | connection.environment_options(station))
-    path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
+    path = (out or recordings_folder(run)) / f"episodes{'-' * bool(policy)}{policy}.csv"
     rows: list[dict[str, Any]] = []
 
     def write(rows: list[dict[str, Any]]) -> None:

@@ -43,6 +43,7 @@ from guiderail.tools.hardware.preflight import (
     start_simulator,
 )
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.pretrained import PRETRAINED, find_run
 
 SIGNALS = {
     "wrench": 6,
@@ -281,8 +282,8 @@ def deploy(
 ) -> int:
     """Execute the policy of a run on a robot.
 
-    The recording is written to `out`, by default `hardware` in the run folder. With `assume_yes` the pre-flight checks
-    need no confirmation.
+    The run is a folder or `pretrained:NAME`. The recording is written to `out`, by default `recordings_folder`. With
+    `assume_yes` the pre-flight checks need no confirmation.
 
     Returns:
         The exit code: 0 if the skill was executed to its end, 1 if it was stopped.
@@ -291,7 +292,7 @@ def deploy(
         InputError: If the policy cannot be executed or recorded, no robot answers, or a check fails or is not
             confirmed.
     """
-    folder, recordings = RunFolder(run), out or run / "hardware"
+    folder, recordings = RunFolder(find_run(run)), out or recordings_folder(run)
     config, policy = folder.config(), Policy.load(folder.path)
     check_writable(step_log_file(recordings, 0))
     environment = hardware_environment(config.task, config.environment, station)
@@ -328,6 +329,11 @@ def deploy(
             finally:
                 executor.save(recordings, outcome, {**metadata, **connection.timing(skill_station, wall_clock)}, log)
     return outcome.exit_code
+
+
+def recordings_folder(run: Path) -> Path:
+    """Return the folder of recordings: `hardware` in the run's folder; NAME/hardware for `pretrained:NAME`."""
+    return Path(str(run).removeprefix(PRETRAINED)) / "hardware"
 
 
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.clock import set_realtime_priority
+from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -23,7 +25,7 @@ from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, Robot
 from guiderail.tools.hardware.operator import confirm, operator_keys
 from guiderail.tools.hardware.preflight import confirm_checks
 from guiderail.tools.hardware.robot_env import RobotEnv
-from guiderail.tools.hardware.sim_driver import PartRandomizer
+from guiderail.tools.hardware.sim_driver import PartRandomizer, publish_part_offsets
 from guiderail.tools.learning.run_folder import RunConfig
 
 
@@ -76,8 +78,10 @@ def robot_session(
                 confirm("Resume from where it is?")
 
         randomize_parts = None
-        if connection.sim and isinstance(station.driver, LcmDriver):
-            randomize_parts = PartRandomizer(task, station.driver, config.seed)
+        if isinstance(clock, FciLockstepClock):
+            randomize_parts = PartRandomizer(task, clock.move_parts, config.seed)
+        elif connection.sim and isinstance(station.driver, LcmDriver):
+            randomize_parts = PartRandomizer(task, partial(publish_part_offsets, station.driver), config.seed)
         env = RobotEnv(
             diagram,
             station,

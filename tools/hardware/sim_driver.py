@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
-from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.config import EnvConfig
@@ -21,9 +20,8 @@ from guiderail.diagrams.hardware.lcm import IiwaDriver, LcmDriver, open_bus
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.insertion import InsertionTask, part_poses
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.tools.hardware.connection import SIMULATED
 from guiderail.tools.hardware.scenario import load_scenario
 
@@ -57,7 +55,8 @@ def run_sim_driver(
             instead (lockstep).
         offset: Offset (x, y) of the fixture from its nominal position [m].
         scenario: Scenario file with the surroundings; see `load_scenario`.
-        driver: "fci" for a Franka on its own protocol, at the address `url`, always by the wall clock.
+        driver: "fci" for a Franka on its own protocol, at the address `url`: in lockstep with a `FciLockstepClock`,
+            without one by the wall clock.
         log: Function that shows a message.
 
     Returns:
@@ -83,11 +82,8 @@ def run_sim_driver(
             raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
         from guiderail.diagrams.hardware.fci_simulated import WorkcellSimulator, serve  # needs franky-sim
 
-        fixture = RigidTransform()
-        if reset is not None:
-            fixture = pose_to_transform(insertion.offsets.draw(np.random.default_rng(0), reset)[0])
-        simulator = WorkcellSimulator(insertion.workcell(), fixture)
-        serve(simulator, start, seconds, 1.0 if rate is None else rate, url, log)
+        parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)
+        serve(WorkcellSimulator(insertion.workcell()), start, part_poses(*parts), seconds, rate or 1.0, url, log)
         return True
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm = open_bus(url)
@@ -155,17 +151,28 @@ def _insertion_task(name: str) -> InsertionTask:
 class PartRandomizer:
     """Sampler of the offsets of a task's parts, which sends them to the simulated driver."""
 
-    def __init__(self, task: InsertionTask, driver: LcmDriver, seed: int):
-        """Sample the offset of the run; it is the same as in simulation with this seed."""
-        self._task, self._driver = task, driver
+    def __init__(self, task: InsertionTask, move_parts: Callable[[list[list[float]]], object], seed: int):
+        """Sample the offset of the run; it is the same as in simulation with this seed.
+
+        Args:
+            task: Task with the parts.
+            move_parts: Function that sends the offsets of fixture and workpiece, such as `publish_part_offsets`.
+            seed: Seed of the run.
+        """
+        self._task, self._move_parts = task, move_parts
         task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Move the parts to offsets sampled with the options of a reset in simulation; return the offsets by name."""
         reset = validate_options(self._task.Reset, options, "a simulated driver")
         fixture, workpiece = self._task.offsets.draw(rng, reset)
-        self._driver.lcm.Publish(PART_OFFSETS_CHANNEL, json.dumps([fixture.tolist(), workpiece.tolist()]).encode())
+        self._move_parts([fixture.tolist(), workpiece.tolist()])
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
+
+
+def publish_part_offsets(driver: LcmDriver, offsets: list[list[float]]) -> None:
+    """Send the offsets of fixture and workpiece to a simulated robot with `subscribe_part_offsets`."""
+    driver.lcm.Publish(PART_OFFSETS_CHANNEL, json.dumps(offsets).encode())
 
 
 def subscribe_part_offsets(lcm: DrakeLcmInterface, task: InsertionTask, robot: SimulatedIiwa, context: Context) -> None:

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware import fci as fci
-from guiderail.diagrams.hardware.fci import FORCE_THRESHOLD_SHARE, FciDriver
+from guiderail.diagrams.hardware.fci import FORCE_THRESHOLD_SHARE, NO_ERRORS, FciDriver
 from guiderail.diagrams.hardware.pose_control import make_robot_impedance
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant
@@ -44,18 +44,14 @@ class Robot:
     """Robot that holds its joints, and records what it is told to do."""
 
     def __init__(self, positions):
-        self.calls, self.errors, self.is_connected = [], "", True
+        self.calls, self.errors, self.is_connected, self.motion_error = [], NO_ERRORS, True, None
         self.positions, self.external, self.time = positions, np.zeros(7), 0.0
         self.can_recover, self.mode, self.tool, self.mass = True, "RobotMode.Idle", np.eye(4), 0.0
 
     @property
-    def has_errors(self):
+    def state(self):
         if not self.is_connected:
             raise NetworkError
-        return bool(self.errors)
-
-    @property
-    def state(self):
         self.time += 0.0025  # the driver reads twice per period
         return SimpleNamespace(
             q=self.positions,
@@ -71,9 +67,20 @@ class Robot:
         )
 
     def recover_from_errors(self):
+        if not self.is_connected:
+            raise NetworkError
         if self.can_recover:
-            self.errors = ""
+            self.errors = NO_ERRORS
         return self.can_recover
+
+    def join_motion(self, timeout):
+        error, self.motion_error = self.motion_error, None
+        if error is not None:
+            raise error
+
+    def move(self, motion, asynchronous):
+        self.join_motion(None)  # as the client, which raises the error of the last motion when the next one begins
+        self.calls.append(("move", (motion,), {}))
 
     def set_ee(self, matrix):
         self.calls.append(("set_ee", (matrix,), {}))
@@ -202,6 +209,40 @@ def test_recover_clears_the_error_or_raises(driver, robot):
     robot.can_recover = True
     driver.recover()
     assert driver.read().is_readable
+
+
+def test_motion_continues_after_a_reflex_is_cleared(driver, robot):
+    driver.write_pose(RigidTransform(), 0.0)
+    robot.motion_error = FrankyError("cartesian_reflex")
+    driver.stop()  # the motion has ended already
+    robot.motion_error = FrankyError("cartesian_reflex")
+    driver.recover()
+    driver.write_pose(RigidTransform(), 0.0)
+    assert len(motions(robot)) == 2
+
+
+@pytest.mark.parametrize("is_noticed", [True, False])
+def test_recover_connects_again_and_configures_the_robot(driver, robot, monkeypatch, is_noticed):
+    robot.is_connected = False
+    assert not is_noticed or not driver.read().is_readable
+    monkeypatch.setattr(fci, "RECONNECTION_TIME", 0.0)
+    with pytest.raises(InputError, match="does not answer"):
+        driver.recover()
+    robot.is_connected = True
+    robot.calls.clear()
+    driver.recover()
+    assert driver.read().is_readable
+    assert [name for name, *_ in robot.calls] == ["set_ee", "set_load", "set_collision_behavior"]
+
+
+def test_lost_connection_is_no_refusal_of_the_configuration(driver, robot, model):
+    robot.is_connected = False
+    driver.configure(make_robot_impedance(model, IMPEDANCE))
+    assert not driver.read().is_readable
+
+
+def test_bayonet_may_be_turned_at_one_radian_per_second():
+    assert FciDriver.motion_limits.angular[0] / np.sqrt(3.0) > 1.02  # the fastest turn of pretrained:connector
 
 
 def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):

@@ -1,26 +1,24 @@
-"""Run of a simulated Franka through its own protocol: insert, lock, stop, and the loss of the robot.
+"""Run of a simulated Franka through its own protocol: insert, lock, stop, the loss of the robot, and another robot.
 
 Run by `make fci`, in an environment with franky and franky-sim. The robot is a process of its own that answers
-libfranka's network protocol; its clock runs at a rate of the wall clock's, because a busy machine does not reach 1 kHz.
+libfranka's network protocol. It runs in lockstep with the station, so that the speed of the machine does not count.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
-import time
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.clock import WallClock
+from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.models.control.joint_status import Fault
+from guiderail.models.control.joint_status import STATUS_FAULTS, Fault
 from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.connection import subprocess_tied_to_parent
+from guiderail.tools.hardware.connection import LOCKSTEP_TIMEOUT, subprocess_tied_to_parent
 from guiderail.tools.hardware.sim_driver import START
 
 FORCE_LIMIT = 18.0  # bound of the impedance's force [N]
@@ -32,7 +30,7 @@ PRESSED = -0.006  # commanded height while the plug is turned [m]
 class SimulatedRun:
     """Hardware station on the simulated robot."""
 
-    def __init__(self, rate: float):
+    def __init__(self) -> None:
         self.host = f"127.0.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
         self.station = HardwareStation(
             BncWorkcell(),
@@ -44,7 +42,7 @@ class SimulatedRun:
         )
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
-        self.clock = WallClock(self.station.driver, self.station.period, rate)
+        self.clock = FciLockstepClock(self.host, LOCKSTEP_TIMEOUT, self.station.period)
         self.pose = START.copy()
         self.max_force = 0.0
 
@@ -62,6 +60,13 @@ class SimulatedRun:
             self.clock.advance(self.simulator, self.station, CONTROL_STEPS)
             self.max_force = max(self.max_force, float(self["contact_force"][0]))
 
+    def resume(self) -> None:
+        """End a stop, and hold the arm where it is until the station has full authority."""
+        self.advance(0.6)
+        self.pose = self["pose"].copy()
+        self.station.resume(self.context)
+        self.advance(0.8)
+
     def __getitem__(self, port: str) -> np.ndarray:
         return self.station.GetOutputPort(port).Eval(self.context)
 
@@ -71,7 +76,7 @@ class SimulatedRun:
         return f"{state.name}, {fault.description}; at {np.round(position, 2)} mm, turned {turn:.1f} degrees"
 
 
-def run_checks(rate: float) -> list[str]:
+def run_checks() -> list[str]:
     """Run the sequence of motions; return the names of failed checks."""
     failures = []
 
@@ -80,10 +85,10 @@ def run_checks(rate: float) -> list[str]:
         if not passed:
             failures.append(name)
 
-    run = SimulatedRun(rate)
+    run = SimulatedRun()
     code = (
         "from guiderail.tools.hardware.sim_driver import run_sim_driver\n"
-        f"run_sim_driver({run.host!r}, 1e4, 60.0, rate={rate!r}, driver='fci', log=lambda _: None)"
+        f"run_sim_driver({run.host!r}, 1e4, 60.0, driver='fci', log=lambda _: None)"
     )
     with subprocess_tied_to_parent(code) as robot:
         run.start()
@@ -100,15 +105,20 @@ def run_checks(rate: float) -> list[str]:
         run.station.stop(run.context)
         run.advance(0.6)
         check("stop", run["arm_state"][0] == ArmState.OFF, run.describe())
+        run.resume()
+        check("resume", run["arm_state"][0] == ArmState.RUNNING, run.describe())
         robot.kill()
-        before = time.monotonic()
-        run.advance(0.2)
-        fault = Fault(int(run["fault"][0]))
-        check("loss", fault != Fault.NONE, f"{fault.description}, {time.monotonic() - before:.1f} s later")
+        run.advance(0.6)
+        check(
+            "loss", Fault(int(run["fault"][0])) in STATUS_FAULTS and run["arm_state"][0] == ArmState.OFF, run.describe()
+        )
+    with subprocess_tied_to_parent(code):
+        run.station.driver.recover()
+        run.clock.begin()
+        run.resume()
+        check("recovery", run["arm_state"][0] == ArmState.RUNNING, run.describe())
     return failures
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rate", type=float, default=0.1, help="rate of the robot's clock (default: 0.1)")
-    sys.exit(bool(run_checks(parser.parse_args().rate)))
+    sys.exit(bool(run_checks()))

@@ -1,6 +1,7 @@
 """The simulated driver imports the modules of the run."""
 
 from contextlib import contextmanager
+from pathlib import Path
 
 import gymnasium
 import pytest
@@ -9,6 +10,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.cli.main import main
 from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.executor import recordings_folder
 
 MINE = """
 from guiderail.diagrams.tasks.bnc_connector.task import BncConnector
@@ -58,3 +60,14 @@ def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
         gymnasium.registry.pop(environment_id("mine/Connector"), None)
         TASKS._entries.pop("mine/Connector", None)
     assert served == ["Mine", "Mine", "Mine"]
+
+
+def test_simulated_franka_is_in_lockstep():
+    assert RobotConnection(sim=True, robot="panda", driver="fci").synchronous
+    assert not RobotConnection(robot="panda", driver="fci", robot_url="192.0.2.1").synchronous
+    assert not RobotConnection(sim=True).synchronous
+
+
+@pytest.mark.parametrize(("run", "folder"), [("runs/peg", "runs/peg/hardware"), ("pretrained:clamp", "clamp/hardware")])
+def test_recordings_are_in_a_folder_of_the_run(run, folder):
+    assert recordings_folder(Path(run)) == Path(folder)

@@ -1,5 +1,7 @@
 """With a simulated driver the parts have the same offsets as after a reset in simulation."""
 
+from functools import partial
+
 import numpy as np
 from pydrake.lcm import DrakeLcm
 
@@ -7,7 +9,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
-from guiderail.tools.hardware.sim_driver import PartRandomizer, subscribe_part_offsets
+from guiderail.tools.hardware.sim_driver import PartRandomizer, publish_part_offsets, subscribe_part_offsets
 
 SEED = 30
 
@@ -18,7 +20,8 @@ def test_offsets_equal_those_of_simulation_for_the_same_seed():
     robot = SimulatedIiwa(task.workcell(), lcm)
     context = robot.CreateDefaultContext()
     subscribe_part_offsets(lcm, task, robot, context)
-    randomize, rng = PartRandomizer(task, IiwaDriver(lcm), SEED), np.random.default_rng(7)
+    randomize = PartRandomizer(task, partial(publish_part_offsets, IiwaDriver(lcm)), SEED)
+    rng = np.random.default_rng(7)
     simulated = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
     simulated.offsets.draw(np.random.default_rng(SEED), validate_options(simulated.Reset, {}, "a reset"))
     others, jacks = np.random.default_rng(7), []

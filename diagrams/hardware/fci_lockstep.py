@@ -1,0 +1,149 @@
+"""Lockstep of a hardware station with a simulated Franka: each waits for the other, however slow the machine is.
+
+libfranka's protocol has no message with which a robot could be made to wait. The simulated robot therefore listens on a
+second port for requests, one JSON object a line, and answers each with its time [s]. ``{"advance": h}`` is answered
+when the robot's clock has advanced by h [s]; then the robot waits. ``{"parts": [fixture, workpiece]}`` moves the task's
+parts by their offsets.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.hardware.clock import ReceivingStation
+
+LOCKSTEP_PORT = 1339  # the robot's own ports are 1337 and 1338
+
+
+class FciLockstepClock:
+    """Clock that advances a hardware station in lockstep with a simulated Franka.
+
+    The station's time base advances with the robot's clock, so that delays of either process are no delays of a status.
+    A robot that does not answer is noticed by the station's watchdog: the time base then advances without statuses.
+    """
+
+    def __init__(self, host: str, timeout: float, period: float):
+        """Construct the clock.
+
+        Args:
+            host: Address of the simulated robot.
+            timeout: Longest wait for an answer [s of wall clock time].
+            period: Status period of the station [s].
+        """
+        self._address, self._timeout, self._period = (host, LOCKSTEP_PORT), timeout, period
+        self._socket: socket.socket | None = None
+        self._time, self._robot_time, self._has_timed_out = 0.0, np.inf, False
+
+    def begin(self) -> None:
+        """Prepare to advance a simulator that has just been initialized with the newest status."""
+        self._follow(0.0)
+
+    def advance(self, simulator: Simulator, station: ReceivingStation, steps: int) -> None:
+        """Advance the simulator by `steps` status periods."""
+        context = simulator.get_mutable_context()
+        start = context.get_time()
+        for step in range(steps):
+            self._follow(self._period)
+            simulator.AdvancePendingEvents()
+            station.receive(context, self._time)
+            simulator.AdvanceTo(start + (step + 1) * self._period)
+
+    def move_parts(self, offsets: list[list[float]]) -> None:
+        """Move the task's fixture and workpiece by their offsets, as `InsertionTask.part_offsets` defines them."""
+        self._request({"parts": offsets})
+
+    def _follow(self, seconds: float) -> None:
+        """Let the robot advance; advance the time base as much as the robot's clock, or without one by `seconds`."""
+        answer = self._request({"advance": seconds})
+        if answer is None or answer < self._robot_time:  # no robot, or another one
+            self._time += seconds
+        else:
+            self._time += answer - self._robot_time
+        self._robot_time = np.inf if answer is None else answer
+
+    def _request(self, message: dict[str, Any]) -> float | None:
+        """Return the robot's time after a request [s], or None if it does not answer."""
+        try:
+            if self._socket is None:
+                self._socket = socket.create_connection(self._address, self._timeout)
+            # The full timeout is waited only once for a silent robot, not in every step.
+            self._socket.settimeout(self._period if self._has_timed_out else self._timeout)
+            self._socket.sendall(json.dumps(message).encode() + b"\n")
+            answer = self._socket.recv(4096)
+            if not answer:
+                raise ConnectionError
+            self._has_timed_out = False
+            return float(json.loads(answer))
+        except OSError as error:
+            self._has_timed_out = isinstance(error, TimeoutError)
+            if self._socket is not None:
+                self._socket.close()
+            self._socket = None
+            return None
+
+
+class LockstepServer:
+    """The simulated robot's end of the connection, which never blocks."""
+
+    def __init__(self, host: str):
+        """Listen at the address `host`."""
+        self._listener = socket.create_server((host, LOCKSTEP_PORT))
+        self._listener.setblocking(False)
+        self._client: socket.socket | None = None
+        self._buffer = b""
+
+    @property
+    def is_connected(self) -> bool:
+        """True if a station is connected."""
+        return self._client is not None
+
+    @property
+    def socket(self) -> socket.socket:
+        """Socket to wait on: readable if there is a request or a new station."""
+        return self._client or self._listener
+
+    def receive(self) -> dict[str, Any] | None:
+        """Return the next request, or None if there is none."""
+        try:
+            if self._client is None:
+                self._client, _ = self._listener.accept()
+                self._client.setblocking(False)
+                self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._buffer = b""
+            received = self._client.recv(4096)
+            if not received:
+                raise ConnectionError
+            self._buffer += received
+        except BlockingIOError:
+            return None
+        except OSError:
+            self._disconnect()
+            return None
+        line, separator, rest = self._buffer.partition(b"\n")
+        if not separator:
+            return None
+        self._buffer = rest
+        return dict(json.loads(line))
+
+    def answer(self, time: float) -> None:
+        """Answer a request with the robot's time [s]."""
+        try:
+            if self._client is not None:
+                self._client.sendall(json.dumps(time).encode())
+        except OSError:
+            self._disconnect()
+
+    def _disconnect(self) -> None:
+        if self._client is not None:
+            self._client.close()
+        self._client = None
+
+    def close(self) -> None:
+        """Close both sockets."""
+        self._disconnect()
+        self._listener.close()

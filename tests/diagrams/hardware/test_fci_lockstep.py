@@ -1,0 +1,88 @@
+"""Lockstep of a station with a simulated Franka, whose end is a thread here; `make fci` tests the whole robot."""
+
+import socket
+import threading
+from contextlib import closing, contextmanager
+
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.primitives import ConstantVectorSource
+
+from guiderail.diagrams.hardware import fci_lockstep
+from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock, LockstepServer
+
+HOST, PERIOD = "127.0.0.1", 0.005
+
+
+class ClockRecorder:
+    def __init__(self):
+        self.clocks = []
+
+    def receive(self, context, clock=None):
+        self.clocks.append(clock)
+
+
+@pytest.fixture(autouse=True)
+def _free_port(monkeypatch):
+    with socket.create_server((HOST, 0)) as server:
+        monkeypatch.setattr(fci_lockstep, "LOCKSTEP_PORT", server.getsockname()[1])
+
+
+@contextmanager
+def robot(lead=0.0):
+    """Run a robot whose clock advances more than requested; yield the requests that it receives."""
+    requests, ended, time = [], threading.Event(), 7.0
+    with closing(LockstepServer(HOST)) as server:
+
+        def serve():
+            nonlocal time
+            while not ended.is_set():
+                if (request := server.receive()) is not None:
+                    requests.append(request)
+                    time += request.get("advance", 0.0) + lead
+                    server.answer(time)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield requests
+        finally:
+            ended.set()
+            thread.join()
+
+
+def test_time_base_of_the_station_is_the_clock_of_the_robot():
+    simulator, recorder = Simulator(ConstantVectorSource([0.0])), ClockRecorder()
+    with robot(lead=0.001) as requests:
+        clock = FciLockstepClock(HOST, 5.0, PERIOD)
+        clock.begin()
+        clock.advance(simulator, recorder, 3)
+    assert simulator.get_context().get_time() == pytest.approx(3 * PERIOD)
+    assert recorder.clocks == pytest.approx([0.006, 0.012, 0.018])
+    assert [request["advance"] for request in requests] == [0.0, PERIOD, PERIOD, PERIOD]
+
+
+def test_offsets_of_parts_arrive_at_the_robot():
+    with robot() as requests:
+        FciLockstepClock(HOST, 5.0, PERIOD).move_parts([[1e-3, 2e-3], [0.0, 0.0]])
+    assert requests == [{"parts": [[1e-3, 2e-3], [0.0, 0.0]]}]
+
+
+def test_time_base_advances_without_a_robot_and_follows_a_new_one():
+    simulator, recorder = Simulator(ConstantVectorSource([0.0])), ClockRecorder()
+    clock = FciLockstepClock(HOST, 5.0, PERIOD)
+    clock.begin()
+    clock.advance(simulator, recorder, 2)
+    for _ in range(2):  # the clock of the second robot begins again
+        with robot(lead=0.001):
+            clock.begin()
+            clock.advance(simulator, recorder, 2)
+    assert recorder.clocks == pytest.approx([0.005, 0.01, 0.016, 0.022, 0.027, 0.033])
+
+
+def test_silent_robot_is_waited_for_once():
+    simulator, recorder = Simulator(ConstantVectorSource([0.0])), ClockRecorder()
+    with closing(LockstepServer(HOST)):
+        clock = FciLockstepClock(HOST, 0.01, PERIOD)
+        clock.advance(simulator, recorder, 3)
+    assert recorder.clocks == pytest.approx([PERIOD, 2 * PERIOD, 3 * PERIOD])
