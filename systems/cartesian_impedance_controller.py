@@ -42,7 +42,7 @@ class ImpedanceGains:
 
     def __post_init__(self) -> None:
         K = np.asarray(self.stiffness, dtype=float)
-        is_symmetric = K.shape == (6, 6) and np.isfinite(K).all() and np.allclose(K, K.T)
+        is_symmetric = K.shape == (6, 6) and np.allclose(K, K.T)
         if not is_symmetric or not (np.abs(K) <= MAX_STIFFNESS).all() or not (np.linalg.eigvalsh(K) > 0.0).all():
             raise InputError(
                 f"a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix, at most {MAX_STIFFNESS:g}"

@@ -18,7 +18,7 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 LIGHT, HEAVY = 300.0, 3000.0
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
 _ROUNDING = 1e-9  # largest change of a wrench by a bound that is no saturation [N, Nm]
-_SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+_SCALE = np.repeat([1.0, LEVER], 3)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
 def _root_of_inverse(Lambda_inverse: np.ndarray) -> np.ndarray:
     """Compute the inverse (6, 6) of the lower triangular factor R of Λ⁻¹ = R Rᵀ; then Λ = R⁻ᵀ R⁻¹."""
     # LAPACK is called directly: NumPy's overhead exceeds the computation for matrices of six rows.
-    R, failed = lapack.dpotrf(Lambda_inverse, lower=1, clean=1)
+    R, failed = lapack.dpotrf(Lambda_inverse, lower=1)
     if failed:
         raise np.linalg.LinAlgError("the inertia at the tool is not positive definite")
     return lapack.dtrtri(R, lower=1)[0]

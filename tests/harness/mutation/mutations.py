@@ -63,7 +63,8 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
     elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
         yield _with(node, op=ARITHMETIC[type(node.op)]())
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
-        yield _with(node, left=node.right, right=node.left)
+        if ast.unparse(node.left) != ast.unparse(node.right):
+            yield _with(node, left=node.right, right=node.left)
     elif isinstance(node, ast.AugAssign):
         if type(node.op) in ARITHMETIC:
             yield _with(node, op=ARITHMETIC[type(node.op)]())

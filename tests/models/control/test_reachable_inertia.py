@@ -36,6 +36,15 @@ def test_reachable_inertia_falls_smoothly_with_the_mass():
     assert np.abs(np.diff(shares)).max() < 0.03
 
 
+@pytest.mark.parametrize("axis", range(6))
+def test_reachable_inertia_halves_a_mass_in_the_middle(axis):
+    """In the middle between both masses on a logarithmic scale; rotational ones are converted by the lever."""
+    masses = np.ones(6)
+    masses[axis] = np.sqrt(LIGHT * HEAVY)
+    inertia = reachable_inertia(np.diag(1.0 / (masses * SCALE**2)))
+    np.testing.assert_allclose(np.diag(inertia)[axis], 0.5 * masses[axis] * SCALE[axis] ** 2, rtol=1e-6)
+
+
 def law(J, posture_torque, M=None):
     n = J.shape[1]
     return impedance_torques(
@@ -70,6 +79,11 @@ def test_posture_torque_acts_in_the_singular_direction():
     lost = W[:, 5]
     torque = law(J, 3.0 * lost + W[:, 0])
     np.testing.assert_allclose(torque, 3.0 * lost, atol=1e-6)
+
+
+def test_posture_torque_acts_on_a_heavy_rotation():
+    M = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, HEAVY * LEVER**2])
+    np.testing.assert_allclose(law(np.eye(6), np.ones(6), M), [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], atol=1e-6)
 
 
 def test_posture_torque_acts_before_the_arm_is_singular():
