@@ -410,6 +410,7 @@ def test_damping_gives_every_mode_its_damping_ratio():
         {"posture": np.full(7, np.nan)},
         {"posture": np.array([0.0] * 6 + [np.inf])},
         {"stiffness": np.eye(6) + np.eye(6, k=1)},
+        *({"stiffness": np.where(np.eye(6) > 0.0, 1.0, entry)} for entry in (-1e300, -np.inf, np.inf, -1.0)),
         {"stiffness": np.diag([1.0, 1, 1, 1, 1, 0])},
         {"stiffness": np.diag([1.0005e8, 1, 1, 1, 1, 1])},
         {"wrench_limits": np.ones(5)},
