@@ -215,7 +215,7 @@ class CartesianImpedanceController(LeafSystem):
     def _bound(self, context: Context) -> WrenchBound | None:
         if not self._max_wrench_port.HasValue(context):
             return self._gains.bound
-        bound = self._gains.bound or WrenchBound(np.asarray(self._gains.wrench_limits), np.inf, np.inf)
+        bound = self._gains.bound or WrenchBound(self._gains.wrench_limits, np.inf, np.inf)
         return bound.lowered_to(self._max_wrench_port.Eval(context))
 
     def _gravity_torque(self, plant_context: Context) -> np.ndarray:
