@@ -124,7 +124,7 @@ def test_velocity_is_predicted_from_the_torque(plant):
     M, drag = rig.dynamics.evaluate(rig.plant_context)
     rig.port.GetMutableData().set_value(object())
     expected = np.array([0.1, 0.2]) + PERIOD * np.linalg.solve(M, [1.0, -0.5] - drag)
-    np.testing.assert_allclose(rig["velocity"], expected, rtol=1e-3)
+    np.testing.assert_allclose(rig["velocity"], expected, rtol=1e-6)
 
 
 def test_dynamics_are_those_of_the_plant(plant):
