@@ -232,6 +232,16 @@ def test_monitor_stops_the_arm_when_two_programs_command(arm, torque, clock):
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
 
 
+def test_monitor_repeats_its_torque_twice_between_checks(arm):
+    bus = Bus(arm).watch()
+    bus.go(MAX_MISSED_MESSAGES + 1)
+    bus.commands.clear()
+    for torque in (1.0, 2.0, 3.0, 4.0):
+        bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.full(7, torque), bus.now))
+        bus.settle()
+    assert len(bus.commands) == 4 + 2
+
+
 def test_two_monitors_stop_the_arm_and_go_on(arm):
     """Each one repeats its torque after a command, but not after the other one's without end."""
     bus = Bus(arm)
