@@ -25,6 +25,8 @@ from guiderail.tools.files import (
     write_atomically,
 )
 
+UNIT_RATIO = 20.0  # demonstrations of one motion differ by less in size; mm instead of m is 1000, cm 100
+
 
 def fit_bounds(
     file: Path,
@@ -183,7 +185,20 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         "widest": spread.max(axis=0).round(6).tolist(),
     }
     summary |= {} if draw is None else {"picture": str(draw)}
-    return summary | (fit_primitive(demonstrations) if fit else _default_deviation(common))
+    summary |= fit_primitive(demonstrations) if fit else _default_deviation(common)
+    remarks = [*_other_units(outputs), *([summary["remark"]] if "remark" in summary else [])]
+    return summary | ({"remark": "; ".join(remarks)} if remarks else {})
+
+
+def _other_units(outputs: np.ndarray) -> list[str]:
+    """Return a sentence for each demonstration (M, N, O) that is `UNIT_RATIO` times as long or short as the median."""
+    lengths = np.linalg.norm(np.ptp(outputs, axis=1), axis=1)
+    median = float(np.median(lengths))
+    return [
+        f"demonstration {index} extends over {length:.3g} and the median one over {median:.3g}: check its unit"
+        for index, length in enumerate(lengths)
+        if max(length, median) > UNIT_RATIO * min(length, median)
+    ]
 
 
 def _default_deviation(common: Demonstrations) -> dict[str, Any]:

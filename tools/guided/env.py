@@ -112,6 +112,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.action_repeat, self._observe = int(action_repeat), tuple(observe)
         self._pose, self._to_action = pose, to_action
         self._command: GuideCommand | None = None
+        self._observation: Any = None
         self.action_space = Box(-1.0, 1.0, (self.guide.num_actions,), np.float32)
         self.observation_space = self._extended_space(env.observation_space)
 
@@ -133,8 +134,11 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Begin an action; step several environments together with `request`, `advance` and `end_action`.
 
         Raises:
-            InputError: If the action is not (A,) finite numbers.
+            InputError: If the action is not (A,) finite numbers; one outside [−1, 1] is clipped.
+            ResetNeeded: If no episode has begun.
         """
+        if self._observation is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset() first")
         checked = as_numbers(action, "an action")
         if checked.shape != (self.guide.num_actions,) or not np.isfinite(checked).all():
             raise InputError(f"an action must be {self.guide.num_actions} finite numbers, not {brief(action)}")

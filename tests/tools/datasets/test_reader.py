@@ -49,6 +49,16 @@ def test_byte_order_mark_is_not_part_of_the_first_name(tmp_path):
     assert load_demonstrations(tmp_path / "marked.csv").num_demonstrations == 2
 
 
+def test_validate_names_the_demonstration_in_another_unit(tmp_path):
+    t = np.linspace(0.0, 2.0, 50)
+    for index, unit in enumerate((1.0, 1000.0, 1.0)):  # the second one in mm
+        rows = unit * np.column_stack([t, np.sin(t) + 0.01 * index])
+        np.savetxt(tmp_path / f"{index}.csv", np.column_stack([t, rows]), delimiter=",", header="time,x,y", comments="")
+    assert "demonstration 1 extends over 2.24e+03 and the median" in validate_demonstrations(tmp_path)["remark"]
+    (tmp_path / "1.csv").unlink()
+    assert "extends over" not in validate_demonstrations(tmp_path).get("remark", "")
+
+
 @pytest.mark.parametrize("read", [validate_demonstrations, load_demonstrations, fit_bounds])
 @pytest.mark.parametrize("ending", ["", ".csv", ".npz"])
 def test_readers_refuse_a_name_that_is_too_long(read, ending, tmp_path):

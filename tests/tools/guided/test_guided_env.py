@@ -368,3 +368,9 @@ def test_constraints_of_the_motion_need_a_period():
     with pytest.raises(InputError, match="period"):
         env.reset(seed=0)
     guided(demonstrations=[segment], constraints=None, frame=None).reset(seed=0)
+
+
+def test_step_needs_a_reset():
+    env = GuidedEnv(PointEnv(), demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        env.step(np.zeros(env.action_space.shape))
