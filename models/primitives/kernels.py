@@ -54,14 +54,23 @@ def make_kernel(
         parameters: Further parameters of the kernel by name.
 
     Raises:
-        InputError: If there is no such kernel, a parameter is not one of the kernel's, or a value is out of range.
+        InputError: If there is no such kernel, a parameter is missing or not one of the kernel's, or a value is
+                out of range.
     """
     factory = KERNELS.get(name)
     parameters = parameters or {}
-    accepted = [key for key in inspect.signature(factory).parameters if key != "length_scale"]
+    signature = inspect.signature(factory)
+    accepted = [key for key in signature.parameters if key != "length_scale"]
     for key in parameters:
         if key not in accepted:
             raise InputError(f"the kernel {name!r} has no parameter {brief(key)}: {did_you_mean(key, accepted)}")
+    try:
+        signature.bind(length_scale=length_scale, **parameters)
+    except TypeError as error:
+        raise InputError(
+            f"the kernel {name!r} can't be made of length_scale and parameters ({error}): register a class with the "
+            "argument length_scale, whose instances take two arrays of inputs"
+        ) from error
     return _build(factory, length_scale, tuple(sorted(parameters.items())))
 
 

@@ -52,6 +52,12 @@ def test_environment_uses_the_thesis_kernel_by_default():
     assert primitive().kernel == SquaredExponential(0.5)
 
 
+def test_kernel_that_is_a_plain_function_is_refused():
+    register_kernel("lab_function", lambda a, b: np.subtract.outer(a, b))
+    with pytest.raises(InputError, match=r"'lab_function' can't be made of length_scale.*: register a class"):
+        primitive(kernel="lab_function")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
