@@ -12,6 +12,7 @@ import sys
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.hardware.fci import FciDriver
 from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import Impedance
@@ -30,14 +31,13 @@ PRESSED = -0.006  # commanded height while the plug is turned [m]
 class SimulatedRun:
     """Hardware station on the simulated robot."""
 
-    def __init__(self) -> None:
+    def __init__(self, driver: type[FciDriver] = FciDriver):
         self.host = f"127.0.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
         self.station = HardwareStation(
             BncWorkcell(),
-            "fci",
+            driver(self.host),
             Impedance().with_max_force(FORCE_LIMIT),
             robot="panda",
-            robot_url=self.host,
             robot_timeout=60.0,
         )
         self.simulator = Simulator(self.station)
