@@ -1,14 +1,13 @@
 """Command lines of the research programs, `python -m research.NAME`."""
 
 import argparse
-import json
-import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 from guiderail.models.common.errors import InputError, RunsFailedError
+from guiderail.tools.cli.app import to_json
 
 
 class Parser(argparse.ArgumentParser):
@@ -56,26 +55,6 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print one JSON object")
 
 
-def environment_options(pairs: Iterable[str] | None) -> dict[str, Any]:
-    """Parse `--env` options, each value as YAML.
-
-    Args:
-        pairs: `key=value` texts.
-
-    Raises:
-        InputError: If a text has no equals sign.
-    """
-    from guiderail.tools.environments import as_value  # imports Drake, which takes a second
-
-    options = {}
-    for pair in pairs or ():
-        key, separator, value = pair.partition("=")
-        if not separator:
-            raise InputError(f"--env takes key=value, such as station=arm, not {pair!r}")
-        options[key.strip()] = as_value(value.strip())
-    return options
-
-
 def find_task(task: str, imports: Iterable[str]) -> tuple[str, tuple[str, ...]]:
     """Return the name of a task and the modules that register it.
 
@@ -97,21 +76,13 @@ def find_task(task: str, imports: Iterable[str]) -> tuple[str, tuple[str, ...]]:
 def print_result(result: Mapping[str, Any], *, as_json: bool = False) -> None:
     """Print a result, one line a key, or as one JSON object in which infinity and NaN are null."""
     if as_json:
-        print(json.dumps(_finite(result), allow_nan=False, default=str))
+        print(to_json(result))
         return
     from guiderail.tools.tables import cell
 
     width = max(map(len, result), default=0)
     for key, value in result.items():
         print(f"{key.replace('_', ' '):<{width}}  {cell(value)}")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def run_program(main: Callable[[list[str]], int | None], arguments: list[str] | None = None) -> NoReturn:

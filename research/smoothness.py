@@ -48,12 +48,12 @@ def log_dimensionless_jerk(positions: np.ndarray, period: float) -> float:
     positions = np.asarray(positions, dtype=float)
     if len(positions) < 4:
         return -np.inf
-    jerk = np.diff(positions, 3, axis=0) / period**3
+    jerks = np.diff(positions, 3, axis=0) / period**3
     peak = np.max(np.linalg.norm(np.diff(positions, axis=0), axis=1)) / period
     duration = (len(positions) - 1) * period
     if not peak > 0:
         return -np.inf
-    return float(-np.log(duration**3 / peak**2 * np.sum(jerk**2) * period))
+    return float(-np.log(duration**3 / peak**2 * np.sum(jerks**2) * period))
 
 
 def spectral_arc_length(
@@ -230,17 +230,17 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
         return {}
     # The primitive of the environment at an action scale of 1.
     histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
-    skill = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
-    assert skill is not None
+    config = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
+    assert config is not None
     indices = np.array(action_dims)
     if method.guidance == "residual":  # one gain for all outputs of a unit; their deviations differ
-        reached = RMS * (skill.residual_gains() / deviation(skill.reference))[indices]
+        reached = RMS * (config.residual_gains() / deviation(config.reference))[indices]
         return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
-    primitive = skill.primitive(history=method.guidance == "skgrl")
+    primitive = config.primitive(history=method.guidance == "skgrl")
     if not method.environment.get("adaptive_history"):
         return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
     # One action scale sets the gains of every length of an adaptive history. In free space it has its full length.
-    reached = exploration_rms(primitive, skill.null_space_gains(primitive), method.action_repeat)[indices]
+    reached = exploration_rms(primitive, config.null_space_gains(primitive), method.action_repeat)[indices]
     return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
 
 

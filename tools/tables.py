@@ -92,7 +92,7 @@ def write_table(path: Path, rows: Rows) -> Path:
     table = pd.DataFrame(rows, dtype=object)
     write_atomically(path.with_suffix(".csv"), table_text(table).encode())
     lines = [[name.replace("_", " ") for name in table], ["---"] * len(table.columns)]
-    lines += [[cell(value) for value in row] for row in table.itertuples(index=False)]
+    lines += [[cell(value).replace("|", "\\|") for value in row] for row in table.itertuples(index=False)]
     write_atomically(path.with_suffix(".md"), "".join(f"| {' | '.join(line)} |\n" for line in lines).encode())
     return path.with_suffix(".md")
 

@@ -77,7 +77,7 @@ class DrivenStation:
         return self.recorder.recording(recorder_context)
 
 
-def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
+def linear_motion(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
     """Return a source of straight lines between `poses` (N, 6) at `times` (N,) [s]; the last pose is held."""
     return TrajectorySource(PiecewisePolynomial.FirstOrderHold(np.asarray(times), np.asarray(poses).T))
 
@@ -90,7 +90,7 @@ def drive_along(
     `prepare` is called with the plant and its context before the start.
     """
     times, poses = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
-    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     if prepare is not None:
         prepare(station.plant, driven.plant_context)
     driven.start(poses[0])

@@ -4,9 +4,9 @@ import json
 import sys
 from pathlib import Path
 
-from research.action_fuzzing import ALL, CAMPAIGNS
-from research.action_fuzzing.campaign import fuzz
-from research.command import Parser, environment_options, find_task, run_program
+from guiderail.tools.cli.app import parse_environment
+from research.action_fuzzing.tasks import ALL, CAMPAIGNS, fuzz
+from research.command import Parser, find_task, run_program
 
 
 def main(arguments: list[str]) -> int:
@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> int:
         steps=args.steps,
         seed=args.seed,
         out=args.out,
-        environment=environment_options(args.env),
+        environment=parse_environment(args.env),
         report=lambda line: print(line, file=sys.stderr, flush=True),
     )
     print(json.dumps(result, indent=None if args.json else 2))

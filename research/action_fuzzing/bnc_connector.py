@@ -1,6 +1,6 @@
 """Fuzzing of the connector: random, repeated and saturated actions in x and y, and in all six outputs.
 
-Residual learning is not constrained; it checks the simulation.
+Residual learning is not constrained: its episodes check the simulation.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ LIMITS = {
 
 
 class Penetration(EnvCallback):
-    """Penetration depths of jack and plug at the end of each control step [mm]."""
+    """Callback that records the penetration depths of jack and plug [mm] at the end of each control step."""
 
     def on_episode_start(self) -> None:
         """Start with no depths."""

@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselineFactory
 from guiderail.tools.evaluation.metrics import TOLERANCE
@@ -26,7 +23,6 @@ from guiderail.tools.evaluation.rollout import Callback, EnvCallback, Transition
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import read_table, table_text
-from research.action_fuzzing import ALL, CAMPAIGNS
 from research.action_fuzzing.recompute import Frames, RecomputedViolation, nominal_frames
 
 # Columns of an episode's row that the table of a campaign has.
@@ -38,7 +34,7 @@ ACTIONS = {name: BASELINES[name] for name in ("uniform_random", "random_hold", "
 
 
 class NonFiniteCounter(EnvCallback):
-    """Number of NaN and infinite values of an episode."""
+    """Callback that counts the NaN and infinite values of an episode."""
 
     def on_episode_start(self) -> None:
         """Reset the count."""
@@ -229,102 +225,3 @@ def find_failures(result: Mapping[str, Any], limits: Mapping[str, float]) -> lis
     if not result["disagreement"] <= TOLERANCE:
         failures.append("reported and recomputed violations differ")
     return failures + [f"{name} beyond {limit:g}" for name, limit in limits.items() if not result[name] <= limit]
-
-
-def fuzz(
-    task: str,
-    *,
-    episodes: int | None = None,
-    steps: int | None = None,
-    seed: int = 0,
-    out: Path | None = None,
-    environment: Mapping[str, Any] | None = None,
-    report: Callable[[str], None] | None = None,
-) -> dict[str, Any]:
-    """Fuzz a task, or all tasks, for a number of episodes or control steps.
-
-    Args:
-        task: Name of a task; one without a campaign is fuzzed as in `own_task`. "all": each of `CAMPAIGNS` gets the
-            same number of control steps.
-        episodes: Number of episodes of one task, 1000 by default.
-        steps: Number of control steps, instead.
-        seed: Seed of the first episode of each task.
-        out: Table of one task; with "all", a folder with a table of each task and a folder with every control step.
-            Episodes in it are not run again.
-        environment: Options that every case has besides its own.
-        report: Called with a line of text after every round.
-
-    Returns:
-        The entries `cases`, `all` and `failures`; with "all", the entries `tasks`, `control_steps` and `failures`.
-
-    Raises:
-        InputError: For an unknown task, or a number out of range.
-    """
-    if (episodes is not None and episodes < 1) or (steps is not None and steps < 1) or seed < 0:
-        raise InputError("a campaign has at least one episode or control step, and a seed from 0")
-    if task == ALL:
-        if steps is None or episodes is not None or environment:
-            raise InputError("all tasks are fuzzed for a number of control steps, without --env: give --steps")
-        if out is not None and out.suffix == ".csv":
-            raise InputError(f"all tasks need a folder, not the table {out}: name a folder with --out")
-        return _fuzz_all(-(-steps // len(CAMPAIGNS)), seed=seed, out=out, report=report)
-    if task not in CAMPAIGNS and task not in TASKS.names():
-        remedy = did_you_mean(task, {*CAMPAIGNS, *TASKS.names(), ALL})
-        raise InputError(
-            f"there is no task {brief(task)} to fuzz: {remedy}"
-            + ("" if remedy.endswith("?") else ", or --import the file that registers it")
-        )
-    return _fuzz(task, 1000 if episodes is None else episodes, steps, seed, out, None, environment, report)
-
-
-def _fuzz_all(steps: int, *, seed: int, out: Path | None, report: Callable[[str], None] | None) -> dict[str, Any]:
-    results = {}
-    for task in CAMPAIGNS:
-        table, step_log = (None, None) if out is None else (out / f"{task}.csv", out / "steps" / task)
-        report_task = None if report is None else _with_prefix(report, task)
-        results[task] = _fuzz(task, 0, steps, seed, table, step_log, None, report_task)
-    return {
-        "tasks": results,
-        "control_steps": sum(result["all"]["control_steps"] for result in results.values()),
-        "max_commanded_violation": max(result["all"]["max_commanded_violation"] for result in results.values()),
-        "disagreement": max(result["all"]["disagreement"] for result in results.values()),
-        "failures": [f"{task}: {failure}" for task, result in results.items() for failure in result["failures"]],
-    }
-
-
-def _with_prefix(report: Callable[[str], None], task: str) -> Callable[[str], None]:
-    return lambda line: report(f"{task}: {line}")
-
-
-def _fuzz(
-    task: str,
-    episodes: int,
-    steps: int | None,
-    seed: int,
-    out: Path | None,
-    step_log: Path | None,
-    environment: Mapping[str, Any] | None,
-    report: Callable[[str], None] | None,
-) -> dict[str, Any]:
-    if task in CAMPAIGNS:
-        campaign = import_module(f"research.action_fuzzing.{CAMPAIGNS[task]}").campaign()
-    else:
-        from research.action_fuzzing.own_task import campaign_of
-
-        campaign = campaign_of(task)
-
-    def is_done(rows: list[dict[str, Any]]) -> bool:
-        if steps is not None:
-            return sum(row["steps"] for row in rows) >= steps
-        return len(rows) >= episodes
-
-    rows = run_campaign(
-        campaign, is_done, seed=seed, out=out, step_log=step_log, environment=environment, report=report
-    )
-    cases, failures = {}, []
-    for case in campaign.cases:
-        if of_case := [row for row in rows if row["case"] == case.name]:
-            cases[case.name] = outcome(of_case)
-            limits = campaign.limits if case.limits is None else case.limits
-            failures += [f"{case.name}: {failure}" for failure in find_failures(cases[case.name], limits)]
-    return {"cases": cases, "all": outcome(rows), "failures": failures}

@@ -19,7 +19,7 @@ from research.action_fuzzing.campaign import Campaign, Case
 
 
 class EarlyTilt(EnvCallback):
-    """Largest commanded tilt [rad] while the template is in its first state, in which the thermos is upright."""
+    """Callback that adds the largest commanded tilt in the template's first state, which keeps the thermos upright."""
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return `early_tilt` [rad] over all control steps; 0 if the template was never in its first state."""
@@ -44,7 +44,7 @@ def noisy_pour(rng: np.random.Generator, spread: float = 1.5) -> PolicyFn:
 
 
 def random_walk(rng: np.random.Generator) -> PolicyFn:
-    """Return full inputs that change now and then: they reach every corner of the workspace."""
+    """Return full inputs that change with a probability of 0.1 per action: they reach every corner of the workspace."""
     action = np.sign(rng.normal(size=3))
 
     def act(observation: np.ndarray) -> np.ndarray:

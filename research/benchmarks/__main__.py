@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from guiderail.tools.cli.app import parse_environment
 from research.benchmarks import BENCHMARKS, run_benchmark
-from research.command import Parser, environment_options, find_task, print_result, run_program
+from research.command import Parser, find_task, print_result, run_program
 
 
 def main(arguments: list[str]) -> None:
@@ -16,7 +17,7 @@ def main(arguments: list[str]) -> None:
     parser.add_json()
     args = parser.parse_args(arguments)
     task, modules = (None, ()) if args.task is None else find_task(args.task, args.imports)
-    options = {"task": task, "environment": environment_options(args.env), "imports": modules}
+    options = {"task": task, "environment": parse_environment(args.env), "imports": modules}
     results, show = run_benchmark(args.name, picture=args.picture, **options)
     if args.json:
         print_result(results, as_json=True)

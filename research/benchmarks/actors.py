@@ -92,7 +92,7 @@ def _time_of_children() -> float:
 
 @contextmanager
 def _cores(number: int) -> Iterator[None]:
-    """Let this process and its forks use at most so many cores."""
+    """Let this process and its forks use at most `number` cores."""
     own = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(own)[:number])
     try:

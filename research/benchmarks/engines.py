@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
+from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear_motion
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD
@@ -90,7 +90,7 @@ def even_lever(d: BncDimensions, offset: float) -> float:
 def _profile(task: str, station: str) -> dict[str, Any]:
     workcell, times, motion, _ = scripted_motion(task)
     driven = DrivenStation(
-        STATIONS.get(station).build(workcell), along(times, motion), round(times[-1] / CONTROL_PERIOD)
+        STATIONS.get(station).build(workcell), linear_motion(times, motion), round(times[-1] / CONTROL_PERIOD)
     )
     driven.start(motion[0])
     begin = time.process_time()
@@ -142,7 +142,7 @@ def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1
     motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
     station = STATIONS.get(name).build(workcell)
     times = np.array([0.0, 0.6, 1.4])
-    driven = DrivenStation(station, along(times, motion), round(times[-1] / CONTROL_PERIOD))
+    driven = DrivenStation(station, linear_motion(times, motion), round(times[-1] / CONTROL_PERIOD))
     workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
     if modulus != 1.0:
         station.set_contact(driven.context, 1.0, modulus)

@@ -15,7 +15,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
@@ -68,7 +68,7 @@ def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarra
     """Simulate a scripted insertion with a time step [s]; return its row and the plug's poses, (n, 6)."""
     workcell, (times, poses) = BncWorkcell(), insert_and_lock()
     station = GantryStation(workcell, time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
-    driven = DrivenStation(station, along(times, poses), round(times[-1] / CONTROL_PERIOD))
+    driven = DrivenStation(station, linear_motion(times, poses), round(times[-1] / CONTROL_PERIOD))
     driven.start(poses[0])
     begin = time.process_time()
     recording = driven.run()

@@ -83,11 +83,11 @@ def _policy(observations: int, actions: int) -> Policy:
 def _parts() -> list[Row]:
     number = round(SECONDS / PERIOD)
     policy, observation = _policy(13, 2), np.zeros(13, np.float32)
-    skill = make_prior_knowledge(TASK, guidance="skgrl").demonstrations
-    assert skill is not None
+    config = make_prior_knowledge(TASK, guidance="skgrl").demonstrations
+    assert config is not None
     rows = [_row("policy", HOLD * CONTROL_PERIOD, _timed(lambda index: policy(observation), number))]
     rng = np.random.default_rng(0)
-    primitive = skill.primitive(history=True)
+    primitive = config.primitive(history=True)
     history = np.tile(primitive.reference.means[0], (primitive.history, 1))
     actions = rng.uniform(-1e-4, 1e-4, (number, primitive.num_outputs))
     steps = primitive.num_steps - 1

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
@@ -116,7 +116,7 @@ def _one_run(name: str) -> dict[str, float]:
     workcell, times, poses, contact = scripted_motion(REQUIRED_FACTOR[name][0])
     with timed_callbacks() as spent:
         station = STATIONS.get(name if name in STATIONS.names() else "gantry").build(workcell)
-        driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
+        driven = DrivenStation(station, linear_motion(times, poses), num_samples=NUM_STEPS)
         driven.start(poses[0])
         first, last = (round(t / CONTROL_PERIOD) for t in contact)
         driven.run(first)

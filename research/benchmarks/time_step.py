@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
@@ -38,7 +38,7 @@ def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], floa
     task, offset = MOTIONS[motion]
     workcell, times, poses, _ = scripted_motion(task)
     station = GantryStation(workcell, time_step=time_step)
-    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     if isinstance(workcell, BncWorkcell):
         workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform(np.array(offset)))
     driven.start(poses[0])

@@ -48,9 +48,9 @@ PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10
 
 def primitive_of(kind: str, variance: float = THESIS_VARIANCE) -> LcNsKmp:
     """Return the primitive of the narrow passage, with a history for sKGRL."""
-    skill = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
-    assert skill is not None
-    return skill.primitive(history=kind == "skgrl")
+    config = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
+    assert config is not None
+    return config.primitive(history=kind == "skgrl")
 
 
 def figure_5_2(out: Path) -> dict[str, Any]:

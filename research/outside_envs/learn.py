@@ -24,9 +24,9 @@ from research.outside_envs.task import OutsideTask
 
 TASKS = ("peg", "assembly", "nut")
 METHODS = ("kgrl", "skgrl", "residual", "clipped_residual", "tqc", "rlpd")  # the last two are without guidance
-TOLERANCE = 1e-9  # of a constraint [unit of the output]
+TOLERANCE = 1e-9  # largest violation of a constraint that is not counted [unit of the output]
 HELD_OUT_SEED = 10_000
-SELECTION_SEED = 5_000  # of the episodes that select the best constant action
+SELECTION_SEED = 5_000  # seed of the episodes that select the best constant action
 NUM_DEMONSTRATIONS = 10
 LEARNING_STARTS = 120  # transitions with random actions
 # Gradient steps per transition, with guidance and without. A bare environment has four times as many transitions.
@@ -186,7 +186,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=(*TASKS, "table"))
     parser.add_argument("--method", default="kgrl", choices=(*METHODS, "baselines"))
-    parser.add_argument("--guidance", default="kgrl", choices=METHODS[:4], help="of the baselines")
+    parser.add_argument("--guidance", default="kgrl", choices=METHODS[:4], help="guidance of the baselines")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)

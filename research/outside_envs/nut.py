@@ -22,7 +22,7 @@ PERIOD = 0.05  # duration of a step [s]
 STEP, TURN = 0.05, 0.5  # displacement and rotation of an action of 1 [m, rad]
 OFFSETS = (0.01, 0.02)  # distance of the assumed peg from the true one in y, on either side [m]
 HANDLE = 0.054  # distance of the handle from the nut's center [m]
-MAX_YAW = np.radians(110.0)  # of the gripper, because of the range of the last joint
+MAX_YAW = np.radians(110.0)  # largest yaw of the gripper [rad], because of the range of the last joint
 MAX_LAG = 0.03  # height of the gripper above its command at which the first attempt ends: the nut lies on the peg [m]
 LONGEST = 170  # steps of a recording
 OPEN, CLOSED = -1.0, 1.0
@@ -107,11 +107,11 @@ class HiddenPeg(gymnasium.Env):
         """Step the environment and measure success and force."""
         action = np.clip(action, -1.0, 1.0)
         self.commanded = self.measured() + np.append(STEP * action[:3], TURN * action[5])
-        _, theirs, _, _ = self._sim_env.step(action)
+        _, package_reward, _, _ = self._sim_env.step(action)
         self.steps += 1
         self.is_success = success = bool(self._sim_env._check_success())
         self._peak_force = max(self._peak_force, self._force())
-        reward = SUCCESS_REWARD if success else REWARD_SCALE * (min(float(theirs), 1.0) - 1.0)
+        reward = SUCCESS_REWARD if success else REWARD_SCALE * (min(float(package_reward), 1.0) - 1.0)
         info = {"is_success": success, "peak_force": self._peak_force, "side": self.side}
         return self.observe(), reward, success, self.steps >= self.length and not success, info
 
@@ -214,8 +214,8 @@ class Script:
         ("true_goal", 1.02, CLOSED, 4),
         ("true_goal", 0.85, CLOSED, 8),
     )
-    SPEED, TURN_RATE = 0.018, 0.12  # of the waypoint that is followed [m, rad per step]
-    TOLERANCE, ANGLE_TOLERANCE = 0.012, 0.05  # at which a waypoint is reached [m, rad]
+    SPEED, TURN_RATE = 0.018, 0.12  # speed of the command between waypoints [m/step, rad/step]
+    TOLERANCE, ANGLE_TOLERANCE = 0.012, 0.05  # largest errors at which a waypoint is reached [m, rad]
 
     def __init__(self) -> None:
         self.index = 0

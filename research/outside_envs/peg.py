@@ -22,7 +22,7 @@ from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 OFFSETS = (0.025, 0.05)  # distance of the assumed hole from the true one in y, on either side [m]
 HEIGHT_OFFSET = 0.015  # largest distance in z [m]
 MAX_LAG = 0.035  # lag of the hand behind its command at which the first attempt ends: it presses on the box [m]
-MIN_HEIGHT = 0.045  # of the hand above the table [m]
+MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table [m]
 
 
 def is_blocked(env: Any, observation: Any) -> bool:
@@ -52,7 +52,7 @@ class _Env(SawyerPegInsertionSideEnvV3):
 
 
 class HiddenHole(HiddenGoal):
-    """Environment whose success is 5 cm inside of the hole: metaworld's own, a radius of 7 cm, counts the mouth."""
+    """Environment that requires a depth of 5 cm; metaworld requires 7 cm from the goal, which the mouth satisfies."""
 
     def __init__(self, seed: int = 0, length: int = LENGTH):
         super().__init__(_Env(), seed, length, OFFSETS, HEIGHT_OFFSET, "box", 5.0)

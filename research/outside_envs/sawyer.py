@@ -14,7 +14,7 @@ from research.outside_envs.task import REWARD_SCALE, SUCCESS_REWARD, Recording
 warnings.filterwarnings("ignore", message="Constant")  # a constant of metaworld's scripted policies
 PERIOD = 0.0125  # duration of a step of metaworld [s]
 OPEN, CLOSED = -1.0, 0.6  # gripper's effort
-MIN_SAMPLES = 4  # of each recorded part
+MIN_SAMPLES = 4  # smallest number of samples of a recorded part
 
 
 def close_at_end(phase: float, is_held: bool) -> float:
@@ -23,7 +23,7 @@ def close_at_end(phase: float, is_held: bool) -> float:
 
 
 class HiddenGoal(gymnasium.Wrapper):
-    """Environment of metaworld with an observation, a reward and a success of its own.
+    """Environment of metaworld with another observation, reward and criterion of success.
 
     The observation has the assumed position of the goal, which lies left or right of the true one; the reward is
     metaworld's (privileged), scaled to be negative before success.
@@ -35,7 +35,7 @@ class HiddenGoal(gymnasium.Wrapper):
         offsets: Least and largest distance of the assumed goal from the true one in y, on either side [m].
         height_offset: Largest distance in z [m].
         obstacle: Body whose contact force is measured.
-        most: Reward of metaworld that counts as the largest one before success.
+        max_reward: Reward of metaworld before success; a larger one is clipped to it.
 
     Attributes:
         true_goal: Position (3,) of the goal [m].
@@ -50,7 +50,7 @@ class HiddenGoal(gymnasium.Wrapper):
 
     def __init__(
         self, env: Any, seed: int, length: int, offsets: tuple[float, float], height_offset: float, obstacle: str,
-        most: float,
+        max_reward: float,
     ):  # fmt: skip
         env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
         env._partially_observable = False
@@ -59,7 +59,7 @@ class HiddenGoal(gymnasium.Wrapper):
         env.seed(seed)
         super().__init__(env)
         self.length, self.steps = length, 0
-        self._offsets, self._height_offset, self._most = offsets, height_offset, most
+        self._offsets, self._height_offset, self._max_reward = offsets, height_offset, max_reward
         self._rng = np.random.default_rng([seed, 1])
         body = env.model.body(obstacle).id
         self._geoms = {g for g in range(env.model.ngeom) if env.model.body_rootid[env.model.geom_bodyid[g]] == body}
@@ -83,11 +83,12 @@ class HiddenGoal(gymnasium.Wrapper):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Step the environment and measure success and force."""
-        self.raw, theirs, _, _, info = self.unwrapped.step(np.asarray(action, dtype=np.float32))
+        self.raw, package_reward, _, _, info = self.unwrapped.step(np.asarray(action, dtype=np.float32))
         self.steps += 1
         self.is_success = success = self.has_succeeded(info)
         self._peak_force = max(self._peak_force, self._force())
-        reward = SUCCESS_REWARD if success else REWARD_SCALE * (min(float(theirs), self._most) / 10.0 - 1.0)
+        fraction = min(float(package_reward), self._max_reward) / 10.0
+        reward = SUCCESS_REWARD if success else REWARD_SCALE * (fraction - 1.0)
         info = {"is_success": success, "peak_force": self._peak_force, "side": self.side}
         return self.observe(), reward, success, self.steps >= self.length and not success, info
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.models.common.errors import InputError
+from guiderail.tools.tables import write_table
 from research.command import Parser, print_result, run_program
 from research.parts.campaign import finish, learn, prepare
 from research.parts.pairs import Pair, find_pairs
-from research.parts.table import summarize, write_tables
+from research.parts.table import summarize, to_table
 
 DIFFICULTIES = ("standard", "hard", "automate")
 
@@ -66,23 +67,16 @@ def main(arguments: list[str]) -> None:
                 result = finish(
                     out / "steps" / f"{pair.name}-{difficulty}-{seed}.json",
                     lambda d=difficulty, s=seed: learn(  # type: ignore[misc]
-                        pair,
-                        out,
-                        d,
-                        s,
-                        args.episodes,
-                        args.held_out,
-                        args.timeout,
-                        shrink,
+                        pair, out, d, s, args.episodes, args.held_out, args.timeout, shrink
                     ),
                 )
                 rows[pair.name] = {**rows[pair.name], f"{difficulty}-{seed}": result}
                 print(f"{pair.name} {difficulty}: {result.get('error') or result['success_rate']}", file=sys.stderr)
-        write_tables(out, rows)
+        write_table(out / "table", to_table(rows))
 
     with ThreadPoolExecutor(args.processes) as pool:
         list(pool.map(prepare_pair, pairs))
-        write_tables(out, rows)
+        write_table(out / "table", to_table(rows))
         chosen = [pair for pair in pairs if "error" not in rows[pair.name]][:: args.every]
         list(pool.map(learn_pair, chosen if difficulties else []))
     print_result(summarize(rows), as_json=args.json)

@@ -63,7 +63,10 @@ def run_guiderail(log: Path, timeout: float, *arguments: object) -> str:
 
 
 def finish(stored: Path, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return the result of a step, from its file if it is there; a failure is stored as {"error": reason}."""
+    """Return the result of a step, and store it; a stored result is not computed again.
+
+    A failed step has the result {"error": reason}.
+    """
     if not stored.exists():
         try:
             result = step()
@@ -76,7 +79,7 @@ def finish(stored: Path, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def prepare(pair: Pair, out: Path, timeout: float) -> dict[str, Any]:
-    """Prepare a pair and insert it aligned; where the parts overlap, with the plug smaller by the offered distance.
+    """Prepare a pair and insert it aligned. The plug of parts that overlap is shrunk by the distance that is offered.
 
     Raises:
         StepError: If it is refused, or takes more than `timeout` [s] of CPU time.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError
@@ -35,14 +35,12 @@ class Pair:
         plug: Mesh file.
         socket: Mesh file.
         unit: Unit of both files.
-        arguments: Further arguments of `guiderail create-task`.
     """
 
     name: str
     plug: Path
     socket: Path
     unit: str = "m"
-    arguments: tuple[str, ...] = field(default=())
 
 
 def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:

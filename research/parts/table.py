@@ -1,9 +1,8 @@
-"""Tables of the benchmark: one row a pair, and a summary."""
+"""Results of the benchmark: one row per pair, and a summary."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ LEARNED = (
 
 
 def to_table(rows: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Return one row a pair; the results of training have the difficulty and the seed in their names."""
+    """Return one row per pair; the results of training have the difficulty and the seed in their names."""
     lines = []
     for name, row in sorted(rows.items()):
         line: dict[str, Any] = {"part": name, **{key: row.get(key) for key in MEASURED}}
@@ -51,16 +50,6 @@ def to_table(rows: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
                 line[f"{key} reason"] = result.get("error")
         lines.append({**line, "reason": row.get("error")})
     return pd.DataFrame(lines)
-
-
-def write_tables(out: Path, rows: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write `table.csv` and `table.md`."""
-    table = to_table(rows)
-    table.to_csv(out / "table.csv", index=False)
-    cells = table.astype(object).where(table.notna(), "")
-    lines = [list(cells.columns), ["---"] * len(cells.columns), *cells.to_numpy().tolist()]
-    text = "\n".join("| " + " | ".join(str(cell).replace("|", "/") for cell in line) + " |" for line in lines)
-    (out / "table.md").write_text(text + "\n", encoding="utf-8")
 
 
 def summarize(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -367,13 +367,13 @@ def is_guided(row: Row) -> bool:
 
 def knowledge(section: Section, tables: Path) -> list[str]:
     """Return a sentence that names the demonstrated episodes of the learned methods, if they differ."""
-    shown: dict[int, list[str]] = {}
+    methods: dict[int, list[str]] = {}  # names by number of demonstrated episodes
     for row in section.rows:
         if _is_trained(last_rows(tables, row)):
-            shown.setdefault(demonstrated_episodes(row), []).append(row.name)
-    if len(shown) < 2:
+            methods.setdefault(demonstrated_episodes(row), []).append(row.name)
+    if len(methods) < 2:
         return []
-    parts = [f"{number or 'no'} demonstrated episodes: {', '.join(names)}" for number, names in sorted(shown.items())]
+    parts = [f"{number or 'no'} demonstrated episodes: {', '.join(names)}" for number, names in sorted(methods.items())]
     return [f"**The methods do not have equal knowledge.** {'; '.join(parts)}."]
 
 

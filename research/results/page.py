@@ -24,7 +24,7 @@ from research.results.methods import task_table
 from research.studies import study_command_line, study_names, study_path
 from research.thesis import describe_differences
 
-# Figures of the thesis that show what a study repeats.
+# Figures of the thesis that a study reproduces.
 FIGURES_OF_STUDIES = {
     "connector": ("4.8", "5.9"),
     "connector_thesis": ("4.8", "5.9"),
@@ -136,7 +136,7 @@ def _page_head(title: str) -> str:
 
 
 def _figure(file: Path) -> dict[str, Any]:
-    """Return what a figure's JSON file says, without the paths of its picture and table."""
+    """Return the content of a figure's JSON file without the paths of its picture and table."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         kept = {key: value for key, value in content.items() if key not in ("picture", "table")}

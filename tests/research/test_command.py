@@ -8,7 +8,7 @@ from research.action_fuzzing.__main__ import main as action_fuzzing
 from research.benchmarks import BENCHMARKS
 from research.benchmarks.__main__ import main as benchmarks
 from research.certificates import main as certificates
-from research.command import environment_options, print_result, run_program
+from research.command import print_result, run_program
 from research.figures.__main__ import main as figures
 from research.generate.__main__ import main as generate
 from research.results.__main__ import main as results
@@ -46,7 +46,7 @@ def test_help_has_an_example(program, capsys):
         (benchmarks, ["learner", "--picture", "learner.png"], "leave --picture out"),
         (benchmarks, ["training", "Puring"], "did you mean Pouring?"),
         (benchmarks, ["training", "Bead", "--env", "wal=1"], "did you mean wall?"),
-        (benchmarks, ["training", "Bead", "--env", "wall"], "--env takes key=value"),
+        (benchmarks, ["training", "Bead", "--env", "wall"], "--env takes name=value"),
         (benchmarks, ["training", "lab/Own", "--import", "none.py"], "there is no module, file or task folder none.py"),
         (action_fuzzing, ["BncConector"], "did you mean BncConnector?"),
         (action_fuzzing, ["Pouring", "--episodes", "0"], "at least one episode"),
@@ -79,10 +79,6 @@ def test_benchmark_prints_one_json_object(capsys, monkeypatch):
     code, out, _ = run(capsys, benchmarks, "simulation", "--json")
     assert code == 0
     assert json.loads(out) == {"gantry": {"real_time_factor": 12.0}}
-
-
-def test_environment_options_are_read_as_yaml():
-    assert environment_options(["station=arm", "action_dims=[0,1]"]) == {"station": "arm", "action_dims": (0, 1)}
 
 
 def test_non_finite_numbers_are_null_in_json(capsys):

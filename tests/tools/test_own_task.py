@@ -22,7 +22,7 @@ from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
-from research.action_fuzzing.campaign import fuzz
+from research.action_fuzzing.tasks import fuzz
 
 NUM_STEPS = 10
 

@@ -36,7 +36,7 @@ def to_json(result: Mapping[str, Any]) -> str:
             return [convert(item) for item in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    return json.dumps(convert(result), allow_nan=False)
+    return json.dumps(convert(result), allow_nan=False, default=str)
 
 
 def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

@@ -75,8 +75,8 @@ class Frame:
         else:
             result[:3] = self.p + self.R @ result[:3]
         if self.R is not None and len(output) == 6:
-            R = self.R.T if is_inverse else self.R
-            rotation = type(r := pose_rotation(result[3:], orientation)).from_matrix(R) * r
+            rotation = pose_rotation(result[3:], orientation)
+            rotation = rotation.from_matrix(self.R.T if is_inverse else self.R) * rotation
             result[3:] = rotation.as_euler("ZYX") if orientation == "euler_zyx" else rotation.as_rotvec()
         if near is not None and len(output) == 6:
             result[3:] = _continued(result[3:], near[3:], orientation)

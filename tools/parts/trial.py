@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import EventStatus
 
 from guiderail.diagrams.envs.meshcat_page import MeshcatPage
-from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
+from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear_motion
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
@@ -150,7 +150,7 @@ def insert(
     times, poses = file.motion.plan_straight_insertion() if motion is None else motion
     workcell = write_workcell(folder, file)
     station = GantryStation(workcell, time_step=file.time_step)
-    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {
         name: _locator(folder / part.visual)

@@ -54,7 +54,7 @@ def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = Fal
             return _approach(tip_in_mug, last_tip_in_mug, action_repeat)
 
         def tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
-            return _tilting(tip_in_mug, last_tip_in_mug) / 4
+            return _tilting(tip_in_mug, last_tip_in_mug) / 4  # equation 3.8
 
         return [*terms, RewardTerm("approach", poses, approach), RewardTerm("tilting", poses, tilting)]
     raise InputError(f"there is no reward '{reward}': use {', '.join(REWARDS)}")

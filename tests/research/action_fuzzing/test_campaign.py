@@ -14,20 +14,19 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, rollout
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.tables import read_table
-from research.action_fuzzing import CAMPAIGNS, bnc_connector, narrow_passage
-from research.action_fuzzing import campaign as campaign_module
+from research.action_fuzzing import tasks
 from research.action_fuzzing.campaign import (
     ACTIONS,
     Campaign,
     Case,
     NonFiniteCounter,
     find_failures,
-    fuzz,
     outcome,
     run_campaign,
 )
 from research.action_fuzzing.pouring import EarlyTilt
 from research.action_fuzzing.recompute import RecomputedViolation
+from research.action_fuzzing.tasks import CAMPAIGNS, fuzz
 
 
 class TransitionCounter(Callback):
@@ -162,7 +161,7 @@ def test_find_failures_has_a_sentence_per_failed_check(wrong, failures):
 
 
 def test_connector_passes_with_uniform_actions():
-    campaign = bnc_connector.campaign()
+    campaign = CAMPAIGNS["BncConnector"]()
     (case,) = (case for case in campaign.cases if case.name == "skgrl, per_episode, x, y")
     one = Campaign(campaign.task, [case], campaign.limits, make_callback=campaign.make_callback)
     (row,) = run_campaign(one, at_least(1))
@@ -176,13 +175,13 @@ def test_narrow_passage_passes_with_every_kind_of_action():
     result = fuzz("NarrowPassage", episodes=8, seed=5)
     assert result["failures"] == []
     assert result["all"]["episodes"] == 8
-    assert set(result["cases"]) == {case.name for case in narrow_passage.campaign().cases}
+    assert set(result["cases"]) == {case.name for case in CAMPAIGNS["NarrowPassage"]().cases}
 
 
 @pytest.mark.parametrize("error", [0.0, 1e-8])
 def test_violation_is_recomputed_from_the_commands(error):
     """A command that differs from the one that the environment reports is detected."""
-    (case,) = (case for case in narrow_passage.campaign().cases if case.name == "skgrl, action repeat 5")
+    (case,) = (case for case in CAMPAIGNS["NarrowPassage"]().cases if case.name == "skgrl, action repeat 5")
     env = make_environment("NarrowPassage", case.environment)
     base, recorded = env.unwrapped, env.unwrapped.trace.append
     base.trace.append = lambda commanded, *rest: recorded(commanded + [error, 0.0], *rest)
@@ -192,7 +191,7 @@ def test_violation_is_recomputed_from_the_commands(error):
 
 
 def test_fuzzing_all_tasks_is_resumed_from_its_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign_module, "CAMPAIGNS", {"NarrowPassage": "narrow_passage", "GridClamp": "grid_clamp"})
+    monkeypatch.setattr(tasks, "CAMPAIGNS", {task: CAMPAIGNS[task] for task in ("NarrowPassage", "GridClamp")})
     result = fuzz("all", steps=20, seed=5, out=tmp_path)
     assert result["failures"] == []
     assert result["max_commanded_violation"] <= 1e-9

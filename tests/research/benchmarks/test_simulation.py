@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.systems.wrench_sensor import WrenchSensor
@@ -33,7 +33,7 @@ def test_python_share_is_between_0_and_1(monkeypatch, name, contact):
 def test_scripted_pour_empties_the_thermos():
     config, times, poses, _ = scripted_motion("Pouring")
     station = PouringStation(config)
-    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     driven.start(poses[0])
     driven.run()
     balls = station.GetOutputPort("balls_in_mug").Eval(station.GetMyContextFromRoot(driven.context)).reshape(-1, 6)

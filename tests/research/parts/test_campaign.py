@@ -9,9 +9,10 @@ pytest.importorskip("manifold3d")
 pytest.importorskip("igl")
 
 from guiderail.models.common.errors import InputError
+from guiderail.tools.tables import write_table
 from research.parts.campaign import StepError, describe_calibration, finish
 from research.parts.pairs import find_pairs
-from research.parts.table import summarize, write_tables
+from research.parts.table import summarize, to_table
 
 
 def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_path):
@@ -41,7 +42,7 @@ def test_tables_hold_measurements_and_reasons(tmp_path):
     good = {"inserted": True, "clearance_mm": 0.1, "penetration_pushed_on_the_rim_mm": 0.06, "real_time_factor": 9.0}
     good |= {"preparation_s": 1.0, "inserted_s": 2.0, "hard-0": {"success_rate": 0.98}}
     rows = {"a": good, "b": {"error": "the parts overlap | here"}}
-    write_tables(tmp_path, rows)
+    write_table(tmp_path / "table", to_table(rows))
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert len({line.count(" | ") for line in lines}) == 1
     assert "0.98" in lines[2]
