@@ -55,8 +55,11 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
             for other in ORDER[type(operator)]:
                 yield _with(node, ops=[*node.ops[:i], other(), *node.ops[i + 1 :]])
             left, right = ([node.left, *node.comparators][j] for j in (i, i + 1))
-            # A factor changes neither infinity nor the sign of a value that is compared with zero.
-            is_same = ast.unparse(right) == "np.inf" or (isinstance(left, ast.Constant) and left.value == 0)
+            # A factor changes neither infinity nor the sign of a value that is compared with zero, and then with
+            # infinity or with nothing.
+            following = [ast.unparse(other) for other in node.comparators[i : i + 2]]
+            is_zero = isinstance(left, ast.Constant) and left.value == 0
+            is_same = following[0] == "np.inf" or (is_zero and following[1:] in ([], ["np.inf"]))
             if isinstance(operator, LIMITS) and not is_same and not isinstance(right, ast.Constant | ast.UnaryOp):
                 wider = ast.copy_location(ast.BinOp(right, ast.Mult(), ast.Constant(1.001)), right)
                 yield _with(node, comparators=[*node.comparators[:i], wider, *node.comparators[i + 1 :]])

@@ -206,6 +206,7 @@ def test_rounding_by_a_bound_is_no_saturation(sign, force, is_saturated):
 def test_thresholds_have_their_documented_values():
     assert (module.LIGHT, module.HEAVY, module.LEVER) == (300.0, 3000.0, 0.25)
     np.testing.assert_array_equal(module._REGULARIZATION, 1e-9 * np.eye(6))
+    np.testing.assert_array_equal(module._SCALE, [1.0, 1.0, 1.0, 0.25, 0.25, 0.25])
 
 
 @pytest.mark.parametrize("number", range(6))
