@@ -37,10 +37,13 @@ POLICIES: dict[str, dict[str, Any]] = {
         "task": "GridClamp", "guidance": "sct", "episodes": 60, "seed": 2300001, **ARM, "fixture_offset": "per_run",
         "algorithm": "sac", "preset": "sac_gridclamp", "settings": {"demonstration_episodes": 3},
     },
-    "pouring": {"task": "Pouring", "guidance": "sct", "episodes": 100, "difficulty": "hard"},
+    "pouring": {
+        "task": "Pouring", "guidance": "sct", "episodes": 150, "seed": 113, "difficulty": "hard", "reward": "shaped",
+        "algorithm": "sac", "preset": "pouring",
+    },
 }  # fmt: skip
-"""Arguments of `guiderail.train` by the name of the policy; passage, connector and clamp are the first seeds of the
-studies narrow_passage_hard, connector_robot_sensing and grid_clamp_robot_sensing."""
+"""Arguments of `guiderail.train` by the name of the policy: the first seeds of the studies narrow_passage_hard,
+connector_robot_sensing, grid_clamp_robot_sensing and pouring_hard (`rl_sct_longer`)."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
 MAX_SIZE = 200_000  # of the files of one policy [bytes]
 EPISODES = 40  # held-out episodes of the policy and of each baseline policy

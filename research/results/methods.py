@@ -83,6 +83,8 @@ SECTIONS: dict[str, list[Section]] = {
             "Connector, hard, on an iiwa with a robot's sensors",
             [
                 Row("KGRL", "connector_robot_sensing", "kgrl"),
+                Row("KGRL, finer contact afterwards", "connector_robot_sensing_fine", "kgrl", "fresh"),
+                Row("KGRL, finer contact afterwards, in MuJoCo", "connector_robot_sensing_fine", "kgrl", "MuJoCo"),
                 Row("KGRL, light push", "connector_robot_sensing", "light_push"),
                 Row("KGRL, critic without privileged observation", "connector_robot_sensing", "own_observation"),
                 Row("residual RL", "connector_robot_sensing", "residual"),
@@ -94,6 +96,25 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Connector, hard",
             [
+                Row("KGRL", "peers_connector_hard", "kgrl"),
+                Row("sKGRL, adaptive history", "peers_connector_hard", "skgrl_adaptive"),
+                Row("residual RL", "peers_connector_hard", "residual"),
+                Row("safe residual RL", "peers_connector_hard", "safe_residual"),
+                Row("residual RL, covariance without constraints", "peers_connector_hard", "residual_covariance"),
+                Row("residual RL, control barrier function", "peers_connector_hard", "residual_cbf"),
+                Row("residual RL, tangent space", "peers_connector_hard", "residual_tangent"),
+                Row("Policy Decorator", "peers_connector_hard", "policy_decorator"),
+                Row("CrossQ", "peers_connector_hard", "crossq"),
+                Row("behavior cloning", "peers_connector_hard", "bc"),
+                Row("RLPD", "peers_connector_hard", "rlpd"),
+                Row("DroQ", "peers_connector_hard", "droq"),
+                *_baselines("peers_connector_hard", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+            guided=("KGRL", "sKGRL, adaptive history"),
+        ),
+        Section(
+            "Connector, hard, force not bounded (40 N per axis)",
+            [
                 Row("KGRL", "connector_hard", "kgrl"),
                 Row("sKGRL, adaptive history", "connector_hard", "skgrl_adaptive"),
                 Row("sKGRL", "connector_hard", "skgrl"),
@@ -102,7 +123,6 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("residual RL with a larger action scale", "connector_hard", "residual_far"),
                 *_baselines("connector_hard_baselines", _ALL),
             ],
-            guided=("KGRL", "sKGRL, adaptive history"),
         ),
         Section(
             "Connector, hard, from one demonstration",

@@ -90,7 +90,10 @@ class Job:
         study, method = self.study, self.study.methods[self.method]
         choices = [study.learner, method.learner]
         given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
-        given["settings"] = {**study.learner.settings, **method.learner.settings}
+        settings = {**study.learner.settings, **method.learner.settings}
+        if "init_from" in settings:  # the run of another method of the study
+            settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
+        given["settings"] = settings
         environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
         given |= {"imports": study.imports, "seed": self.seed}
         return configure(study.task, environment, episodes=max(episodes, 1), **given)

@@ -7,6 +7,7 @@ setting given by `--set name=value` is validated against that class.
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
@@ -45,6 +46,8 @@ Fraction = Annotated[float, Field(ge=0, le=1), BeforeValidator(reject_bool)]
 Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
 EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
+# Absolute, so that a run can be resumed from another folder.
+Folder = Annotated[str, AfterValidator(lambda path: path and str(Path(path).resolve()))]
 NetArch = Annotated[
     tuple[NumUnits, ...],
     Field(min_length=1, max_length=20),
@@ -88,6 +91,7 @@ class OffPolicyConfig(LearnerConfig):
     random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of images in training [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Fraction = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
+    init_from: Folder = ""  # run from whose networks, optimizers and replay buffer learning starts
 
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:

@@ -11,6 +11,7 @@ import copy
 import inspect
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import gymnasium
@@ -27,7 +28,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.checkpoint import CheckpointSelection
+from guiderail.tools.learning.checkpoint import CheckpointSelection, load_checkpoint
 from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error
@@ -43,6 +44,7 @@ from guiderail.tools.learning.networks import (
     share_encoder,
     with_privileged,
 )
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.sb3_state import (
     DemonstrationReplayBuffer,
     module_arrays,
@@ -107,6 +109,9 @@ class OffPolicyLearner(Learner):
             }
         self.config = config
         self.transitions = 0
+        initial = _checkpoint_of(config.init_from) if config.init_from else None
+        if initial is not None:
+            max_transitions += initial[1]["transitions"]
         arguments = {
             "learning_rate": config.learning_rate,
             "buffer_size": min(config.buffer_size, max_transitions + 1),
@@ -156,6 +161,23 @@ class OffPolicyLearner(Learner):
         self._constant_action: np.ndarray | None = None  # the action of a constant episode
         self._extended_action: np.ndarray | None = None
         self._extended_steps = 0  # remaining repetitions of the extended action
+        if initial is not None:
+            self._start_from(*initial, seed)
+
+    def _start_from(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any], seed: int) -> None:
+        """Start with the state of another run, but with random generators and a checkpoint selection of its own."""
+        generators = random_state()
+        try:
+            self.restore(arrays, values)
+        except (LookupError, TypeError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"the run {self.config.init_from} has another algorithm, network, symmetry or other observations than "
+                "this one: give init_from a run with the same learner and environment interface"
+            ) from error
+        restore_random(*generators)
+        self.random, self.greedy_successes = np.random.default_rng(seed), 0
+        if self.selection is not None:  # its actors succeeded in another environment
+            self.selection = CheckpointSelection(self.config.selection_window)
 
     def algorithm_arguments(self, config: Any) -> dict[str, Any]:
         """Return further arguments of the algorithm, from settings that a subclass adds to its `Config`."""
@@ -416,6 +438,17 @@ _BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "do
 def _array_key(array: np.ndarray | None) -> tuple[Any, ...]:
     """Return the comparison key of an array; 0-d arrays count as 1-d, as safetensors stores them."""
     return () if array is None else (np.atleast_1d(array).shape, array.dtype, array.tobytes())
+
+
+def _checkpoint_of(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return the state of a run's off-policy learner; raise an InputError if it has none."""
+    file = RunFolder(Path(run)).checkpoint
+    if not file.is_file():
+        raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
+    arrays, values = load_checkpoint(file)
+    if "transitions" not in values["learner"]:
+        raise InputError(f"init_from names {run}, whose learner is not off-policy: name one of the same algorithm")
+    return arrays, values["learner"]
 
 
 class SacLearner(OffPolicyLearner):

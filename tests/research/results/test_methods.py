@@ -77,7 +77,7 @@ HEAD = (
 
 
 def test_each_seed_is_listed_after_its_last_episode(tmp_path):
-    (tmp_path / "connector_hard.csv").write_text(
+    (tmp_path / "peers_connector_hard.csv").write_text(
         HEAD
         + "residual,7,20,fresh,100,0.1,0,0,0,0,1.0,20,0.1,,0,0,2.0,1\n"
         + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,4\n"
@@ -100,9 +100,9 @@ def test_each_seed_is_listed_after_its_last_episode(tmp_path):
 
 def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
     template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2\n"
-    rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "residual_far": (0.1, 0.2, 0.3, 0.4)}
+    rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "residual_cbf": (0.1, 0.2, 0.3, 0.4)}
     lines = [template.format(name, seed, rate) for name, each in rates.items() for seed, rate in enumerate(each)]
-    (tmp_path / "connector_hard.csv").write_text(HEAD + "".join(lines))
+    (tmp_path / "peers_connector_hard.csv").write_text(HEAD + "".join(lines))
     text = task_table("BncConnector", tmp_path)
     assert [row[3].split(" (")[0] for row in rows(text) if len(row) > 3] == ["100", "90", "25"]
     # Of the 16 pairs of KGRL and residual RL, ten are won and five are ties.
@@ -119,7 +119,7 @@ def test_methods_of_unequal_knowledge_are_marked():
 
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
     line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0\n"
-    (tmp_path / "connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
+    (tmp_path / "peers_connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
     assert rows(readme_table(tmp_path))[0][-2:] == ["KGRL –", "–"]
 
 

@@ -1,3 +1,4 @@
+import contextlib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,9 @@ from stable_baselines3 import DDPG
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.checkpoint import load_checkpoint
 from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner
 from guiderail.tools.learning.networks import export_policy
@@ -167,6 +170,28 @@ def test_restore_refuses_the_state_of_another_network(config):
     arrays, values = make(config).state()
     with pytest.raises((KeyError, RuntimeError, ValueError)):
         make(replace(config, net_arch=(16,))).restore(arrays, values)
+
+
+def test_learner_starts_from_another_run(bead_config, bead_run):
+    config = replace(bead_config.learner, init_from=str(bead_run))
+    with contextlib.closing(make_environment("Bead", {})) as env:
+        learner = LEARNERS.get("tqc")(config, env, **learner_arguments(bead_config, env.unwrapped.task) | {"seed": 8})
+    arrays, values = load_checkpoint(bead_run / "checkpoint" / "state.safetensors")
+    started, state = learner.state()
+    learned = [key for key in arrays if not key.startswith(("random/", "selection/"))]
+    assert learned
+    assert [key for key in learned if not np.array_equal(np.ravel(started[key]), np.ravel(arrays[key]))] == []
+    assert state["transitions"] == values["learner"]["transitions"]
+    assert state["selection"] == {"rows": {}}
+    assert state["greedy_successes"] == 0
+    assert state["exploration"] == np.random.default_rng(8).bit_generator.state
+
+
+def test_init_from_refuses_runs_of_other_learners(bead_config, bead_run, config, tmp_path):
+    with pytest.raises(InputError, match="other observations"):
+        make(replace(config, init_from=str(bead_run)))
+    with pytest.raises(InputError, match="no checkpoint"):
+        make(replace(config, init_from=str(tmp_path)))
 
 
 @pytest.mark.parametrize("settings", [{"gamma": 1.5}, {"net_arch": ""}, {"ent_coef": "much"}, {"batch_size": 2.5}])
