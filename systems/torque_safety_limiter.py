@@ -310,7 +310,8 @@ class TorqueSafetyLimiter(LeafSystem):
         torque = np.zeros(self._num_joints)
         if is_active and not self._present_fault.Eval(context):
             torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
-            torque = torque + (1.0 - blend_factor) * self._damping_torque(context)
+            if blend_factor < 1.0:  # while RUNNING, no inertia has to be evaluated
+                torque = torque + (1.0 - blend_factor) * self._damping_torque(context)
         elif is_active or arm_state == ArmState.DAMPING:
             torque = self._damping_torque(context)
         torque = np.where(np.isfinite(torque), torque, 0.0)
