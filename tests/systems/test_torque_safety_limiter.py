@@ -197,10 +197,15 @@ def test_unknown_velocity_or_posture_is_not_damped(plant, wrong):
 
 
 @pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
-def test_commanded_torque_is_passed_when_the_velocity_is_unknown(plant, unknown):
-    rig = Rig(plant)
+@pytest.mark.parametrize("running", [False, True])
+def test_commanded_torque_is_not_damped_at_unknown_velocity(plant, unknown, running):
+    rig = Rig(plant, running=running)
+    if not running:
+        rig.simulator.Initialize()
+        rig.advance(0.5 * LIMITS.ramp_time)
     rig.set(velocity=[*SPEED[:-1], unknown])
-    np.testing.assert_array_equal(rig["safe_torque"], COMMANDED)
+    assert rig.arm_state == (ArmState.RUNNING if running else ArmState.RAMPING)
+    np.testing.assert_array_equal(rig["safe_torque"], rig["blend_factor"][0] * COMMANDED)
 
 
 def test_torque_that_overflows_is_zero(plant):
