@@ -462,7 +462,8 @@ def _success(seeds: pd.DataFrame) -> str:
     rates = 100 * seeds["success_rate" if _is_evaluated(seeds) else "training_success_rate"].astype(float)
     span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
     is_single = len(seeds) == 1 and _is_trained(seeds)
-    return f"{rates.mean():.0f}{' (one seed)' if is_single else span}"
+    mean = f"{rates.mean():.{int(99.5 <= rates.mean() < 100)}f}"  # 99.6 is not written as 100
+    return f"{mean}{' (one seed)' if is_single else span}"
 
 
 def _percent(seeds: pd.DataFrame) -> str:
