@@ -39,7 +39,7 @@ POLICIES: dict[str, dict[str, Any]] = {
     },
     "pouring": {
         "task": "Pouring", "guidance": "sct", "episodes": 150, "seed": 113, "difficulty": "hard", "reward": "shaped",
-        "algorithm": "sac", "preset": "pouring",
+        "algorithm": "sac", "preset": "pouring", "settings": {"net_arch": "128,128"},
     },
 }  # fmt: skip
 """Arguments of `guiderail.train` by the name of the policy: the first seeds of the studies narrow_passage_hard,
@@ -63,7 +63,7 @@ def make(name: str, out: Path, episodes: int = EPISODES) -> guiderail.Evaluation
         run = guiderail.train(arguments["task"], out=folder, resume=True)
     else:
         run = guiderail.train(arguments.pop("task"), out=folder, **arguments)
-    evaluation = guiderail.evaluate(run.path, episodes=episodes)
+    evaluation = guiderail.evaluate(run, episodes=episodes)
     text = json.dumps(json.loads(to_json({"sentence": evaluation.sentence, **evaluation})), indent=1)
     (folder / "evaluation.json").write_text(text + "\n", encoding="utf-8")
     size = sum((folder / file).stat().st_size for file in FILES)

@@ -223,7 +223,7 @@ def evaluate(
     own environment are stored for a report.
 
     Args:
-        policy: Folder of a run, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
+        policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
             baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
             a model of Stable-Baselines3.
         env: Name of the task, or an environment, that a policy without a run is evaluated in. An environment that is

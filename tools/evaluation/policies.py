@@ -27,7 +27,7 @@ from guiderail.models.policy import BASE_POLICIES, MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
 from guiderail.tools.imports import import_modules, is_trusted
-from guiderail.tools.pretrained import PRETRAINED
+from guiderail.tools.pretrained import PRETRAINED, find_run
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
 """Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
@@ -155,7 +155,7 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     """Return the policy of a folder, a file or `module:function`.
 
     Args:
-        source: Folder with `policy.safetensors`; .zip of Stable-Baselines3; .onnx; TorchScript (.pt, .ts,
+        source: Folder with `policy.safetensors`; `pretrained:NAME`; .zip of Stable-Baselines3; .onnx; TorchScript (.pt, .ts,
             .torchscript); or `module:function`, where a module is a module's name or a file (.py), and a function any
             policy that `as_policy` takes, or a class of such policies.
         trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
@@ -165,7 +165,7 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     """
     if (function := _function_of(str(source))) is not None:
         return _load_function(*function)
-    path = Path(source)
+    path = find_run(source)
     if path.suffix not in ENDINGS:
         return Policy.load(path)
     if not path.is_file():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -129,7 +130,7 @@ def find_subject(
     """Return a policy that is evaluated or shown.
 
     Args:
-        policy: Folder of a run, or `pretrained:NAME`. With `env`: any policy that `load_policy` or `as_policy` takes,
+        policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` or `as_policy` takes,
             or the name of a baseline policy.
         env: Name of the task, or an environment, that a policy without a run acts in; None for a run.
         environment: Options of the task's environment that differ from the defaults; unused for a run.
@@ -138,6 +139,8 @@ def find_subject(
     Raises:
         InputError: If there is no such policy or task, or a policy without a run has no task.
     """
+    if isinstance(policy, os.PathLike):
+        policy = Path(policy)
     if env is None:
         if not isinstance(policy, Path | str) or is_policy_file(policy):
             raise InputError("a policy without a run acts in a task: name it (--task)")

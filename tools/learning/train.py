@@ -39,7 +39,7 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """Training run, read from its folder.
+    """Training run, read from its folder; where a function takes the folder, it takes the run.
 
     Attributes:
         path: Folder of the run.
@@ -48,6 +48,10 @@ class Run:
 
     path: Path
     pictures: Mapping[str, str] = field(default_factory=dict)
+
+    def __fspath__(self) -> str:
+        """Return the path of the folder."""
+        return str(self.path)
 
     @property
     def config(self) -> RunConfig:

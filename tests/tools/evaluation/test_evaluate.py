@@ -18,6 +18,7 @@ from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.subject import evaluation_scope, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import Run
 
 
 def test_episode_conditions_depend_on_its_seed_alone():
@@ -53,7 +54,7 @@ def test_demonstration_runs_on_the_episodes_of_the_policy(bead_run, capsys):
     assert "series 2 of 2: demonstration alone 3/3" in printed
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
-    elsewhere = evaluate(bead_run, episodes=3, environment={"wall": -0.5})
+    elsewhere = evaluate(Run(bead_run), episodes=3, environment={"wall": -0.5})
     assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
     assert elsewhere["mean_return"] != result["mean_return"]
 

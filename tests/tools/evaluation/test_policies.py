@@ -234,6 +234,13 @@ def test_pretrained_name_that_does_not_exist_is_refused():
         find_run("pretrained:toaster")
 
 
+def test_name_of_a_pretrained_policy_loads_it():
+    folder = find_run("pretrained:connector")
+    named, loaded = load_policy("pretrained:connector"), Policy.load(folder)
+    observation = np.full(loaded.description["observation_shape"], 0.1, np.float32)
+    np.testing.assert_array_equal(named(observation), loaded(observation))
+
+
 def test_pretrained_policy_is_evaluated_without_writing_into_the_package(bead_run, tmp_path, monkeypatch):
     folder = tmp_path / "package" / "bead"
     folder.mkdir(parents=True)
