@@ -153,19 +153,12 @@ def verify_certificate(
 
 @dataclass(frozen=True)
 class _Skill:
-    """Subject of a certificate.
+    """Subject of a certificate."""
 
-    Attributes:
-        loop: Primitive in its feedback loop.
-        stiffness: Stiffness of the impedance, or None.
-        limits: Limits of the impedance's wrench, or None.
-        about: Description of the run or task, stored in the certificate.
-    """
-
-    loop: CertifiedLoop
-    stiffness: np.ndarray | None
-    limits: np.ndarray | None
-    about: dict[str, Any]
+    loop: CertifiedLoop  # primitive in its feedback loop
+    stiffness: np.ndarray | None  # stiffness of the impedance, or None
+    limits: np.ndarray | None  # limits of the impedance's wrench, or None
+    about: dict[str, Any]  # description of the run or task, stored in the certificate
 
 
 def _find_skill(subject: str, environment: Mapping[str, Any], start_within: float | None) -> _Skill:

@@ -48,19 +48,13 @@ _PARAMETERS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """Camera that is fixed in the world or in a frame of the plant, such as a wrist camera.
+    """Camera that is fixed in the world or in a frame of the plant, such as a wrist camera."""
 
-    Attributes:
-        size: Width and height of its image [pixels].
-        vertical_fov: Vertical field of view [rad].
-        X_WC: Pose of the camera in the world, or in `frame`; C has x to the right, y down and z into the picture.
-        frame: Name of the frame of the plant that carries the camera; None: the world.
-    """
-
-    size: tuple[int, int]
-    vertical_fov: float
+    size: tuple[int, int]  # width and height of its image [pixels]
+    vertical_fov: float  # vertical field of view [rad]
+    # Pose of the camera in the world, or in `frame`; C has x to the right, y down and z into the picture.
     X_WC: RigidTransform
-    frame: str | None = None
+    frame: str | None = None  # name of the frame of the plant that carries the camera; None: the world
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return the pixel coordinates (n, 2), from the upper left corner, of points (n, 3) in the world [m]."""

@@ -26,29 +26,18 @@ from guiderail.models.common.registry import did_you_mean
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Configuration of an environment, every option validated and every default filled in.
+    """Configuration of an environment, every option validated and every default filled in."""
 
-    Attributes:
-        task: Name of the task.
-        guidance: Name of the guidance.
-        station: Name of the station.
-        reward: Name of the reward.
-        observation: Name of the observation.
-        difficulty: Name of the difficulty.
-        action_repeat: Control steps per action.
-        control_period: Time between commands [s]; None: that of the task's station.
-        parts: All other options by the part that they configure: "task", "station", "primitive", "template",
-            "guidance" and "disturbances".
-    """
-
-    task: str
-    guidance: str
-    station: str
-    reward: str
-    observation: str
-    difficulty: str
-    action_repeat: int
-    control_period: float | None
+    task: str  # name of the task
+    guidance: str  # name of the guidance
+    station: str  # name of the station
+    reward: str  # name of the reward
+    observation: str  # name of the observation
+    difficulty: str  # name of the difficulty
+    action_repeat: int  # control steps per action
+    control_period: float | None  # time between commands [s]; None: that of the task's station
+    # All other options by the part that they configure: "task", "station", "primitive", "template", "guidance" and
+    # "disturbances".
     parts: Mapping[str, Options] = field(hash=False)
 
     @classmethod

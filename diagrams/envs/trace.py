@@ -11,19 +11,12 @@ from guiderail.models.common.errors import InputError
 
 @dataclass(frozen=True)
 class Metric:
-    """Definition of a number that is computed from an episode, or from a table of episodes.
+    """Definition of a number that is computed from an episode, or from a table of episodes."""
 
-    Attributes:
-        name: Name of the metric's column.
-        unit: Unit, or the quantity that is counted; "" if there is none.
-        description: Definition in words.
-        compute: Function from the episode, or from the table of episodes, to the number.
-    """
-
-    name: str
-    unit: str
-    description: str
-    compute: Callable[[Any], Any]
+    name: str  # name of the metric's column
+    unit: str  # unit, or the quantity that is counted; "" if there is none
+    description: str  # definition in words
+    compute: Callable[[Any], Any]  # function from the episode, or from the table of episodes, to the number
 
 
 class EpisodeTrace:

@@ -45,25 +45,15 @@ MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Arm, tool and workpiece in a plant.
+    """Arm, tool and workpiece in a plant."""
 
-    Attributes:
-        model: Model instance of the arm's joints.
-        target: Target frame T.
-        tool_center: Frame of the tool center P.
-        wrist: Joint between flange and tool.
-        tool: Bodies of tool and workpiece, the first at the wrist.
-        tool_model: Model instance of the tool's joints.
-        gripper: Actuators of the tool's joints.
-    """
-
-    model: ModelInstanceIndex
-    target: Frame
-    tool_center: Frame
-    wrist: WeldJoint
-    tool: list[RigidBody]
-    tool_model: ModelInstanceIndex
-    gripper: list[JointActuator]
+    model: ModelInstanceIndex  # model instance of the arm's joints
+    target: Frame  # target frame T
+    tool_center: Frame  # frame of the tool center P
+    wrist: WeldJoint  # joint between flange and tool
+    tool: list[RigidBody]  # bodies of tool and workpiece, the first at the wrist
+    tool_model: ModelInstanceIndex  # model instance of the tool's joints
+    gripper: list[JointActuator]  # actuators of the tool's joints
 
 
 def add_arm(

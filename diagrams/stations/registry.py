@@ -15,23 +15,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StationKind:
-    """Kind of station.
+    """Kind of station."""
 
-    Attributes:
-        name: Name for `station=`.
-        build: Function that builds the station from a workcell and options by name.
-        workcell_kind: Kind of workcell that the station needs, such as "insertion" for a workpiece and a fixture.
-        options: Class of the station's environment options; None if it has none.
-        description: Summary in one line.
-        is_simulated: True for a simulation: a reset can set its state.
-    """
-
-    name: str
-    build: Callable[..., Station]
-    workcell_kind: str
-    options: type[Options] | None
-    description: str
-    is_simulated: bool = True
+    name: str  # name for `station=`
+    build: Callable[..., Station]  # function that builds the station from a workcell and options by name
+    workcell_kind: str  # kind of workcell that the station needs, such as "insertion" for a workpiece and a fixture
+    options: type[Options] | None  # class of the station's environment options; None if it has none
+    description: str  # summary in one line
+    is_simulated: bool = True  # True for a simulation: a reset can set its state
 
 
 STATIONS: Registry[StationKind] = Registry(

@@ -33,26 +33,16 @@ class JointTorqueAccuracy:
     """Errors of an arm's external joint torques.
 
     Except for the standard deviations, each value is the limit of an error that is sampled uniformly every episode.
-
-    Attributes:
-        gain: Relative error of a torque.
-        offset: Offset of a sensor, as a fraction of the joint's largest torque.
-        friction: Friction that a sensor measures, as a fraction of that torque.
-        drift: Standard deviation of a sensor's drift after `DRIFT_TIME`, as a fraction of that torque.
-        noise: Standard deviation of a sensor's noise, as a fraction of that torque.
-        mass: Relative error of the mass of each link.
-        center: Error of the center of mass of each body in each direction [m].
-        payload: Error of the mass of tool and workpiece [kg].
     """
 
-    gain: float = 0.01
-    offset: float = 0.005
-    friction: float = 2e-4
-    drift: float = 5e-5
-    noise: float = 1e-4
-    mass: float = 0.02
-    center: float = 2.0 * MM
-    payload: float = 0.05
+    gain: float = 0.01  # relative error of a torque
+    offset: float = 0.005  # offset of a sensor, as a fraction of the joint's largest torque
+    friction: float = 2e-4  # friction that a sensor measures, as a fraction of that torque
+    drift: float = 5e-5  # standard deviation of a sensor's drift after `DRIFT_TIME`, as a fraction of that torque
+    noise: float = 1e-4  # standard deviation of a sensor's noise, as a fraction of that torque
+    mass: float = 0.02  # relative error of the mass of each link
+    center: float = 2.0 * MM  # error of the center of mass of each body in each direction [m]
+    payload: float = 0.05  # error of the mass of tool and workpiece [kg]
 
 
 @dataclass(frozen=True)

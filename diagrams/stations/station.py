@@ -72,19 +72,13 @@ CONTACT_STIFFNESS = 1e5  # stiffness of workpiece, grasp and fixture in series d
 
 @dataclass(frozen=True)
 class Impedance:
-    """Impedance at the tool center along and about the axes of T, [x y z Rz Ry Rx].
+    """Impedance at the tool center along and about the axes of T, [x y z Rz Ry Rx]."""
 
-    Attributes:
-        stiffness: Stiffness [N/m], [Nm/rad].
-        damping_ratio: Damping ratio of every mode.
-        limits: Largest forces [N] and torques [Nm].
-        bound: Bound of the wrench and of the approach speed, within `limits`, in the order [x y z Rx Ry Rz]; None:
-            only `limits` apply.
-    """
-
-    stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)
-    damping_ratio: float = 1.0
-    limits: tuple[float, ...] = (40.0, 40.0, 40.0, 3.0, 3.0, 3.0)
+    stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)  # stiffness [N/m], [Nm/rad]
+    damping_ratio: float = 1.0  # damping ratio of every mode
+    limits: tuple[float, ...] = (40.0, 40.0, 40.0, 3.0, 3.0, 3.0)  # largest forces [N] and torques [Nm]
+    # Bound of the wrench and of the approach speed, within `limits`, in the order [x y z Rx Ry Rz]; None: only `limits`
+    # apply.
     bound: WrenchBound | None = None
 
     def __post_init__(self) -> None:
@@ -234,19 +228,12 @@ class Station(Diagram):
 
 @dataclass
 class ControllerPlant:
-    """Model of a robot for its controller: with tool and workpiece, without fixture and offsets.
+    """Model of a robot for its controller: with tool and workpiece, without fixture and offsets."""
 
-    Attributes:
-        plant: Plant with the robot only.
-        target: Target frame T.
-        tool_center: Frame of the tool center P.
-        posture: Joint positions to which the null space returns, (n,).
-    """
-
-    plant: MultibodyPlant
-    target: Frame
-    tool_center: Frame
-    posture: np.ndarray
+    plant: MultibodyPlant  # plant with the robot only
+    target: Frame  # target frame T
+    tool_center: Frame  # frame of the tool center P
+    posture: np.ndarray  # joint positions to which the null space returns, (n,)
 
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
         """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""

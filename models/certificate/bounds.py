@@ -40,22 +40,15 @@ CORNER_MARGIN = 1e-8  # margin of the corrections at corners, so that the checke
 
 @dataclass(frozen=True)
 class CertifiedBounds:
-    """Certified bounds of a loop.
+    """Certified bounds of a loop."""
 
-    Attributes:
-        free: Bounds until a constraint becomes active.
-        always: Bounds for all sequences.
-        can_be_active: Mask (N,) of the steps at which some actions make a constraint of the window active.
-        multipliers: Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F), at the T steps of `can_be_active`
-            and every corner of the action cells; empty with a history.
-        budgeted: Bounds for corrections within a budget, or None.
-    """
-
-    free: Bounds
-    always: Bounds
-    can_be_active: np.ndarray
+    free: Bounds  # bounds until a constraint becomes active
+    always: Bounds  # bounds for all sequences
+    can_be_active: np.ndarray  # mask (N,) of the steps at which some actions make a constraint of the window active
+    # Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F), at the T steps of `can_be_active` and every corner
+    # of the action cells; empty with a history.
     multipliers: np.ndarray
-    budgeted: BudgetedBounds | None = None
+    budgeted: BudgetedBounds | None = None  # bounds for corrections within a budget, or None
 
 
 def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBounds:

@@ -20,15 +20,10 @@ FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative t
 
 @dataclass(frozen=True)
 class Budget:
-    """Budget of corrections: largest value at one step, and largest sum over a sequence.
+    """Budget of corrections: largest value at one step, and largest sum over a sequence."""
 
-    Attributes:
-        excess: (2, A), excess over ±1 of the actions that are equivalent to corrected commands.
-        residue: (2, O), displacement of outputs that no action moves, by corrections.
-    """
-
-    excess: np.ndarray
-    residue: np.ndarray
+    excess: np.ndarray  # (2, A), excess over ±1 of the actions that are equivalent to corrected commands
+    residue: np.ndarray  # (2, O), displacement of outputs that no action moves, by corrections
 
 
 @dataclass(frozen=True)
@@ -37,20 +32,13 @@ class BudgetedBounds:
 
     The last three attributes prove the bounds. They have one entry for each order of the difference, sign, step, output
     and round, (3, 2, N, O, R).
-
-    Attributes:
-        budget: Assumed budget.
-        bounds: Bounds on commands, speeds and accelerations.
-        steps: Step of the constraint that tightens a bound.
-        outputs: Output of that constraint.
-        multipliers: Its multiplier, positive for an upper and negative for a lower bound.
     """
 
-    budget: Budget
-    bounds: Bounds
-    steps: np.ndarray
-    outputs: np.ndarray
-    multipliers: np.ndarray
+    budget: Budget  # assumed budget
+    bounds: Bounds  # bounds on commands, speeds and accelerations
+    steps: np.ndarray  # step of the constraint that tightens a bound
+    outputs: np.ndarray  # output of that constraint
+    multipliers: np.ndarray  # its multiplier, positive for an upper and negative for a lower bound
 
 
 def bound_within_budget(

@@ -11,38 +11,23 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 @dataclass(frozen=True)
 class CertifiedLoop:
-    """Primitive in its feedback loop.
+    """Primitive in its feedback loop."""
 
-    Attributes:
-        primitive: Movement primitive.
-        gains: Null-space units per action (O,); zero for outputs that no action moves.
-        period: Time between two commands [s].
-        start: Output at which the robot begins (O,).
-        start_within: Largest offset of the robot from `start` (O,).
-    """
-
-    primitive: LcNsKmp
-    gains: np.ndarray
-    period: float
-    start: np.ndarray
-    start_within: np.ndarray
+    primitive: LcNsKmp  # movement primitive
+    gains: np.ndarray  # null-space units per action (O,); zero for outputs that no action moves
+    period: float  # time between two commands [s]
+    start: np.ndarray  # output at which the robot begins (O,)
+    start_within: np.ndarray  # largest offset of the robot from `start` (O,)
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of one regime at every step; infinite at commands without a bound.
+    """Bounds of one regime at every step; infinite at commands without a bound."""
 
-    Attributes:
-        lower: Least command (N, O).
-        upper: Greatest command (N, O).
-        speed: Largest speed (N, O) from the previous step to this step [unit of the output/s].
-        acceleration: Largest acceleration (N, O) over this step and the two before it [unit of the output/s²].
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
+    lower: np.ndarray  # least command (N, O)
+    upper: np.ndarray  # greatest command (N, O)
+    speed: np.ndarray  # largest speed (N, O) from the previous step to this step [unit of the output/s]
+    acceleration: np.ndarray  # largest acceleration (N, O) over this step and the two before it [unit of the output/s²]
 
 
 def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:

@@ -23,17 +23,11 @@ _SCALE = np.repeat([1.0, LEVER], 3)
 
 @dataclass(frozen=True)
 class JointTorques:
-    """Result of the impedance law.
+    """Result of the impedance law."""
 
-    Attributes:
-        torque: Joint torques to command (n,) [Nm].
-        wrench: Wrench of the impedance (6,) [N, Nm].
-        is_saturated: True if a wrench or a torque is at its limit.
-    """
-
-    torque: np.ndarray
-    wrench: np.ndarray
-    is_saturated: bool
+    torque: np.ndarray  # joint torques to command (n,) [Nm]
+    wrench: np.ndarray  # wrench of the impedance (6,) [N, Nm]
+    is_saturated: bool  # True if a wrench or a torque is at its limit
 
 
 def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.ndarray) -> np.ndarray:

@@ -78,23 +78,14 @@ STATUS_FAULTS = tuple(fault for fault in Fault if Fault.NONE < fault <= Fault.CL
 
 @dataclass(frozen=True)
 class JointStatus:
-    """Decoded status message of a robot driver; neither sizes nor values have been checked.
+    """Decoded status message of a robot driver; neither sizes nor values have been checked."""
 
-    Attributes:
-        time: Time stamp by the robot's clock [s]; NaN if the message could not be decoded.
-        positions: Joint positions, (n,) [rad].
-        velocities: Joint velocities, (n,) [rad/s].
-        external_torque: External joint torques, (n,) [Nm].
-        conflicts: Number of messages so far that contradict their predecessors, such as those of a second robot.
-        foreign_commands: Number of commands so far that cannot be from the program that commands the arm.
-    """
-
-    time: float
-    positions: np.ndarray
-    velocities: np.ndarray
-    external_torque: np.ndarray
-    conflicts: int = 0
-    foreign_commands: int = 0
+    time: float  # time stamp by the robot's clock [s]; NaN if the message could not be decoded
+    positions: np.ndarray  # joint positions, (n,) [rad]
+    velocities: np.ndarray  # joint velocities, (n,) [rad/s]
+    external_torque: np.ndarray  # external joint torques, (n,) [Nm]
+    conflicts: int = 0  # number of messages so far that contradict their predecessors, such as those of a second robot
+    foreign_commands: int = 0  # number of commands so far that cannot be from the program that commands the arm
 
     def __deepcopy__(self, memo: object) -> "JointStatus":
         """Return the same immutable object, because Drake copies abstract values often."""
@@ -112,17 +103,11 @@ class JointStatus:
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """Heartbeat message of a robot-side safety monitor, sent with every status message.
+    """Heartbeat message of a robot-side safety monitor, sent with every status message."""
 
-    Attributes:
-        sequence: Sequence number, larger in each message.
-        is_stopping: True while the monitor stops the arm.
-        sender: Random number of the monitor's process.
-    """
-
-    sequence: int
-    is_stopping: bool
-    sender: int = 0
+    sequence: int  # sequence number, larger in each message
+    is_stopping: bool  # True while the monitor stops the arm
+    sender: int = 0  # random number of the monitor's process
 
     def __deepcopy__(self, memo: object) -> "Heartbeat":
         """Return the same immutable object."""
@@ -187,17 +172,11 @@ class StatusLimits:
 
 @dataclass(frozen=True)
 class LastStatus:
-    """Last readable status, with which the next one is compared.
+    """Last readable status, with which the next one is compared."""
 
-    Attributes:
-        time: Time stamp by the robot's clock [s]; NaN before the first status.
-        offset: Offset from the robot's clock to the local clock [s].
-        values: `JointStatus.values`, (3n,).
-    """
-
-    time: float
-    offset: float
-    values: np.ndarray
+    time: float  # time stamp by the robot's clock [s]; NaN before the first status
+    offset: float  # offset from the robot's clock to the local clock [s]
+    values: np.ndarray  # `JointStatus.values`, (3n,)
 
 
 def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:

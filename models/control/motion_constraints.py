@@ -38,17 +38,11 @@ class StateConstraints(Protocol):
 
 
 class Violations(NamedTuple):
-    """Largest violation of each kind of constraint, negative inside and −inf without constraints of the kind.
+    """Largest violation of each kind of constraint, negative inside and −inf without constraints of the kind."""
 
-    Attributes:
-        linear: max(c − G y) with rows of unit norm [unit of the output].
-        shapes: Largest depth inside an `outside` shape, or distance outside an `inside` shape [m].
-        state: Largest violation of state constraints, such as joint limits [rad].
-    """
-
-    linear: float
-    shapes: float
-    state: float
+    linear: float  # max(c − G y) with rows of unit norm [unit of the output]
+    shapes: float  # largest depth inside an `outside` shape, or distance outside an `inside` shape [m]
+    state: float  # largest violation of state constraints, such as joint limits [rad]
 
 
 @dataclass(frozen=True)

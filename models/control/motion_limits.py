@@ -11,15 +11,10 @@ from guiderail.models.common.errors import InputError
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Largest norms of velocity, acceleration and jerk of a pose.
+    """Largest norms of velocity, acceleration and jerk of a pose."""
 
-    Attributes:
-        linear: Limits of the position: [m/s], [m/s²], [m/s³].
-        angular: Limits of the orientation: [rad/s], [rad/s²], [rad/s³].
-    """
-
-    linear: tuple[float, float, float]
-    angular: tuple[float, float, float]
+    linear: tuple[float, float, float]  # limits of the position: [m/s], [m/s²], [m/s³]
+    angular: tuple[float, float, float]  # limits of the orientation: [rad/s], [rad/s²], [rad/s³]
 
     def __post_init__(self) -> None:
         """Check the limits.

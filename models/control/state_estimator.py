@@ -42,68 +42,41 @@ MAX_PREDICTION_TIME = 0.1  # age of the accepted status above which the velocity
 
 @dataclass(frozen=True)
 class EstimatorState:
-    """State of the estimator between two checks.
+    """State of the estimator between two checks."""
 
-    Attributes:
-        check_time: Local time of the next check [s].
-        receipt_time: Local time of the last readable status [s].
-        fault: Last fault, a code of `Fault`.
-        fault_time: Local time of that fault [s].
-        doubt_time: Local time of the last fault that put statuses in doubt [s]; NaN if none.
-        early: Sum of the recent corrections of the clock offset for early statuses [s].
-        conflicts: `JointStatus.conflicts` of the last status.
-        foreign_commands: `JointStatus.foreign_commands` of the last status.
-        last_time: Time stamp of the last readable status [s]; NaN before the first.
-        last_offset: Offset from the robot's clock to the local clock after the last readable status [s].
-        accepted_time: Time stamp of the accepted status [s]; NaN before the first.
-        accepted_offset: Clock offset after the accepted status [s].
-        last_values: `JointStatus.values` of the last readable status, valid or not, (3n,).
-        accepted_values: `JointStatus.values` of the accepted status, (3n,), with its velocity limited to the interval
-            of the other two sources of the velocity; zero before the first.
-        velocity: Velocity estimate from several sources, (n,) [rad/s]; zero where it is unknown.
-        residual: Recent difference between positions and integrated velocities, (n,) [rad].
-        equal_positions: Number of consecutive equal positions of each moving joint, (n,).
-        equal_velocities: Number of consecutive equal velocities of each moving joint, (n,).
-        equal_values: Number of consecutive statuses with equal values of a joint while another one moves, (n,).
-        external: External torque in the prediction, which follows the accepted one at a limited rate, (n,) [Nm].
-        torque: Torques in effect until the next check, (n,) [Nm].
-        variation: Last change of torques and external torques, (n,) [Nm].
-        predicted: Recent impulse of all torques, (n,) [Nms].
-        commanded: Recent impulse of the torques without the external ones, (n,) [Nms].
-        measured: Recent change of momentum, (n,) [Nms].
-        reaction: Recent changes of velocity, (n,) [rad/s], not negative.
-        tolerance: Largest difference of `predicted` and `measured` that errors of the torques explain, (n,) [Nms].
-        bias: Learned constant error of the torques, (n,) [Nm].
-    """
-
-    check_time: float
-    receipt_time: float
-    fault: float
-    fault_time: float
-    doubt_time: float
-    early: float
-    conflicts: float
-    foreign_commands: float
-    last_time: float
-    last_offset: float
-    accepted_time: float
-    accepted_offset: float
-    last_values: np.ndarray
+    check_time: float  # local time of the next check [s]
+    receipt_time: float  # local time of the last readable status [s]
+    fault: float  # last fault, a code of `Fault`
+    fault_time: float  # local time of that fault [s]
+    doubt_time: float  # local time of the last fault that put statuses in doubt [s]; NaN if none
+    early: float  # sum of the recent corrections of the clock offset for early statuses [s]
+    conflicts: float  # `JointStatus.conflicts` of the last status
+    foreign_commands: float  # `JointStatus.foreign_commands` of the last status
+    last_time: float  # time stamp of the last readable status [s]; NaN before the first
+    last_offset: float  # offset from the robot's clock to the local clock after the last readable status [s]
+    accepted_time: float  # time stamp of the accepted status [s]; NaN before the first
+    accepted_offset: float  # clock offset after the accepted status [s]
+    last_values: np.ndarray  # `JointStatus.values` of the last readable status, valid or not, (3n,)
+    # `JointStatus.values` of the accepted status, (3n,), with its velocity limited to the interval of the other two
+    # sources of the velocity; zero before the first.
     accepted_values: np.ndarray
-    velocity: np.ndarray
-    residual: np.ndarray
-    equal_positions: np.ndarray
-    equal_velocities: np.ndarray
+    velocity: np.ndarray  # velocity estimate from several sources, (n,) [rad/s]; zero where it is unknown
+    residual: np.ndarray  # recent difference between positions and integrated velocities, (n,) [rad]
+    equal_positions: np.ndarray  # number of consecutive equal positions of each moving joint, (n,)
+    equal_velocities: np.ndarray  # number of consecutive equal velocities of each moving joint, (n,)
+    # Number of consecutive statuses with equal values of a joint while another one moves, (n,).
     equal_values: np.ndarray
+    # External torque in the prediction, which follows the accepted one at a limited rate, (n,) [Nm].
     external: np.ndarray
-    torque: np.ndarray
-    variation: np.ndarray
-    predicted: np.ndarray
-    commanded: np.ndarray
-    measured: np.ndarray
-    reaction: np.ndarray
+    torque: np.ndarray  # torques in effect until the next check, (n,) [Nm]
+    variation: np.ndarray  # last change of torques and external torques, (n,) [Nm]
+    predicted: np.ndarray  # recent impulse of all torques, (n,) [Nms]
+    commanded: np.ndarray  # recent impulse of the torques without the external ones, (n,) [Nms]
+    measured: np.ndarray  # recent change of momentum, (n,) [Nms]
+    reaction: np.ndarray  # recent changes of velocity, (n,) [rad/s], not negative
+    # Largest difference of `predicted` and `measured` that errors of the torques explain, (n,) [Nms].
     tolerance: np.ndarray
-    bias: np.ndarray
+    bias: np.ndarray  # learned constant error of the torques, (n,) [Nm]
 
     @classmethod
     def initial(cls, num_joints: int) -> "EstimatorState":
@@ -134,19 +107,12 @@ class EstimatorState:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Result of a check.
+    """Result of a check."""
 
-    Attributes:
-        fault: Present or recent fault, or `Fault.NONE`.
-        age: Age of the accepted status relative to the earliest arrival [s]; infinite before the first.
-        is_new: True if a status is accepted at this check.
-        state: State for the next check; has the accepted values and the velocity estimate.
-    """
-
-    fault: Fault
-    age: float
-    is_new: bool
-    state: EstimatorState
+    fault: Fault  # present or recent fault, or `Fault.NONE`
+    age: float  # age of the accepted status relative to the earliest arrival [s]; infinite before the first
+    is_new: bool  # True if a status is accepted at this check
+    state: EstimatorState  # state for the next check; has the accepted values and the velocity estimate
 
 
 class StateEstimator:

@@ -21,19 +21,12 @@ MAX_WRENCH_SIZE = 8
 
 @dataclass(frozen=True, eq=False)  # arrays do not compare to one truth value
 class WrenchBound:
-    """Largest wrench of an impedance controller, per axis and as norms, and the contact stiffness that it assumes.
+    """Largest wrench of an impedance controller, per axis and as norms, and the contact stiffness that it assumes."""
 
-    Attributes:
-        axes: Limits (6,) along and about the axes [N, Nm], not negative.
-        force: Limit of the norm of the force [N], not negative.
-        torque: Limit of the norm of the torque [Nm], not negative.
-        contact_stiffness: Stiffness of workpiece, grasp and fixture in an impact [N/m], not negative. 0: the approach
-            speed is not limited.
-    """
-
-    axes: np.ndarray
-    force: float
-    torque: float
+    axes: np.ndarray  # limits (6,) along and about the axes [N, Nm], not negative
+    force: float  # limit of the norm of the force [N], not negative
+    torque: float  # limit of the norm of the torque [Nm], not negative
+    # Stiffness of workpiece, grasp and fixture in an impact [N/m], not negative. 0: the approach speed is not limited.
     contact_stiffness: float = 0.0
 
     def __post_init__(self) -> None:

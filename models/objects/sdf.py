@@ -100,21 +100,13 @@ DRAKE_NAMESPACE = 'xmlns:drake="drake.mit.edu"'
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Parameters of the hydroelastic contact model of a surface; they are not properties of a real material.
+    """Parameters of the hydroelastic contact model of a surface; they are not properties of a real material."""
 
-    Attributes:
-        friction: Coefficient of static and dynamic friction.
-        modulus: Pressure at full depth [Pa]; None for a rigid surface.
-        resolution: Edge length of a curved primitive's mesh [m].
-        dissipation: Hunt-Crossley dissipation [s/m].
-        margin: Distance at which a compliant surface enters the contact computation [m], so that no step penetrates
-            deeply.
-    """
-
-    friction: float
-    modulus: float | None = None
-    resolution: float | None = None
-    dissipation: float = 1.0
+    friction: float  # coefficient of static and dynamic friction
+    modulus: float | None = None  # pressure at full depth [Pa]; None for a rigid surface
+    resolution: float | None = None  # edge length of a curved primitive's mesh [m]
+    dissipation: float = 1.0  # Hunt-Crossley dissipation [s/m]
+    # Distance at which a compliant surface enters the contact computation [m], so that no step penetrates deeply.
     margin: float | None = None
 
 

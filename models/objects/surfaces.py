@@ -38,38 +38,23 @@ class Hull:
 
 @dataclass(frozen=True)
 class Spring:
-    """Spring-loaded slide of a surface, for a physics engine whose contact model is too stiff.
+    """Spring-loaded slide of a surface, for a physics engine whose contact model is too stiff."""
 
-    Attributes:
-        axis: Direction of the slide (3,) in the body's frame.
-        stiffness: Stiffness [N/m].
-    """
-
-    axis: tuple[float, float, float]
-    stiffness: float
+    axis: tuple[float, float, float]  # direction of the slide (3,) in the body's frame
+    stiffness: float  # stiffness [N/m]
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Convex solid of a body's collision geometry.
+    """Convex solid of a body's collision geometry."""
 
-    Attributes:
-        name: Unique name.
-        pair: Name of the pair; the surface collides with those surfaces of the other body that have the same pair.
-        shape: Shape in the surface's frame.
-        friction: Friction coefficient of the pair.
-        position: Position (3,) [m] of the frame in the body.
-        pitch: Rotation of the frame about the body's y axis [rad].
-        spring: Slide that carries the surface; None: it is fixed to the body.
-    """
-
-    name: str
-    pair: str
-    shape: Cylinder | Box | Hull
-    friction: float
-    position: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
-    pitch: float = 0.0
-    spring: Spring | None = None
+    name: str  # unique name
+    pair: str  # name of the pair; the surface collides with those surfaces of the other body that have the same pair
+    shape: Cylinder | Box | Hull  # shape in the surface's frame
+    friction: float  # friction coefficient of the pair
+    position: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))  # position (3,) [m] of the frame in the body
+    pitch: float = 0.0  # rotation of the frame about the body's y axis [rad]
+    spring: Spring | None = None  # slide that carries the surface; None: it is fixed to the body
 
 
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:

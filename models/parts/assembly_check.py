@@ -22,17 +22,11 @@ _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a roun
 
 @dataclass(frozen=True)
 class InsertionMotion:
-    """Motion of a plug to its target along z, with a turn about z at the end.
+    """Motion of a plug to its target along z, with a turn about z at the end."""
 
-    Attributes:
-        travel: Height of the start above the target [m].
-        rim: Height at which the plug's lowest point is level with the socket's highest [m].
-        turn: Angle of the turn, counter-clockwise as seen from above [rad].
-    """
-
-    travel: float
-    rim: float
-    turn: float = 0.0
+    travel: float  # height of the start above the target [m]
+    rim: float  # height at which the plug's lowest point is level with the socket's highest [m]
+    turn: float = 0.0  # angle of the turn, counter-clockwise as seen from above [rad]
 
     def path(self, steps: int = 24) -> list[tuple[float, float]]:
         """Return heights [m] and angles [rad] from the rim to the target."""

@@ -19,19 +19,12 @@ from guiderail.models.parts.tetrahedra import vtk_text
 
 @dataclass(frozen=True)
 class Piece:
-    """Piece of a compliant part.
+    """Piece of a compliant part."""
 
-    Attributes:
-        body: Index of the piece's body in `ContactSurface.bodies`.
-        suffix: ".obj" of a convex surface, or ".vtk" of tetrahedra.
-        points: Points (P, 3) [m].
-        cells: Triangles (T, 3) or tetrahedra (N, 4).
-    """
-
-    body: int
-    suffix: str
-    points: np.ndarray
-    cells: np.ndarray
+    body: int  # index of the piece's body in `ContactSurface.bodies`
+    suffix: str  # ".obj" of a convex surface, or ".vtk" of tetrahedra
+    points: np.ndarray  # points (P, 3) [m]
+    cells: np.ndarray  # triangles (T, 3) or tetrahedra (N, 4)
 
 
 def piece_text(piece: Piece) -> str:

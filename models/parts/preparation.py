@@ -35,21 +35,13 @@ Arrays = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class ContactSurface:
-    """Surface of a part as it is simulated.
+    """Surface of a part as it is simulated."""
 
-    Attributes:
-        bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, the snapping ones last.
-        snapping: Number of the snapping bodies.
-        visual: Vertices and triangles of the whole part, decimated but not cropped.
-        deviation: Largest measured distance from the drawing in the regions that can touch [m].
-        volume: Volume of the part [m³].
-    """
-
-    bodies: tuple[Arrays, ...]
-    snapping: int
-    visual: Arrays
-    deviation: float
-    volume: float
+    bodies: tuple[Arrays, ...]  # vertices (V, 3) [m] and triangles (T, 3) of each body, the snapping ones last
+    snapping: int  # number of the snapping bodies
+    visual: Arrays  # vertices and triangles of the whole part, decimated but not cropped
+    deviation: float  # largest measured distance from the drawing in the regions that can touch [m]
+    volume: float  # volume of the part [m³]
 
     @property
     def num_triangles(self) -> int:

@@ -21,19 +21,13 @@ _NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding 
 
 @dataclass(frozen=True)
 class Repair:
-    """Changes of a mesh that made it a solid.
+    """Changes of a mesh that made it a solid."""
 
-    Attributes:
-        closed_edges: Number of edges that did not join exactly two triangles, at least 1 if the surface was changed.
-        moved: Largest distance of the new surface from the old one [m].
-        cavities: Number of filled closed cavities.
-        inverted: Number of bodies whose faces pointed inwards.
-    """
-
+    # Number of edges that did not join exactly two triangles, at least 1 if the surface was changed.
     closed_edges: int = 0
-    moved: float = 0.0
-    cavities: int = 0
-    inverted: int = 0
+    moved: float = 0.0  # largest distance of the new surface from the old one [m]
+    cavities: int = 0  # number of filled closed cavities
+    inverted: int = 0  # number of bodies whose faces pointed inwards
 
     def __str__(self) -> str:
         changes = []

@@ -31,22 +31,15 @@ _EVALUATED = 40  # number of steps at which candidates are compared
 
 @dataclass(frozen=True)
 class Candidate:
-    """Kernel and regularization with their cross-validation error.
+    """Kernel and regularization with their cross-validation error."""
 
-    Attributes:
-        length_scale: ℓ of the kernel [input].
-        lambda_: λ = β.
-        error: RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in
-            standard deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread.
-        worse: Difference from the best candidate's error, in standard errors over the demonstrations.
-        share: Share of the steps at which the motion without actions is within one standard deviation of the mean.
-    """
-
-    length_scale: float
-    lambda_: float
+    length_scale: float  # ℓ of the kernel [input]
+    lambda_: float  # λ = β
+    # RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in standard
+    # deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread.
     error: float
-    worse: float
-    share: float
+    worse: float  # difference from the best candidate's error, in standard errors over the demonstrations
+    share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
 
 
 @dataclass(frozen=True)

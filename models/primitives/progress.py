@@ -24,16 +24,12 @@ class StateProgress:
     the motion by at most `max_lag` steps. The tolerance should cover the deviations that contact and tracking cause
     while nothing blocks the robot.
 
-    Attributes:
-        tolerance: Tolerances of the position [unit of the output] and of the angles [rad], positive.
-        max_lag: Largest number of steps behind the clock, not negative; with 0, progress follows the clock.
-
     Raises:
         InputError: If an argument is out of range.
     """
 
-    tolerance: tuple[float, float]
-    max_lag: int
+    tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and of the angles [rad], positive
+    max_lag: int  # largest number of steps behind the clock, not negative; with 0, progress follows the clock
 
     def __post_init__(self) -> None:
         if len(self.tolerance) != 2 or not all(0.0 < one < np.inf for one in self.tolerance):

@@ -345,21 +345,13 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
 
 @dataclass(frozen=True)
 class Mixture:
-    """Joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations.
+    """Joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations."""
 
-    Attributes:
-        weights: Weights of the components (C,).
-        means: Means (C, 1 + O).
-        covariances: Covariances (C, 1 + O, 1 + O).
-        center: Mean of the data (1 + O,) [s, unit of the output].
-        scale: Standard deviations of the data (1 + O,) [s, unit of the output].
-    """
-
-    weights: np.ndarray
-    means: np.ndarray
-    covariances: np.ndarray
-    center: np.ndarray
-    scale: np.ndarray
+    weights: np.ndarray  # weights of the components (C,)
+    means: np.ndarray  # means (C, 1 + O)
+    covariances: np.ndarray  # covariances (C, 1 + O, 1 + O)
+    center: np.ndarray  # mean of the data (1 + O,) [s, unit of the output]
+    scale: np.ndarray  # standard deviations of the data (1 + O,) [s, unit of the output]
 
 
 def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, seed: int) -> Mixture:

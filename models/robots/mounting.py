@@ -24,35 +24,22 @@ from guiderail.models.robots.robot import EndEffector, JointDrives, Robot
 
 @dataclass(frozen=True)
 class MountedRobot:
-    """Robot in a plant.
+    """Robot in a plant."""
 
-    Attributes:
-        model: Model instance of its joints.
-        flange: Frame to which a tool is mounted.
-        actuators: Actuators in the order of its joints.
-    """
-
-    model: ModelInstanceIndex
-    flange: Frame
-    actuators: list[JointActuator]
+    model: ModelInstanceIndex  # model instance of its joints
+    flange: Frame  # frame to which a tool is mounted
+    actuators: list[JointActuator]  # actuators in the order of its joints
 
 
 @dataclass(frozen=True)
 class MountedEndEffector:
-    """End effector on a robot's flange.
+    """End effector on a robot's flange."""
 
-    Attributes:
-        wrist: Joint to the flange, at which a wrist sensor measures.
-        tool_center: Frame P of the tool center.
-        bodies: All bodies; the first is the child of `wrist`.
-        model: Model instance.
-        actuators: Actuators in the order of its joints; empty for a rigid tool, or a gripper added as a rigid body.
-    """
-
-    wrist: WeldJoint
-    tool_center: Frame
-    bodies: list[RigidBody]
-    model: ModelInstanceIndex
+    wrist: WeldJoint  # joint to the flange, at which a wrist sensor measures
+    tool_center: Frame  # frame P of the tool center
+    bodies: list[RigidBody]  # all bodies; the first is the child of `wrist`
+    model: ModelInstanceIndex  # model instance
+    # Actuators in the order of its joints; empty for a rigid tool, or a gripper added as a rigid body.
     actuators: list[JointActuator]
 
 

@@ -27,17 +27,11 @@ SIGNIFICANT = 0.05  # p-values below it support that a policy is better
 
 
 class Comparison(NamedTuple):
-    """Comparison of a policy's success with that of the best baseline policy, on the same episodes.
+    """Comparison of a policy's success with that of the best baseline policy, on the same episodes."""
 
-    Attributes:
-        baseline: Name of the baseline policy with the most successes.
-        successes: Number of successes of this baseline policy.
-        p: Largest p-value of the tests against each baseline policy; see `compare`.
-    """
-
-    baseline: str
-    successes: int
-    p: float
+    baseline: str  # name of the baseline policy with the most successes
+    successes: int  # number of successes of this baseline policy
+    p: float  # largest p-value of the tests against each baseline policy; see `compare`
 
 
 @dataclass(frozen=True, eq=False)  # compared as mappings

@@ -113,21 +113,13 @@ def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
 
 @dataclass(frozen=True)
 class Episode:
-    """Finished episode.
+    """Finished episode."""
 
-    Attributes:
-        index: Number of the episode.
-        trace: Every control step.
-        total: Sum of the rewards that the environment returned.
-        terms: Sum of each reward term.
-        info: `info` of the last step.
-    """
-
-    index: int
-    trace: EpisodeTrace
-    total: float
-    terms: Mapping[str, float]
-    info: Mapping[str, Any]
+    index: int  # number of the episode
+    trace: EpisodeTrace  # every control step
+    total: float  # sum of the rewards that the environment returned
+    terms: Mapping[str, float]  # sum of each reward term
+    info: Mapping[str, Any]  # `info` of the last step
 
     @cached_property
     def statistics(self) -> dict[str, float]:

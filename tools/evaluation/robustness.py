@@ -131,21 +131,13 @@ def select_axes(names: str | None) -> list[Axis]:
 
 @dataclass(frozen=True)
 class Point:
-    """One value of one axis.
-
-    Attributes:
-        axis: Axis.
-        value: Value on the axis.
-        environment: Options of the environment with this value.
-        trained: Value in training if it is the axis's default, otherwise None.
-        options: Options of every reset.
-    """
+    """One value of one axis."""
 
     axis: Axis
-    value: float
-    environment: Environment
-    trained: float | None
-    options: Mapping[str, Any] = field(default_factory=dict)
+    value: float  # value on the axis
+    environment: Environment  # options of the environment with this value
+    trained: float | None  # value in training if it is the axis's default, otherwise None
+    options: Mapping[str, Any] = field(default_factory=dict)  # options of every reset
 
 
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
@@ -249,21 +241,14 @@ DEMONSTRATION = "demonstration"  # name of the zero policy if it executes the de
 
 @dataclass(frozen=True)
 class _Actor:
-    """Policy in the environment of a run.
+    """Policy in the environment of a run."""
 
-    Attributes:
-        name: Name in the table.
-        make_policy: Function from an environment to the policy.
-        config: Configuration of the run.
-        environment: Options of the environment at every point, including the changes given to `robustness`.
-        about: Digest of a learned policy.
-    """
-
-    name: str
-    make_policy: MakePolicy
-    config: RunConfig
+    name: str  # name in the table
+    make_policy: MakePolicy  # function from an environment to the policy
+    config: RunConfig  # configuration of the run
+    # Options of the environment at every point, including the changes given to `robustness`.
     environment: Mapping[str, Any]
-    about: str | None = None
+    about: str | None = None  # digest of a learned policy
 
 
 def robustness(

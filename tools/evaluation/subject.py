@@ -104,24 +104,16 @@ def has_held_out_distribution(task: str) -> bool:
 
 @dataclass(frozen=True)
 class Subject:
-    """Policy that is evaluated or shown.
+    """Policy that is evaluated or shown."""
 
-    Attributes:
-        name: Name of the policy.
-        config: Configuration of its run; without a run, a configuration of the environment that it acts in; None if the
-            environment is given as an object.
-        make_policy: Function from an environment to the policy.
-        folder: Folder of its run, or None.
-        is_stored: True if evaluated episodes are stored in the run's folder.
-        digest: Digest of the policy, for the names of stored files; None for a baseline policy.
-    """
-
-    name: str
+    name: str  # name of the policy
+    # Configuration of its run; without a run, a configuration of the environment that it acts in; None if the
+    # environment is given as an object.
     config: RunConfig | None
-    make_policy: MakePolicy
-    folder: RunFolder | None = None
-    is_stored: bool = False
-    digest: str | None = None
+    make_policy: MakePolicy  # function from an environment to the policy
+    folder: RunFolder | None = None  # folder of its run, or None
+    is_stored: bool = False  # True if evaluated episodes are stored in the run's folder
+    digest: str | None = None  # digest of the policy, for the names of stored files; None for a baseline policy
 
 
 def find_subject(

@@ -34,19 +34,13 @@ Request = tuple[LcNsKmp, int, np.ndarray, np.ndarray | None]
 
 @dataclass(frozen=True)
 class GuideCommand:
-    """Command of one control step.
+    """Command of one control step."""
 
-    Attributes:
-        output: Command (O,) in the world.
-        violation: Violation of the segment's constraints; negative inside, −inf without constraints.
-        is_fallback: True if no command within the constraints was found; the command is then the last one or near it.
-        extra: Discrete output of the segment, for `to_action`.
-    """
-
-    output: np.ndarray
-    violation: float
+    output: np.ndarray  # command (O,) in the world
+    violation: float  # violation of the segment's constraints; negative inside, −inf without constraints
+    # True if no command within the constraints was found; the command is then the last one or near it.
     is_fallback: bool
-    extra: Any
+    extra: Any  # discrete output of the segment, for `to_action`
 
 
 class Guide(ABC):
@@ -172,23 +166,15 @@ class _FittedSegment:
 
 @dataclass(frozen=True)
 class GuideSettings:
-    """Settings of guidance by demonstrations.
+    """Settings of guidance by demonstrations."""
 
-    Attributes:
-        action_scale: κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
-        action_dims: Outputs that an action moves, one entry each; all by default.
-        history: P, past outputs that the motion of sKGRL passes through.
-        history_variance: ρ, variance of the past outputs [output²].
-        horizon: H, future points at which the constraints are satisfied.
-        orientation: Meaning of outputs 3 to 6 of a pose, in frames with a rotation.
-    """
-
+    # κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
-    action_dims: Sequence[int] | None = None
-    history: int = 4
-    history_variance: float = 1e-6
-    horizon: int = 20
-    orientation: Orientation = "rotation_vector"
+    action_dims: Sequence[int] | None = None  # outputs that an action moves, one entry each; all by default
+    history: int = 4  # P, past outputs that the motion of sKGRL passes through
+    history_variance: float = 1e-6  # ρ, variance of the past outputs [output²]
+    horizon: int = 20  # H, future points at which the constraints are satisfied
+    orientation: Orientation = "rotation_vector"  # meaning of outputs 3 to 6 of a pose, in frames with a rotation
 
 
 class PrimitiveGuide(Guide):

@@ -65,27 +65,19 @@ def exit_with_parent() -> None:
 class RobotConnection:
     """Connection to the robot driver.
 
-    Args:
-        robot_url: Address of the driver, LCM's default if empty; a simulated driver has a bus of its own.
-        robot: Name of the arm.
-        driver: Name of the driver; empty for the one with the robot's name.
-        sim: Use a simulated driver, in a process of its own.
-        synchronous: Run station and simulated driver in lockstep instead of by the wall clock; always so for the driver
-            fci, whose robot at 1 kHz is slower than real time on most machines.
-        rate: Rate of a simulated robot's clock relative to the wall clock.
-        scenario: Scenario file with robot, address and surroundings.
-
     Raises:
         InputError: If the options contradict each other, or the driver has no simulated robot.
     """
 
-    robot_url: str = ""
-    robot: str = DEFAULT_ROBOT
-    driver: str = ""
-    sim: bool = False
+    robot_url: str = ""  # address of the driver, LCM's default if empty; a simulated driver has a bus of its own
+    robot: str = DEFAULT_ROBOT  # name of the arm
+    driver: str = ""  # name of the driver; empty for the one with the robot's name
+    sim: bool = False  # use a simulated driver, in a process of its own
+    # Run station and simulated driver in lockstep instead of by the wall clock; always so for the driver fci, whose
+    # robot at 1 kHz is slower than real time on most machines.
     synchronous: bool = False
-    rate: float = DEFAULT_RATE
-    scenario: Path | None = None
+    rate: float = DEFAULT_RATE  # rate of a simulated robot's clock relative to the wall clock
+    scenario: Path | None = None  # scenario file with robot, address and surroundings
 
     @classmethod
     def from_scenario(cls, file: Path | None, **options: Any) -> RobotConnection:

@@ -62,17 +62,11 @@ COMPLETED = "done"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of an execution.
+    """Outcome of an execution."""
 
-    Attributes:
-        fault: Fault that stopped the arm, or NONE.
-        description: The outcome in words.
-        steps: Number of executed control steps of the skill.
-    """
-
-    fault: Fault
-    description: str
-    steps: int
+    fault: Fault  # fault that stopped the arm, or NONE
+    description: str  # the outcome in words
+    steps: int  # number of executed control steps of the skill
 
     @property
     def exit_code(self) -> int:

@@ -23,33 +23,20 @@ Weights = dict[str, dict[str, np.ndarray]]
 
 
 class Snapshot(NamedTuple):
-    """State of a learner that an actor needs.
+    """State of a learner that an actor needs."""
 
-    Attributes:
-        weights: Parameters by module and name.
-        transitions: Number of transitions that the learner has learned from.
-        greedy_successes: Number of consecutive successes in greedy episodes.
-    """
-
-    weights: Weights
-    transitions: int
-    greedy_successes: int
+    weights: Weights  # parameters by module and name
+    transitions: int  # number of transitions that the learner has learned from
+    greedy_successes: int  # number of consecutive successes in greedy episodes
 
 
 class SimulatedEpisode(NamedTuple):
-    """Episode that an actor simulated.
+    """Episode that an actor simulated."""
 
-    Attributes:
-        number: Number of the episode.
-        row: Its row in the table of the run.
-        transitions: Its transitions.
-        is_greedy: True if the learner acted without exploration.
-    """
-
-    number: int
-    row: dict[str, Any]
-    transitions: list[Transition]
-    is_greedy: bool
+    number: int  # number of the episode
+    row: dict[str, Any]  # its row in the table of the run
+    transitions: list[Transition]  # its transitions
+    is_greedy: bool  # True if the learner acted without exploration
 
 
 class ParallelLearner(Learner):

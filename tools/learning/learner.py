@@ -151,16 +151,11 @@ class DeferredLearner(NamedTuple):
     """Registry entry of a learner whose module is imported when the learner is constructed.
 
     PyTorch takes seconds to import; configurations and lists of names do not need it.
-
-    Attributes:
-        module: Import name of the module.
-        name: Name of the class.
-        Config: Configuration class.
     """
 
-    module: str
-    name: str
-    Config: type[LearnerConfig]
+    module: str  # import name of the module
+    name: str  # name of the class
+    Config: type[LearnerConfig]  # configuration class
 
     def __call__(self, *args: Any, **kwargs: Any) -> Learner:
         """Import the module and construct the learner."""

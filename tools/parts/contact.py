@@ -33,23 +33,14 @@ CHECK_SECONDS = 20  # largest CPU time for Drake to build the contact geometry [
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact geometry and settings.
+    """Contact geometry and settings."""
 
-    Attributes:
-        compliant: Name of the compliant part, "plug" or "socket".
-        pieces: Pieces of the compliant part.
-        snapping: Indices of the compliant part's bodies that snap.
-        modulus: Modulus of the bodies that do not snap [Pa].
-        snap_modulus: Modulus of the snapping bodies [Pa].
-        time_step: Time step of the simulation [s]; the default if None.
-    """
-
-    compliant: str
-    pieces: tuple[Piece, ...]
-    snapping: frozenset[int] = frozenset()
-    modulus: float = MODULUS
-    snap_modulus: float = MODULUS
-    time_step: float | None = None
+    compliant: str  # name of the compliant part, "plug" or "socket"
+    pieces: tuple[Piece, ...]  # pieces of the compliant part
+    snapping: frozenset[int] = frozenset()  # indices of the compliant part's bodies that snap
+    modulus: float = MODULUS  # modulus of the bodies that do not snap [Pa]
+    snap_modulus: float = MODULUS  # modulus of the snapping bodies [Pa]
+    time_step: float | None = None  # time step of the simulation [s]; the default if None
 
     @property
     def files(self) -> list[tuple[str, float]]:
@@ -76,25 +67,15 @@ class Contact:
 
 @dataclass(frozen=True)
 class Choice:
-    """Contact with its trials.
+    """Contact with its trials."""
 
-    Attributes:
-        contact: Contact geometry and settings.
-        push: Commanded depth below the target [m].
-        aligned: Trial with the socket in place.
-        deepest: Largest penetration in all trials, those with the plug on the rim included [m].
-        speed: Smallest real-time factor of the trials.
-        misaligned: Trials at `MISALIGNMENTS`.
-        seconds: CPU time of cutting, meshing and checking geometry, before any trial [s].
-    """
-
-    contact: Contact
-    push: float
-    aligned: Any
-    deepest: float
-    speed: float
-    misaligned: tuple[Any, ...] = ()
-    seconds: float = 0.0
+    contact: Contact  # contact geometry and settings
+    push: float  # commanded depth below the target [m]
+    aligned: Any  # trial with the socket in place
+    deepest: float  # largest penetration in all trials, those with the plug on the rim included [m]
+    speed: float  # smallest real-time factor of the trials
+    misaligned: tuple[Any, ...] = ()  # trials at `MISALIGNMENTS`
+    seconds: float = 0.0  # CPU time of cutting, meshing and checking geometry, before any trial [s]
 
 
 MakeFile = Callable[[Contact, float], Any]

@@ -36,15 +36,10 @@ NAME = "create-task/calibration"  # name of the task in the process that calibra
 
 @dataclass(frozen=True)
 class Setting:
-    """Setting of the difficulty.
+    """Setting of the difficulty."""
 
-    Attributes:
-        offset: Largest offset of the socket [m]; the smallest offset is 85 % of it.
-        action_repeat: Control steps per action; random actions that change more often move the plug less far.
-    """
-
-    offset: float
-    action_repeat: int = 5
+    offset: float  # largest offset of the socket [m]; the smallest offset is 85 % of it
+    action_repeat: int = 5  # control steps per action; random actions that change more often move the plug less far
 
     def options(self, force_limit: float, turn: float) -> dict[str, Any]:
         """Return the options of the environment.
@@ -77,19 +72,12 @@ FIRST = 4  # index of the setting that is tried first
 
 @dataclass(frozen=True)
 class Score:
-    """Successes of the baseline policies with one setting.
+    """Successes of the baseline policies with one setting."""
 
-    Attributes:
-        random: Number of successes of uniform random actions.
-        random_episodes: Number of episodes of random actions; fewer than requested if the result was clear earlier.
-        scripted: Number of successes of the scripted search.
-        scripted_episodes: Number of its episodes; 0 if it was not run because random actions succeed too often.
-    """
-
-    random: int
-    random_episodes: int
-    scripted: int
-    scripted_episodes: int
+    random: int  # number of successes of uniform random actions
+    random_episodes: int  # number of episodes of random actions; fewer than requested if the result was clear earlier
+    scripted: int  # number of successes of the scripted search
+    scripted_episodes: int  # number of its episodes; 0 if it was not run because random actions succeed too often
 
     @property
     def is_too_easy(self) -> bool:

@@ -42,29 +42,17 @@ _INTERVAL = 4  # simulator steps between two measurements of depth
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of a scripted insertion.
+    """Result of a scripted insertion."""
 
-    Attributes:
-        success: True if the plug reached the target.
-        pose: Final pose of the plug in the socket, position and rotation vector (6,) [m, rad].
-        lowest: Smallest height of the plug above the target [m].
-        peak_force: Largest contact force [N].
-        penetration: Largest penetration of the parts [m], without snapping pieces.
-        resting_penetration: Penetration at the end of the motion, while the plug is pushed at rest [m].
-        snap: Largest penetration of snapping pieces [m].
-        real_time_factor: Simulated time per CPU time.
-        recording: Poses, wrench and force at the control steps.
-    """
-
-    success: bool
-    pose: np.ndarray
-    lowest: float
-    peak_force: float
-    penetration: float
-    resting_penetration: float
-    snap: float
-    real_time_factor: float
-    recording: Recording
+    success: bool  # True if the plug reached the target
+    pose: np.ndarray  # final pose of the plug in the socket, position and rotation vector (6,) [m, rad]
+    lowest: float  # smallest height of the plug above the target [m]
+    peak_force: float  # largest contact force [N]
+    penetration: float  # largest penetration of the parts [m], without snapping pieces
+    resting_penetration: float  # penetration at the end of the motion, while the plug is pushed at rest [m]
+    snap: float  # largest penetration of snapping pieces [m]
+    real_time_factor: float  # simulated time per CPU time
+    recording: Recording  # poses, wrench and force at the control steps
 
 
 class Depths:

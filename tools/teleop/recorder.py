@@ -129,23 +129,14 @@ MAX_REST = 0.1  # longest rest of the command in a demonstration [s]
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """State before a control step, to which an undo returns.
+    """State before a control step, to which an undo returns."""
 
-    Attributes:
-        context: Copy of the root context.
-        steps: Number of simulated control steps.
-        command: Commanded pose, (6,).
-        offset: Offset of the sliders, (6,).
-        samples: Number of recorded commands.
-        resting: Number of control steps for which the command has not changed.
-    """
-
-    context: Context
-    steps: int
-    command: np.ndarray
-    offset: np.ndarray
-    samples: int
-    resting: int
+    context: Context  # copy of the root context
+    steps: int  # number of simulated control steps
+    command: np.ndarray  # commanded pose, (6,)
+    offset: np.ndarray  # offset of the sliders, (6,)
+    samples: int  # number of recorded commands
+    resting: int  # number of control steps for which the command has not changed
 
 
 @dataclass

@@ -32,21 +32,13 @@ class Teleoperator(Protocol):
 
 @dataclass(frozen=True)
 class Slider:
-    """Slider of a page.
+    """Slider of a page."""
 
-    Attributes:
-        limit: Largest value, and smallest value with the opposite sign.
-        step: Change by one key press.
-        keys: Keys that lower and raise the value, by JavaScript's codes.
-        scale: Factor from the slider's unit to that of the input.
-        speed: Change of the value per second at full deflection of its gamepad axis; 0: no axis moves it.
-    """
-
-    limit: float
-    step: float
-    keys: tuple[str, str]
-    scale: float = 1.0
-    speed: float = 0.0
+    limit: float  # largest value, and smallest value with the opposite sign
+    step: float  # change by one key press
+    keys: tuple[str, str]  # keys that lower and raise the value, by JavaScript's codes
+    scale: float = 1.0  # factor from the slider's unit to that of the input
+    speed: float = 0.0  # change of the value per second at full deflection of its gamepad axis; 0: no axis moves it
 
 
 class MeshcatPanel(Teleoperator):

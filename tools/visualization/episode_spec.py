@@ -16,27 +16,16 @@ from guiderail.tools.evaluation.subject import find_subject, refuse_guidance_cha
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """Held-out episode that is shown.
+    """Held-out episode that is shown."""
 
-    Attributes:
-        task: Name of the task.
-        environment: Options of the environment.
-        policy: Function that returns the policy for an environment.
-        acting: Label of the policy.
-        title: Text next to task and guidance in a heading.
-        run_seed: Seed of the run, from which its hidden values are sampled.
-        seed: Seed of the episode.
-        run: Folder of the run, or None.
-    """
-
-    task: str
-    environment: Mapping[str, Any]
-    policy: MakePolicy
-    acting: str
-    title: str
-    run_seed: int = 0
-    seed: int = HELD_OUT_SEED
-    run: Path | None = None
+    task: str  # name of the task
+    environment: Mapping[str, Any]  # options of the environment
+    policy: MakePolicy  # function that returns the policy for an environment
+    acting: str  # label of the policy
+    title: str  # text next to task and guidance in a heading
+    run_seed: int = 0  # seed of the run, from which its hidden values are sampled
+    seed: int = HELD_OUT_SEED  # seed of the episode
+    run: Path | None = None  # folder of the run, or None
 
     @classmethod
     def of_policy(

@@ -36,15 +36,10 @@ DescribeDifferences = Callable[[RunConfig], Sequence[str]]
 
 @dataclass(frozen=True)
 class Cell:
-    """Cell of a table.
+    """Cell of a table."""
 
-    Attributes:
-        text: Content.
-        mark: CSS class: "good", "bad", "long" or none.
-    """
-
-    text: str
-    mark: str = ""
+    text: str  # content
+    mark: str = ""  # CSS class: "good", "bad", "long" or none
 
 
 @dataclass(frozen=True)

@@ -100,21 +100,14 @@ class Run:
 
 @dataclass
 class ReportData:
-    """Contents of a report.
+    """Contents of a report."""
 
-    Attributes:
-        name: Title.
-        runs: Runs with at least one episode.
-        held_out: Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
-        is_study: True if one of the folders is that of a study.
-        folder_names: Unique name of each run's folder.
-    """
-
-    name: str
-    runs: list[Run] = field(default_factory=list)
+    name: str  # title
+    runs: list[Run] = field(default_factory=list)  # runs with at least one episode
+    # Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    is_study: bool = False
-    folder_names: list[str] = field(default_factory=list)
+    is_study: bool = False  # True if one of the folders is that of a study
+    folder_names: list[str] = field(default_factory=list)  # unique name of each run's folder
 
     @property
     def tasks(self) -> list[str]:

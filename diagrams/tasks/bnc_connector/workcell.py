@@ -37,23 +37,16 @@ HALF_TURN_OF_WRENCH = np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class BncWorkcell(MovableWorkcell):
-    """Jack in front of the robot's base, turned so that the target frame's axes are the world's.
-
-    Attributes:
-        dimensions: Dimensions of the connector.
-        p_WJ: Position of the jack, (3,) [m].
-        friction: Friction coefficient of the connector's metal.
-        margin: Distance at which contact with the jack begins in Drake [m]; not used in MuJoCo.
-        equal_area: True if the polygons of barrel and bore in Drake have the areas of their circles. Otherwise the
-            barrel's polygon lies inside its circle and the bore's outside, and the plug drops in at larger offsets.
-    """
+    """Jack in front of the robot's base, turned so that the target frame's axes are the world's."""
 
     fixture: ClassVar[str] = "jack"
     workpiece: ClassVar[str] = "plug"
-    dimensions: BncDimensions = field(default_factory=BncDimensions)
-    p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)
-    friction: float = FRICTION
-    margin: float = MARGIN
+    dimensions: BncDimensions = field(default_factory=BncDimensions)  # dimensions of the connector
+    p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the jack, (3,) [m]
+    friction: float = FRICTION  # friction coefficient of the connector's metal
+    margin: float = MARGIN  # distance at which contact with the jack begins in Drake [m]; not used in MuJoCo
+    # True if the polygons of barrel and bore in Drake have the areas of their circles. Otherwise the barrel's polygon
+    # lies inside its circle and the bore's outside, and the plug drops in at larger offsets.
     equal_area: bool = False
 
     @property

@@ -39,19 +39,13 @@ FILTERED_PAIRS = [
 
 @dataclass(frozen=True)
 class GridClampWorkcell(MovableWorkcell):
-    """Table in front of the robot's base; the target frame's axes are the world's.
-
-    Attributes:
-        dimensions: Dimensions of clamp and table.
-        p_WG: Center of the middle hole in the table's face, (3,) [m].
-        friction: Friction coefficient of pegs, holes and the table's face.
-    """
+    """Table in front of the robot's base; the target frame's axes are the world's."""
 
     fixture: ClassVar[str] = "table"
     workpiece: ClassVar[str] = "clamp"
-    dimensions: GridClampDimensions = field(default_factory=GridClampDimensions)
-    p_WG: tuple[float, float, float] = (0.55, 0.0, 0.15)
-    friction: float = FRICTION
+    dimensions: GridClampDimensions = field(default_factory=GridClampDimensions)  # dimensions of clamp and table
+    p_WG: tuple[float, float, float] = (0.55, 0.0, 0.15)  # center of the middle hole in the table's face, (3,) [m]
+    friction: float = FRICTION  # friction coefficient of pegs, holes and the table's face
 
     @property
     def X_WF(self) -> RigidTransform:

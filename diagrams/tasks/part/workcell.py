@@ -23,25 +23,17 @@ PLUG, SOCKET = "plug", "socket"
 
 @dataclass(frozen=True)
 class PartWorkcell(MovableWorkcell):
-    """Socket in the world and plug in the tool; the vertices of the assembled parts are given in the target frame.
-
-    Attributes:
-        folder: Folder with the SDF files of plug and socket.
-        place: Position of the target in the world, (3,) [m].
-        stiction_tolerance: Largest creep of a sticking contact [m/s].
-        scenario: Paths of Drake model directives of further objects.
-        convex: Names of the files of the convex pieces of plug and socket, for MuJoCo.
-        friction: Friction coefficient of the convex pieces.
-    """
+    """Socket in the world and plug in the tool; the vertices of the assembled parts are given in the target frame."""
 
     fixture: ClassVar[str] = SOCKET
     workpiece: ClassVar[str] = PLUG
-    folder: Path
-    place: tuple[float, float, float] = (0.55, 0.0, 0.15)
-    stiction_tolerance: float = 1e-5
-    scenario: Sequence[str] = ()
+    folder: Path  # folder with the SDF files of plug and socket
+    place: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the target in the world, (3,) [m]
+    stiction_tolerance: float = 1e-5  # largest creep of a sticking contact [m/s]
+    scenario: Sequence[str] = ()  # paths of Drake model directives of further objects
+    # Names of the files of the convex pieces of plug and socket, for MuJoCo.
     convex: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-    friction: float = 0.2
+    friction: float = 0.2  # friction coefficient of the convex pieces
 
     @property
     def X_WF(self) -> RigidTransform:

@@ -53,15 +53,10 @@ _MAX_LISTED = 8
 
 @dataclass(frozen=True)
 class _Column:
-    """Column of a table.
+    """Column of a table."""
 
-    Attributes:
-        name: Name in the file.
-        values: Values (N,).
-    """
-
-    name: str
-    values: np.ndarray
+    name: str  # name in the file
+    values: np.ndarray  # values (N,)
 
     @property
     def plain(self) -> str:

@@ -19,18 +19,12 @@ COMMANDED = ("command", "desired", "target", "equilibrium", "cmd", "action", "go
 
 @dataclass
 class Recorded:
-    """Imported motions.
+    """Imported motions."""
 
-    Attributes:
-        times: Times (N_m,) of each motion [s].
-        outputs: Outputs (N_m, O) of each motion.
-        names: Names of the outputs.
-        assumptions: Assumptions about facts that the file does not state, one sentence each.
-    """
-
-    times: list[np.ndarray]
-    outputs: list[np.ndarray]
-    names: tuple[str, ...]
+    times: list[np.ndarray]  # times (N_m,) of each motion [s]
+    outputs: list[np.ndarray]  # outputs (N_m, O) of each motion
+    names: tuple[str, ...]  # names of the outputs
+    # Assumptions about facts that the file does not state, one sentence each.
     assumptions: list[str] = field(default_factory=list)
 
 

@@ -17,15 +17,10 @@ GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a job.
+    """Result of a job."""
 
-    Attributes:
-        rows: Rows of its table.
-        failure: One sentence on why the job failed; empty if it succeeded.
-    """
-
-    rows: tuple[dict[str, Any], ...] = ()
-    failure: str = ""
+    rows: tuple[dict[str, Any], ...] = ()  # rows of its table
+    failure: str = ""  # one sentence on why the job failed; empty if it succeeded
 
 
 Work: TypeAlias = Callable[[Any], Outcome]
