@@ -139,11 +139,7 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_new(out: Path, what: str) -> None:
-    """Check that a path is new and can be written, before its content is computed.
-
-    Args:
-        out: Path.
-        what: Noun for the message, such as "file".
+    """Check that a path is new and can be written, before its content is computed; `what` is a noun for the message.
 
     Raises:
         InputError: If the path exists, or its folder cannot be written to.

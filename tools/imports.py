@@ -74,10 +74,6 @@ def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
     A task folder holds no code. A module that this process has imported, and a file that the user has named in this
     process, need no trust.
 
-    Args:
-        modules: Names of the modules, as the file has them.
-        source: File that names the modules, for error messages.
-
     Raises:
         InputError: If code would be executed without trust, or if `import_modules` raises one.
     """

@@ -137,11 +137,8 @@ class _Gateway:
 def _close_port(port: int, keep: Sequence[int]) -> None:
     """Replace this process's listening socket of a port by an unconnected one, and end the port's connections.
 
-    Drake has no function for this. The descriptor keeps its number, so that Drake can still close it.
-
-    Args:
-        port: Port of the listening socket.
-        keep: Ports of peers whose connections stay open.
+    Connections to peers with the ports `keep` stay open. Drake has no function for this. The descriptor keeps its
+    number, so that Drake can still close it.
 
     Raises:
         RuntimeError: If there is no such socket.

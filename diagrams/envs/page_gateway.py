@@ -100,11 +100,9 @@ def _is_below(path: str, parent: str) -> bool:
 
 
 def parse_event(message: bytes | str, controls: Controls) -> dict[str, Any] | None:
-    """Return a browser's message as the event that Meshcat expects; None if the message is invalid.
+    """Return a browser's message, any bytes, as the event that Meshcat expects; None if the message is invalid.
 
-    Args:
-        message: Message of a browser, any bytes.
-        controls: Controls that exist.
+    The controls are those that exist.
     """
     if not isinstance(message, bytes) or len(message) > MAX_MESSAGE:
         return None

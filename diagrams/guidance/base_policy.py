@@ -63,11 +63,9 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
     """Guidance that commands chunks, with a guard by default; the action has no effect. A guard exports ``rate``."""
 
     def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False):
-        """Construct the guidance.
+        """Construct the guidance; with `takes_window`, the chunks come from the input ``reference_window``.
 
-        Args:
-            prior: Prior knowledge.
-            takes_window: True takes the chunks from the input ``reference_window`` instead of the demonstrations' mean.
+        Without it, they are those of the demonstrations' mean.
 
         Raises:
             InputError: If the guard does not support the limits and constraints, or the motion waits for the robot.

@@ -149,12 +149,9 @@ class KgrlGuidance(PrimitiveGuidance):
     """KGRL: actions displace the command where the demonstrations vary, and commands satisfy the constraints."""
 
     def __init__(self, prior: PriorKnowledge, *, constrained: bool = True, takes_window: bool = False):
-        """Construct the guidance.
+        """Construct the guidance; without constraints it is the guidance `residual_covariance`.
 
-        Args:
-            prior: Prior knowledge.
-            constrained: True enforces the constraints; False gives the guidance `residual_covariance`.
-            takes_window: True takes mean and covariance from the input ``reference_window``, not the demonstrations.
+        With `takes_window`, mean and covariance come from the input ``reference_window``, not from the demonstrations.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()

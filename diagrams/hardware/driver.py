@@ -90,11 +90,7 @@ class Driver(ABC):
         raise InputError(f"the driver {self.name} can't hold the arm by itself")
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive the messages that have arrived.
-
-        Args:
-            timeout: Longest time to wait for a new status if none has arrived [s].
-        """
+        """Receive the messages that have arrived; if no new status has, wait for one at most `timeout` [s]."""
         end = time.monotonic() + timeout
         while True:
             status = self.read()

@@ -54,11 +54,9 @@ class FciDriver(PoseDriver):
     motion_limits = MOTION_LIMITS
 
     def __init__(self, url: str = "", *, client: Any = None):
-        """Construct the driver; the first `read` connects to the robot.
+        """Construct the driver of the robot at a host or address; the first `read` connects to it.
 
-        Args:
-            url: Host name or address of the robot.
-            client: Module franky, or a test double of it.
+        The client is the module franky, or a test double of it.
 
         Raises:
             InputError: If franky is not installed, or `url` is empty.

@@ -70,10 +70,7 @@ class WorkcellSimulator(MujocoSimulator):
     """Simulated FR3 with a task's parts: the workpiece on the flange, and the fixture in the world."""
 
     def __init__(self, workcell: Any):
-        """Construct the simulator.
-
-        Args:
-            workcell: Workcell of the task, a `ConvexWorkcell`.
+        """Construct the simulator of a task's workcell, a `ConvexWorkcell`.
 
         Raises:
             InputError: If the workcell has no convex solids.

@@ -123,10 +123,7 @@ class LcmDriver(Driver):
     command_type: ClassVar[Any]
 
     def __init__(self, lcm: DrakeLcmInterface | str = ""):
-        """Open the connection.
-
-        Args:
-            lcm: The bus, or its URL.
+        """Open the connection on a bus, or on its URL.
 
         Raises:
             InputError: If the URL is unusable.

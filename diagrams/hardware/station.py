@@ -264,11 +264,9 @@ class HardwareStation(Station):
         simulator.Initialize()
 
     def receive(self, context: Context, clock: float | None = None) -> None:
-        """Read the newest status and heartbeat before a step.
+        """Read the newest status and heartbeat before a step; `context` is the root context.
 
-        Args:
-            context: The root context.
-            clock: Wall clock time [s]; without it, each step counts as one period after the step before.
+        Without the wall clock time [s], each step counts as one period after the step before.
         """
         self.driver.receive()
         status, heartbeat = (system.GetMyMutableContextFromRoot(context) for system in (self._status, self._heartbeat))
@@ -296,10 +294,8 @@ class HardwareStation(Station):
     def copy_state_from(self, context: Context, other: HardwareStation, other_context: Context) -> None:
         """Copy the state of another station on the same driver, so that it continues to control the arm without a gap.
 
-        Args:
-            context: This station's own context, initialized.
-            other: Station that has controlled the arm: a `clone` of this station, or the original of this clone.
-            other_context: The other station's own context.
+        The other station is a `clone` of this station, or the original of this clone. Both contexts are the stations'
+        own, and this one is initialized.
         """
         context.SetStateAndParametersFrom(other_context)
         for mine, theirs, port in (
@@ -331,23 +327,16 @@ class HardwareStation(Station):
         )
 
     def estimate_force(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:
-        """Return the force on the tool of an arm at rest, (3,) [N].
-
-        Args:
-            positions: Joint positions, (n,) [rad].
-            external_torque: External joint torques, (n,) [Nm].
-        """
+        """Return the force (3,) [N] on the tool at rest, from joint positions and external torques (n,) [rad, Nm]."""
         J = self._jacobian(positions)
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 
     def max_torque_shares(self, positions: np.ndarray) -> np.ndarray:
         """Return the largest joint torques of the impedance's wrench, as shares of their limits, (n,).
 
-        The wrench is limited along and about each axis of the target separately; the worst corner of that box counts.
-        The torque limiter clips at 1; without it, the driver's reflex would stop the arm at 1 / `TORQUE_SHARE`.
-
-        Args:
-            positions: Joint positions, (n,) [rad].
+        The joint positions are (n,) [rad]. The wrench is limited along and about each axis of the target separately;
+        the worst corner of that box counts. The torque limiter clips at 1; without it, the driver's reflex would stop
+        the arm at 1 / `TORQUE_SHARE`.
         """
         J, limits = self._jacobian(positions), to_wrench_order(self.impedance.limits)
         return (limits[:3] @ np.abs(J[3:]) + limits[3:] @ np.abs(J[:3])) / np.array(self.limits.torque)

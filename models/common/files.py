@@ -41,12 +41,7 @@ def digest(arrays: Mapping[str, np.ndarray], text: str) -> str:
 
 
 def read_bytes(path: Path, what: str, max_size: int) -> bytes:
-    """Read a regular file.
-
-    Args:
-        path: Path of the file.
-        what: Kind of the file for messages, such as "template".
-        max_size: Largest accepted size [bytes].
+    """Read a regular file of at most `max_size` bytes; `what` is its kind for messages, such as "template".
 
     Raises:
         InputError: If there is no such file, it cannot be read, or it is too large.

@@ -147,13 +147,7 @@ class _ImportedName(NamedTuple):
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:
-    """Return the end of a message about an unknown name: the closest known name, or all of them.
-
-    Args:
-        name: Unknown name.
-        known: Known names.
-        otherwise: Text after the list of all names.
-    """
+    """Return the end of a message about an unknown name: the closest known name, or all of them and `otherwise`."""
     known = sorted(known)
     lower = {word.lower(): word for word in known}
     near = difflib.get_close_matches(str(name).lower(), lower, n=1)

@@ -41,11 +41,7 @@ _PATTERNS = {
 
 
 def load_yaml(path: str | Path, what: str = "file") -> Any:
-    """Read a YAML file.
-
-    Args:
-        path: Path of the file.
-        what: Kind of the file for messages, such as "template".
+    """Read a YAML file; `what` is its kind for messages, such as "template".
 
     Raises:
         InputError: As `parse_yaml`, or if the file cannot be read.
@@ -60,11 +56,7 @@ def load_yaml(path: str | Path, what: str = "file") -> Any:
 
 
 def parse_yaml(text: str, where: str = "text") -> Any:
-    """Read one YAML document as Python's own types.
-
-    Args:
-        text: The document.
-        where: Name of the document for messages.
+    """Read one YAML document as Python's own types; `where` is its name for messages.
 
     Raises:
         InputError: If it is not YAML, it has a tag, a date, a duplicate key or a key that is not text, or it is too

@@ -58,14 +58,10 @@ class Surface:
 
 
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:
-    """Return the convex pieces of a polygonal ring about z, whose first corner is half a side from the x axis.
+    """Return the vertices (4 K, 3) [m] of convex pieces of a polygonal ring about z, including shoulders.
 
-    Args:
-        profile: Corners (K, 2) of the convex section as [radius of the circle inside the polygon, height] [m].
-        num_sides: Number of sides, as for `sdf.lathe`.
-
-    Returns:
-        Vertices (4 K, 3) [m] of each piece, including shoulders.
+    The first corner of the polygon, with sides as for `sdf.lathe`, is half a side from the x axis. The corners (K, 2)
+    of the convex section are [radius of the circle inside the polygon, height] [m].
     """
     radius, height = np.asarray(profile, dtype=float).T
     radius = radius / np.cos(np.pi / num_sides)

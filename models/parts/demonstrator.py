@@ -75,13 +75,9 @@ def plan_search(travel: float, rim: float, turn: float, push: float, press: floa
 def demonstrator_motions(
     seed: int, script: tuple[np.ndarray, np.ndarray], press_from: float, times: np.ndarray
 ) -> np.ndarray:
-    """Return five different searches (5, N, 6) at `times` (N,) [s].
+    """Return five different searches (5, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
-    Args:
-        seed: Seed of the random deviations.
-        script: Times and poses of `plan_search`.
-        press_from: Height of the command above which the deviations are wide [m].
-        times: Times of the control steps [s].
+    The random deviations are wide while the command is above the height `press_from` [m].
     """
     rng = np.random.default_rng(seed)
     script_times, poses = script

@@ -87,11 +87,7 @@ def find_unit(path: Path, unit: str | None) -> str | None:
 
 
 def load_part(path: Path, unit: str) -> Part:
-    """Read a mesh file.
-
-    Args:
-        path: STL, OBJ, PLY, GLB or STEP file.
-        unit: Unit of the file's numbers, one of `UNITS`.
+    """Read a mesh file, STL, OBJ, PLY, GLB or STEP, with numbers in one of `UNITS`.
 
     Raises:
         InputError: If the file can't be read, the part can't be made a solid, or its size is out of bounds.

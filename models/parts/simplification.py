@@ -21,13 +21,8 @@ _SLIVER = 1e-4  # volume below which a cropped piece is a rounding error [mm³]
 def simplify(solid: Any, tolerance: float, start: float = 1.0) -> tuple[Any, float]:
     """Return a solid with fewer triangles, and its measured deviation [mm].
 
-    `manifold3d` may exceed its bound for thin parts. The deviation is therefore measured, and a smaller bound is tried
-    if it is too large.
-
-    Args:
-        solid: Solid.
-        tolerance: Largest deviation [mm].
-        start: Fraction of the tolerance that is tried first.
+    `manifold3d` may exceed its bound for thin parts. The deviation is therefore measured, and a smaller bound than the
+    tolerance [mm] is tried if it is too large. The first bound is the fraction `start` of the tolerance.
     """
     drawn = to_arrays(solid)
     for fraction in (start, 0.3 * start, 0.1 * start):

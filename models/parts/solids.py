@@ -41,12 +41,7 @@ class SurfaceLocator:
     """Nearest points on a triangle surface."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
-        """Construct the hierarchy.
-
-        Args:
-            vertices: Vertices (V, 3).
-            triangles: Indices of the corners (T, 3), T at least 1.
-        """
+        """Construct the hierarchy of at least one triangle (T, 3), of indices of vertices (V, 3)."""
         self._vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         self._triangles = np.ascontiguousarray(triangles, dtype=np.int64)
         self._tree: Any = import_extra("igl").AABB()

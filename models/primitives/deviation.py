@@ -20,15 +20,8 @@ def measure_deviation(
 ) -> tuple[float, float]:
     """Compute the RMS distance of a motion from its reference mean, in two units.
 
-    The motion is that of a primitive without actions, history and constraints. λ and β depend on the unit of the
-    outputs: values for meters are wrong for millimeters.
-
-    Args:
-        reference: As in `LcNsKmp`.
-        kernel: As in `LcNsKmp`.
-        lambda_: As in `LcNsKmp`.
-        beta: As in `LcNsKmp`.
-        horizon: As in `LcNsKmp`.
+    The motion is that of a primitive without actions, history and constraints, with the arguments of `LcNsKmp`. λ and β
+    depend on the unit of the outputs: values for meters are wrong for millimeters.
 
     Returns:
         The distance in standard deviations of the reference, and the largest distance of an output over its range.
@@ -45,14 +38,9 @@ def measure_deviation(
 def outputs_at(
     reference: ReferenceTrajectory, kernel: Kernel, hbar: float, horizon: int, steps: np.ndarray
 ) -> np.ndarray:
-    """Compute the outputs (n, O) at `steps` (n,) without actions, history and constraints: k* (K + ħΣ)⁻¹ μ.
+    """Compute the outputs (n, O) at `steps` (n,) without actions, history and constraints: k* (K + ħΣ)⁻¹ μ, ħ = λ + β.
 
-    Args:
-        reference: As in `LcNsKmp`.
-        kernel: As in `LcNsKmp`.
-        hbar: ħ = λ + β.
-        horizon: As in `LcNsKmp`.
-        steps: Steps of the reference; the window of each begins there.
+    The window of each step begins there. The other arguments are those of `LcNsKmp`.
     """
     outputs, at = reference.num_outputs, np.arange(horizon + 1)
     window = np.minimum(steps[:, None] + at, reference.num_steps - 1)
@@ -90,15 +78,7 @@ def check_deviation(
     horizon: int,
     max_deviation: float = MAX_DEVIATION,
 ) -> float:
-    """Return the first number of `measure_deviation`; warn if it exceeds one.
-
-    Args:
-        reference: As in `LcNsKmp`.
-        kernel: As in `LcNsKmp`.
-        lambda_: As in `LcNsKmp`.
-        beta: As in `LcNsKmp`.
-        horizon: As in `LcNsKmp`.
-        max_deviation: Largest accepted deviation [standard deviations].
+    """Return the first number of `measure_deviation`, in standard deviations; warn if it exceeds one.
 
     Raises:
         InputError: If the first number exceeds `max_deviation` and the second one exceeds `MAX_MISS`.

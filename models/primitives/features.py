@@ -51,16 +51,10 @@ def window_features(
 def window_interpolation(
     kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float, points: np.ndarray
 ) -> np.ndarray:
-    """Compute the map (H+1, J) that interpolates actions at some future points to all of them, given the history.
+    """Compute the map (H+1, J) that interpolates actions at J different future points to all, given the history.
 
-    The map is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history.
-
-    Args:
-        kernel: k.
-        history_inputs: As in `window_features`.
-        future_inputs: As in `window_features`.
-        history_noise: As in `window_features`.
-        points: Different indices (J,) of the future inputs.
+    The map is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history. See `window_features` for the
+    arguments.
 
     Raises:
         InputError: If points are so close that K̲ is singular.

@@ -166,12 +166,7 @@ def estimated_share(
 ) -> float:
     """Estimate `share_within_spread` of a primitive without a history from forty of its steps.
 
-    Args:
-        reference: Reference of the primitive.
-        kernel: As in `LcNsKmp`.
-        lambda_: As in `LcNsKmp`.
-        beta: As in `LcNsKmp`.
-        horizon: As in `LcNsKmp`.
+    The arguments are those of `LcNsKmp`.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     motion = outputs_at(reference, kernel, lambda_ + beta, horizon, steps)

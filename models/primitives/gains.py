@@ -18,9 +18,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.ndarray:
     """Compute the displacement (O,) of each output by a constant raw action of one in this output, RMS over the motion.
 
-    Args:
-        primitive: Primitive in its loop.
-        outputs: Indices or mask of the explored outputs, all by default; the others have authority zero.
+    `outputs` are indices or a mask of the explored outputs, all by default; the others have authority zero.
     """
     explored = _explored_mask(primitive, outputs)
     response = _constant_response(primitive)
@@ -81,12 +79,9 @@ def rms_gains(
 
 
 def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 1) -> np.ndarray:
-    """Compute the RMS displacement (O,) by white actions times `gains`, in demonstration standard deviations.
+    """Compute the RMS displacement (O,) by white actions times gains (O,), in demonstration standard deviations.
 
-    Args:
-        primitive: Primitive in its loop.
-        gains: Gains (O,) of uniform actions in ±1.
-        action_repeat: Control steps per action, at least 1.
+    The actions are uniform in ±1, and each lasts `action_repeat` control steps.
     """
     power = _white_power(primitive, action_repeat) @ np.asarray(gains, dtype=float) ** 2
     return np.sqrt(power) / deviation(primitive.reference)

@@ -175,10 +175,7 @@ def robot_names() -> list[str]:
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
-    """Add an end effector to the registry and return it.
-
-    Args:
-        end_effector: End effector with a name that is not registered yet.
+    """Add an end effector, whose name is not registered yet, to the registry and return it.
 
     Raises:
         InputError: If the name is taken.

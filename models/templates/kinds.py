@@ -21,11 +21,7 @@ Kind = TypeVar("Kind", bound=type)
 
 
 def register(registry: dict[str, type], name: str) -> Callable[[Kind], Kind]:
-    """Return a decorator that makes a dataclass available to template files.
-
-    Args:
-        registry: `INPUT_MAPPINGS`, `ACTIVE_CONSTRAINTS` or `TRANSITION_DISTANCES`.
-        name: Value of `kind` in a file, not registered yet.
+    """Return a decorator that makes a dataclass available to template files as a `kind` of a registry.
 
     Raises:
         ValueError: If the name is taken.

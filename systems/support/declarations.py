@@ -86,12 +86,7 @@ def check_period(period: float) -> None:
 
 
 def declare_sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
-    """Declare a discrete state that contains `port`, sampled at initialization and once per period.
-
-    Args:
-        system: System under construction.
-        port: Vector input port of the system.
-        period: Sampling period [s].
+    """Declare a discrete state that contains a vector input port, sampled at initialization and once per period [s].
 
     Returns:
         Index of the discrete state.
@@ -117,13 +112,9 @@ def declare_cache(
     *,
     prerequisites_of_calc: set[DependencyTicket],
 ) -> CacheEntry:
-    """Declare a cache entry with a value computed by `calc`.
+    """Declare a cache entry with a value that `calc` computes from the system's context.
 
-    Args:
-        system: System under construction.
-        name: Description of the cache entry.
-        calc: Function of the system's context that returns the value.
-        prerequisites_of_calc: Tickets of the values that `calc` reads.
+    Its name is a description. `prerequisites_of_calc` are the tickets of the values that `calc` reads.
     """
     return system.DeclareCacheEntry(
         description=name,
@@ -141,13 +132,10 @@ def declare_plant_context(
     *,
     prerequisites_of_calc: set[DependencyTicket],
 ) -> CacheEntry:
-    """Declare a cache entry that contains a context of `plant`, for its kinematics and inertia.
+    """Declare a cache entry that contains a context of the finalized plant, for its kinematics and inertia.
 
-    Args:
-        system: System under construction.
-        plant: Finalized plant.
-        set_state: Function of the system's context and the plant's context that writes the plant's state.
-        prerequisites_of_calc: Tickets of the values that `set_state` reads.
+    `set_state` writes the plant's state, given the system's context and the plant's context. It reads the values of
+    `prerequisites_of_calc`.
     """
     return system.DeclareCacheEntry(
         description="plant_context",
@@ -160,11 +148,9 @@ def declare_plant_context(
 
 
 def input_getter(name: str, description: str) -> Callable[[System], InputPort]:
-    """Return a method that returns the input port `name`, for the body of a class of systems or diagrams.
+    """Return a method that returns the input port `name`, which a system or diagram stores as `_<name>_port`.
 
-    Args:
-        name: Name of the port, which a system stores as `_<name>_port`.
-        description: Signal, shape and unit, for the method's docstring.
+    The description has signal, shape and unit, for the method's docstring.
     """
 
     def getter(self: System) -> InputPort:

@@ -40,12 +40,9 @@ def to_json(result: Mapping[str, Any]) -> str:
 
 
 def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
-    """Print a result, with a column for every baseline policy in `baselines`.
+    """Print a result, with a column for every baseline policy in `baselines`, or as one JSON object.
 
-    Args:
-        result: Values by name.
-        as_json: True to print one JSON object.
-        space: Replacement of an underscore in a name.
+    In the names of the values, `space` replaces an underscore.
     """
     if as_json:
         typer.echo(to_json(result))
@@ -142,13 +139,7 @@ def expand_choices(text: str) -> str:
 def command(
     example: str, name: str | None = None, group: typer.Typer = app
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a command with an example of its use.
-
-    Args:
-        example: Command line after `guiderail`.
-        name: Name of the command; the function's name by default.
-        group: Application that the command is added to.
-    """
+    """Register a command of a group, by default by the function's name; the example follows the word `guiderail`."""
     return group.command(name, cls=Command, epilog=f"Example: guiderail {example}")
 
 
@@ -266,12 +257,7 @@ Yes = Annotated[bool, option("Hardware: answer all pre-flight questions with yes
 
 
 def parse_pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]:
-    """Return `key=value` pairs as a dictionary.
-
-    Args:
-        given: Values of a repeated option.
-        option: Its name, for the error message.
-        example: Valid value, for the error message.
+    """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message.
 
     Raises:
         InputError: If a value has no `=`.
@@ -310,11 +296,9 @@ def parse_integers(text: str | None, option: str) -> list[int] | None:
 
 
 def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]:
-    """Return the options of an environment, each value of `--env` read as YAML.
+    """Return the options of an environment: values of `--env`, read as YAML, and other options that are not None.
 
-    Args:
-        given: Values of `--env`.
-        options: Options that have an argument of their own; None is left out, and `--env` takes precedence.
+    The values of `--env` take precedence.
 
     Raises:
         InputError: If a value of `--env` has no `=`.
@@ -329,11 +313,7 @@ def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]
 
 
 def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
-    """Import what registers a task and return its name, with the imports that a run of it has to store.
-
-    Args:
-        typed: Name of a task, or path of a task folder.
-        imports: Modules and files that register it.
+    """Import what registers a task, typed as name or folder; return its name, and the imports that a run has to store.
 
     Raises:
         InputError: If an import fails or the task folder is invalid.
@@ -360,24 +340,16 @@ def is_hardware(station: Any) -> bool:
 def hardware_arguments(
     environment: Mapping[str, Any], *, sim: bool, synchronous: bool, rate: float | None
 ) -> dict[str, Any]:
-    """Return the arguments of `RobotConnection.from_scenario` that were given.
+    """Return the arguments of `RobotConnection.from_scenario` that were given; None for `rate` is its default.
 
-    Args:
-        environment: Options of the environment; `robot_url`, `robot` and `driver` are taken from it.
-        sim: True for a simulated driver.
-        synchronous: True if it runs in lockstep.
-        rate: Speed of its clock; None for the default.
+    The address, the robot and the driver are options of the environment.
     """
     given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
     return given | {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
 
 
 def refuse_hardware_options(**given: Any) -> None:
-    """Raise InputError if an option that needs a hardware station was given without one.
-
-    Args:
-        given: Values of the options by name; None and False count as not given.
-    """
+    """Raise InputError if an option that needs a hardware station was given; None and False count as not given."""
     if any(value is not None and value is not False for value in given.values()):
         *names, last = (f"--{name}" for name in given)
         raise InputError(f"{', '.join(names)} and {last} are options of hardware: give --station hardware too")

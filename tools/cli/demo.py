@@ -30,10 +30,7 @@ MARK = ".demo"  # file that marks the folder of a demo: no other folder is remov
 def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     """Train sKGRL with TQC to avoid an obstacle in the narrow passage, evaluate it and print the result.
 
-    Args:
-        out: Folder of the run; an existing demo is replaced, anything else is refused.
-        episodes: Number of training episodes.
-        seed: Seed of all random numbers.
+    An existing demo in the folder `out` is replaced.
 
     Raises:
         InputError: If the folder contains something else than a demo, or a number is out of range.

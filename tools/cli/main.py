@@ -52,10 +52,9 @@ def _guiderail(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command and exit: 0 for success, 1 for a failed run, 2 for wrong input, 130 if interrupted.
+    """Run the command line, by default that of this process, and exit.
 
-    Args:
-        arguments: Words of the command line; those of this process by default.
+    The exit code is 0 for success, 1 for a failed run, 2 for wrong input and 130 if interrupted.
     """
     # Matrices are small here: threads cost more in synchronization than they save, and several runs share a machine.
     os.environ.setdefault("OMP_NUM_THREADS", "1")

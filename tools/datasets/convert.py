@@ -82,13 +82,9 @@ def import_recording(
 
 
 def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None = None) -> dict[str, Any]:
-    """Write demonstrations in another format; return a summary.
+    """Write the demonstrations of a file or folder in the format `kind` of `WRITERS`; return a summary.
 
-    Args:
-        source: File of demonstrations, or a folder of files.
-        out: Folder to write; it must not exist.
-        kind: Key of `WRITERS`.
-        rate: Sampling rate of the result [1/s]; the demonstrations' by default.
+    The folder `out` must not exist. The sampling rate [1/s] is the demonstrations' by default.
 
     Raises:
         InputError: For an unknown format, demonstrations that it cannot represent, or a folder that cannot be written.

@@ -123,10 +123,6 @@ _MAX_COMPONENTS = 8  # largest number of mixture components in the comparison wi
 def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
     """Return a warning if the motion without actions leaves the spread of the demonstrations, else None.
 
-    Args:
-        task: Name of the task.
-        environment: Options of its environment.
-
     Raises:
         InputError: For an unknown task or option.
     """
@@ -275,11 +271,9 @@ SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a transition distance, by the uni
 
 
 def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """Read a template and return its inputs, frames, states and transitions, with remarks.
+    """Read a template file or a shipped template and return its inputs, frames, states and transitions, with remarks.
 
-    Args:
-        file: Template, or the name of a shipped one.
-        draw: Picture of its state machine to write: .png, .svg, .pdf or .dot.
+    With `draw`, its state machine is drawn to a file .png, .svg, .pdf or .dot.
 
     Raises:
         InputError: If the template cannot be used.

@@ -75,13 +75,7 @@ class BaselinePolicy(Callback):
     """Policy that ignores the observation, with a new random generator in every episode."""
 
     def __init__(self, factory: BaselineFactory, env: gymnasium.Env, seed: int = 0):
-        """Construct the policy.
-
-        Args:
-            factory: Function that makes the policy of an episode.
-            env: Environment, for the size of its action only.
-            seed: Seed of the generators; episode i uses [seed, i].
-        """
+        """Construct the policy with the action size of `env`; the generator of episode i has the seed [seed, i]."""
         self._factory, self._seed, self._episode = factory, seed, -1
         self._size = int(np.prod(env.action_space.shape or ()))
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
@@ -131,10 +125,8 @@ def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> Po
 def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:
     """Return a function that makes a baseline policy, or a scripted policy of a task, for an environment.
 
-    Args:
-        task: Name of the task.
-        name: Key of `BASELINES`, the name of a scripted policy, or "scripted" for the default of the difficulty.
-        seed: Seed of a baseline's random generators.
+    The name is a key of `BASELINES`, that of a scripted policy, or "scripted" for the default of the difficulty. The
+    seed is that of a baseline's random generators.
 
     Raises:
         InputError: If the task has no policy of that name.

@@ -31,15 +31,10 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataF
 def episodes_file(
     folder: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
 ) -> Path:
-    """Return the file of evaluated episodes.
+    """Return the file of evaluated episodes of the policy `name`, which depend on all other arguments.
 
-    Args:
-        folder: Folder of the files.
-        name: Name of the policy.
-        config: Configuration of the run, for its task and seed.
-        environment: Options of the environment.
-        about: Anything else that the rows depend on, such as the digest of a learned policy.
-        how: Arguments of `evaluate_policy`; `label` and `processes` are ignored.
+    `about` is anything that they depend on besides the arguments `how` of `evaluate_policy`, such as the digest of a
+    policy. They do not depend on `label` and `processes`.
     """
     how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)

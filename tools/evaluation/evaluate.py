@@ -121,14 +121,7 @@ def evaluate_policies(
 def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
     """Return the rows of held-out episodes of one policy; see `evaluate_policies` for the other arguments.
 
-    Args:
-        env: Environment.
-        act: Policy.
-        label: Name of the progress bar on standard error; no bar if empty.
-        how: Further arguments of `evaluate_policies`.
-
-    Raises:
-        InputError: If a number is out of range.
+    The label is that of the progress bar on standard error; there is no bar without one.
     """
     ((_, rows, _),) = evaluate_policies(env, {POLICY: act}, labels={POLICY: label}, **how)
     return rows
@@ -142,13 +135,8 @@ def evaluate_run(
 ) -> pd.DataFrame:
     """Evaluate a policy in a run's environment, or with other environment options; return the episodes' rows.
 
-    Hidden values that are constant in a run are the same as in its training.
-
-    Args:
-        config: Configuration of the run.
-        make_policy: Function from an environment to the policy.
-        environment: Options of the environment; by default the run's options.
-        how: Arguments of `evaluate_policy`.
+    Hidden values that are constant in a run are the same as in its training. Further arguments are those of
+    `evaluate_policy`.
     """
     env = make_environment(config.task, config.environment if environment is None else environment)
     try:
@@ -170,14 +158,8 @@ def evaluate_once(
 ) -> pd.DataFrame | None:
     """Return the stored rows of held-out episodes; if there are none, evaluate the policy and store its rows.
 
-    Args:
-        folder: Folder of the stored tables.
-        name: Name of the policy, for the file name and the default label of the progress bar.
-        config: Configuration of the run, which decides the task and the hidden values.
-        make_policy: Function from an environment to the policy.
-        environment: Options of the environment.
-        about: Anything else that the rows depend on, such as the digest of a learned policy.
-        how: Arguments of `evaluate_policy`.
+    The run decides the task and the hidden values. See `episodes_file` for `about`; further arguments are those of
+    `evaluate_policy`, with the policy's name as the default label.
 
     Returns:
         Rows of the episodes, or None if the policy's observation or action shape does not match the environment.

@@ -52,12 +52,7 @@ class Forks:
     """
 
     def __init__(self, compute: Callable[[Any], Any], processes: int):
-        """Start the processes.
-
-        Args:
-            compute: Function from an argument to a result; argument and result can be pickled.
-            processes: Number of processes.
-        """
+        """Start processes that call `compute`, whose argument and result can be pickled."""
         context = multiprocessing.get_context("fork")
         self._idle: list[Connection] = []
         self._busy: list[Connection] = []
@@ -120,11 +115,6 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
 
     Results must not depend on the order of the calls. They are computed in this process if one process is enough, or if
     the system cannot fork.
-
-    Args:
-        compute: Function from an index to a result that can be pickled.
-        count: Number of results.
-        processes: Largest number of processes.
 
     Raises:
         KilledError: If a process is killed. An exception of `compute` is raised as it is.

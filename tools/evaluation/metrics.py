@@ -30,14 +30,7 @@ TOLERANCE = 1e-9  # a violation up to this is rounding of the primitive's solver
 
 
 def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the 95 % interval of the mean over runs.
-
-    Args:
-        values: Values (runs, n) of at least two runs.
-
-    Returns:
-        Lower and upper ends, (n,) each.
-    """
+    """Return the lower and upper ends, (n,) each, of the 95 % interval of the mean over at least two runs (runs, n)."""
     return _bootstrap(np.asarray(values, float), np.mean)
 
 
@@ -83,11 +76,8 @@ def wilson_of_each(successes: Sequence[int], episodes: Sequence[int]) -> list[tu
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the fraction of runs that have not converged, by Kaplan and Meier.
 
-    A run that never converged is censored at the last episode after which ten consecutive successes would have fitted.
-
-    Args:
-        converged: Episodes to convergence of each run, or None.
-        episodes: Number of episodes of each run.
+    A run that never converged, None in `converged`, is censored at the last episode after which ten consecutive
+    successes would have fitted.
 
     Returns:
         Numbers of episodes at which the fraction changes, and the fraction from each of them on, (k,) each.
@@ -101,12 +91,7 @@ def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[
 
 
 def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
-    """Return the number of episodes after which half of the runs have converged; None if less than half do.
-
-    Args:
-        steps: Steps of `survival`, (k,).
-        fractions: Fraction of runs that have not converged, (k,).
-    """
+    """Return the step (k,) of `survival` after which half of the runs have converged; None if less than half do."""
     reached = steps[fractions <= 0.5]
     return float(reached[0]) if len(reached) else None
 
@@ -137,14 +122,9 @@ class Episode:
 
 
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
-    """Return the mean jerk of positions and of rotations.
+    """Return the mean jerk of poses (n, O) at intervals of `period` [s]: "linear" [m/s³] and "angular" [rad/s³].
 
-    Args:
-        poses: Poses at equal intervals, (n, O); rotations are the last three of six numbers.
-        period: Interval [s].
-
-    Returns:
-        "linear" [m/s³] and "angular" [rad/s³]; the latter is 0 without rotations.
+    Rotations are the last three of six numbers; without them, "angular" is 0.
     """
     poses = np.array(poses)
     angular = mean_jerk(poses[:, 3:], period) if poses.shape[1] == 6 else 0.0
@@ -213,12 +193,8 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
     """Return an episode's row for an environment that is not of this package, with the columns that `info` provides.
 
-    Args:
-        index: Number of the episode.
-        total: Sum of the rewards.
-        infos: `info` of each step. `is_success` or `success` is the success of the episode, in any step;
-            `constraint_violation` and `contact_force` are those of the step.
-        is_terminated: True if the task ended the episode, False for a time limit.
+    The success of the episode is `is_success` or `success` in the `info` of any step; `constraint_violation` and
+    `contact_force` are those of a step. `is_terminated` is False for a time limit.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -375,13 +351,9 @@ def statistics_of(task: str | None = None) -> dict[str, Metric]:
 
 
 def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: str = "") -> dict[str, Any]:
-    """Return statistics of episodes by name; each is None if there are no episodes.
+    """Return statistics of episodes by name, with a prefix; each is None if there are no episodes.
 
-    Args:
-        rows: Table of episodes.
-        names: Names of the statistics.
-        prefix: Prefix of each name in the result.
-        task: Task of the episodes; its own statistics may be named too.
+    With a task, its own statistics may be named too.
 
     Raises:
         InputError: If a statistic is unknown, or the episodes lack a column that one is computed from.

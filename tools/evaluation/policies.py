@@ -67,13 +67,10 @@ class ForeignPolicy(Callback):
         action_shape: tuple[int, ...] | None = None,
         errors: tuple[type[Exception], ...] = (),
     ):
-        """Construct the policy.
+        """Construct the policy from a function from an observation to an action; shapes are given if they are known.
 
-        Args:
-            act: Function from an observation to an action; a leading dimension of 1 of the action is removed.
-            observation_shape: Shape of the observation, if it is known.
-            action_shape: Shape of the action, if it is known.
-            errors: Exceptions that `act` raises for an observation of a wrong shape.
+        A leading dimension of 1 of the action is removed. `errors` are raised by `act` for an observation of a wrong
+        shape.
         """
         self.observation_shape, self.action_shape = observation_shape, action_shape
         self._act, self._errors = act, errors
@@ -126,10 +123,7 @@ class PredictPolicy(ForeignPolicy):
 
 
 def as_policy(given: Any) -> PolicyFn:
-    """Return a policy as a function from an observation to an action.
-
-    Args:
-        given: A function, or an object with a `predict` method.
+    """Return a function, or an object with a `predict` method, as a function from an observation to an action.
 
     Raises:
         InputError: If `given` is neither.
@@ -280,10 +274,7 @@ def _load_onnx(path: Path) -> PolicyFn:
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
     """Return a policy unchanged if its observation and action shapes match an environment.
 
-    Args:
-        policy: Policy.
-        env: Environment.
-        learned_in: Options of the environment in which the policy was trained, for the error message.
+    The error message compares the environment with the options `learned_in` of the policy's training.
 
     Raises:
         InputError: If the shape of the policy's observations or actions differs from the environment's.
@@ -344,11 +335,6 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
     """Return combinations of options of a task's environment with which a policy is compatible, smallest change first.
 
     Guidance, observation and difficulty are varied, because they decide the sizes of observation and action.
-
-    Args:
-        task: Name of the task.
-        options: Options of its environment.
-        policy: Policy.
     """
     from guiderail.diagrams.guidance.registry import possible_guidance
     from guiderail.diagrams.tasks.registry import TASKS

@@ -143,11 +143,6 @@ class Point:
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
     """Return the points of some axes that an environment supports, and a sentence for each point left out.
 
-    Args:
-        task: Name of the task.
-        environment: Options of its environment.
-        axes: Axes.
-
     Raises:
         InputError: If the environment itself is invalid.
     """

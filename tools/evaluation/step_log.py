@@ -49,12 +49,7 @@ class StepLog(EnvCallback):
     """
 
     def __init__(self, env: gymnasium.Env, folder: Path):
-        """Construct the callback.
-
-        Args:
-            env: Environment.
-            folder: Folder of the files, one for each episode.
-        """
+        """Construct the callback of episodes in `env`; each has a file in the folder."""
         super().__init__(env)
         self._folder = folder
         self.seconds = 0.0
@@ -113,11 +108,7 @@ def write_step_log(path: Path, rows: pa.Table) -> None:
 
 
 def read_step_log(folder: Path, columns: list[str] | None = None) -> pd.DataFrame:
-    """Return the control steps of all episodes in a folder, in order.
-
-    Args:
-        folder: A run's `steps/`.
-        columns: Names of the columns to read; all by default.
+    """Return the control steps of all episodes in a run's `steps/`, in order, by default with all columns.
 
     Raises:
         InputError: If there is no step log, it has more than `MAX_ROWS` rows, or a file is damaged or lacks a column.

@@ -32,26 +32,17 @@ from guiderail.tools.visualization.style import is_demonstrated
 
 
 def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
-    """Return the names of the baseline policies that a task's evaluation includes by default.
-
-    Args:
-        task: Name of the task.
-        environment: Options of its environment.
-    """
+    """Return the names of the baseline policies that a task's evaluation includes by default."""
     zero = [] if is_demonstrated(environment.get("guidance")) else ["zero"]
     has_scripted = bool(scripted_policies(task)) and not str(environment.get("observation")).startswith("image")
     return [*zero, "uniform_random", "constant", *(["scripted"] if has_scripted else [])]
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Check that an environment has the guidance that a policy was trained with, which defines what actions mean.
-
-    Args:
-        own: Options of the environment that the policy was trained in.
-        other: Options of the environment that it acts in.
+    """Refuse another guidance than a policy was trained with, because it defines what actions mean.
 
     Raises:
-        InputError: If the guidance differs.
+        InputError: If the guidance differs between the options of the training and those of the environment.
     """
     trained, used = own.get("guidance"), other.get("guidance")
     if trained != used:
@@ -63,11 +54,6 @@ def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> 
 
 def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets: bool) -> str:
     """Return what an evaluation is valid for: the hidden offset of one run, or offsets sampled in every episode.
-
-    Args:
-        task: Name of the task.
-        environment: Options of its environment.
-        resample_offsets: True to sample the hidden offset of the run again in every episode.
 
     Raises:
         InputError: If `resample_offsets` is True and a run of the task has no hidden offset.
@@ -181,12 +167,9 @@ def _digest(source: Path) -> str:
 def make_baselines(
     config: RunConfig | None, environment: Mapping[str, Any], baselines: Mapping[str, MakePolicy] | Sequence[str] | None
 ) -> Mapping[str, MakePolicy]:
-    """Return the functions that make baseline policies, by name.
+    """Return the functions that make baseline policies by name, given as such or by names; None for the default set.
 
-    Args:
-        config: Configuration of the run or of the task; None if the environment is given as an object.
-        environment: Options of the environment.
-        baselines: Names, or functions by name; None for the default set.
+    There is no configuration if the environment is given as an object.
 
     Raises:
         InputError: If a name is unknown.

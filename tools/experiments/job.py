@@ -308,12 +308,9 @@ def _best_constant(job: Job) -> np.ndarray:
 
 
 def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: Mapping[str, str]) -> Outcome:
-    """Return the rows of a job, or one sentence on its failure, and log the attempt; raise nothing.
+    """Return the rows of a job by `work`, or one sentence on its failure, and log the attempt; raise nothing.
 
-    Args:
-        job: Job.
-        work: Function from a job to its rows.
-        versions: Required package versions by name; a worker with others is refused, because results depend on them.
+    A worker with other package versions than `versions` is refused, because results depend on them.
     """
     host = socket.gethostname()
     if not job.log.parent.is_dir():

@@ -154,10 +154,7 @@ class PartRandomizer:
     def __init__(self, task: InsertionTask, move_parts: Callable[[list[list[float]]], object], seed: int):
         """Sample the offset of the run; it is the same as in simulation with this seed.
 
-        Args:
-            task: Task with the parts.
-            move_parts: Function that sends the offsets of fixture and workpiece, such as `publish_part_offsets`.
-            seed: Seed of the run.
+        The function `move_parts` sends the offsets of fixture and workpiece, as `publish_part_offsets` does.
         """
         self._task, self._move_parts = task, move_parts
         task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))

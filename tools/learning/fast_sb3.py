@@ -52,9 +52,8 @@ class Linear:
     def backward(self, x: torch.Tensor, d: torch.Tensor) -> None:
         """Write the gradient of weights and biases.
 
-        Args:
-            x: Inputs of `forward`, (n or 1, batch, inputs).
-            d: Gradient of the loss with respect to the outputs, (n, batch, outputs).
+        `x` are the inputs of `forward`, and `d` is the gradient of the loss with respect to the outputs, (n, batch,
+        outputs).
         """
         torch.bmm(d.mT, x.expand(self._networks, -1, -1), out=self._weight_gradient)
         torch.sum(d, 1, out=self._bias_gradient)
@@ -167,12 +166,7 @@ class FlatAdam:
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], lr: float):
-        """Construct the optimizer.
-
-        Args:
-            parameters: Parameters of one data type; they become views of `values`.
-            lr: Learning rate.
-        """
+        """Construct the optimizer with a learning rate; the parameters, of one data type, become views of `values`."""
         parameters = list(parameters)
         self._shapes = [parameter.shape for parameter in parameters]
         self.values = flatten(parameters)

@@ -139,9 +139,8 @@ class ViaPointCorrections:
     def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
         """Return the via-points including an episode's corrections; new ones replace old ones nearby.
 
-        Args:
-            offsets: Offsets (A,) by control step, in units of a full action.
-            is_held: True if a correction lasted until the episode's end; it then applies to the rest of the motion.
+        The offsets (A,) by control step are in units of a full action. A correction that `is_held` until the episode's
+        end applies to the rest of the motion.
         """
         if not offsets:
             return self.points
@@ -174,12 +173,7 @@ class SupervisedTraining:
     """
 
     def __init__(self, config: RunConfig, supervisor: Supervisor, state: Mapping[str, Any]):
-        """Construct the environment of the first episode.
-
-        Args:
-            config: Configuration of the run.
-            supervisor: Supervisor of the run.
-            state: Values of the checkpoint from which the run resumes; empty for a new run.
+        """Construct the environment of the first episode; `state` are the values of a checkpoint, empty for a new run.
 
         Raises:
             InputError: If the guidance has no demonstrations to correct.

@@ -232,12 +232,9 @@ class LearningLog:
         *,
         is_finished: bool = False,
     ) -> None:
-        """Write the entry of the last of `rows`, one row per episode.
+        """Write the entry of the last of `rows`, one row per episode, with the learner's metrics.
 
-        Args:
-            rows: Rows of the episodes so far.
-            metrics: Returns the learner's metrics.
-            is_finished: True after the learner's `finish`: the entry has only metrics that were recorded since.
+        After the learner's `finish`, `is_finished` is True: the entry has only metrics that were recorded since.
         """
         if not self._formats:
             return

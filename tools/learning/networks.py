@@ -111,11 +111,8 @@ def packed_space(space: spaces.Box) -> spaces.Box:
 def pack_observation(observation: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Return an observation with an image as a vector of uint8, channel by channel, followed by the state's bytes.
 
-    A replay buffer of such vectors needs one byte per pixel. No number is rounded.
-
-    Args:
-        observation: Image (height, width, channels) of uint8, or vector [image / 255, state] of float32.
-        shape: Shape of the image.
+    A replay buffer of such vectors needs one byte per pixel. No number is rounded. The observation is an image (height,
+    width, channels) of uint8, or a vector [image / 255, state] of float32.
     """
     if observation.ndim == 3:
         return np.moveaxis(observation, -1, 0).ravel()
@@ -137,13 +134,10 @@ class ImageFeatures(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: spaces.Box, shape: tuple[int, int, int], encoder: str, random_shift: int):
-        """Construct the extractor.
+        """Construct the extractor of packed observations with images of height, width and channels.
 
-        Args:
-            observation_space: Space of packed observations.
-            shape: Height, width and channels of the image.
-            encoder: "average_pooling" or "convolutional".
-            random_shift: Largest shift in training mode [pixels].
+        The encoder is "average_pooling" or "convolutional". In training mode, images are shifted by up to
+        `random_shift` pixels.
 
         Raises:
             InputError: If the image is too small.
@@ -288,13 +282,9 @@ def export_layers(
     description: Mapping[str, Any],
     encoder: Sequence[tuple[np.ndarray, np.ndarray]] = (),
 ) -> Policy:
-    """Return the policy of a network's layers; batch renormalization is merged into the next linear layer.
+    """Return the policy of linear layers with one kind of activation between them, and of convolutions before them.
 
-    Args:
-        layers: Linear layers with one kind of activation between them.
-        space: Action space.
-        description: Entries of the policy's description.
-        encoder: Weight and bias of each convolution.
+    Batch renormalization is merged into the next linear layer. The encoder has weight and bias of each convolution.
 
     Raises:
         InputError: If there are other layers.

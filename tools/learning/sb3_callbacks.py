@@ -21,11 +21,7 @@ class Sb3Callbacks(Callback):
     """
 
     def __init__(self, callbacks: Any, learner: Learner):
-        """Construct the callback.
-
-        Args:
-            callbacks: Callback of Stable-Baselines3, or a list of them.
-            learner: Learner of the run.
+        """Construct the callback for one or several callbacks of Stable-Baselines3.
 
         Raises:
             InputError: If the learner has no model of Stable-Baselines3, or a callback is another object.

@@ -144,10 +144,7 @@ def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
     """Return a sort key, larger is better: seated plug, allowed penetration, and at least `MIN_SPEED`, in this order.
 
     If these agree, the faster contact is better if its penetration is allowed, and otherwise the one with less.
-
-    Args:
-        choice: Contact with its trials.
-        allowed: Largest allowed penetration [m].
+    `allowed` is the largest allowed penetration [m].
     """
     seats = bool(choice.aligned.success)
     is_shallow = seats and choice.deepest <= allowed

@@ -262,11 +262,7 @@ def _check_arguments(
 def _snapping(plug: Part, socket: Part, path: InsertionMotion, deviation: float) -> frozenset[int]:
     """Return the indices of the plug's bodies that overlap the socket during the motion.
 
-    Args:
-        plug: Plug.
-        socket: Socket.
-        path: Motion of the plug.
-        deviation: Largest overlap caused by the decimation of both parts [m].
+    `deviation` is the largest overlap caused by the decimation of both parts [m].
 
     Raises:
         InputError: If all bodies overlap: the plug is a rigid part that does not fit.

@@ -42,12 +42,7 @@ class Setting:
     action_repeat: int = 5  # control steps per action; random actions that change more often move the plug less far
 
     def options(self, force_limit: float, turn: float) -> dict[str, Any]:
-        """Return the options of the environment.
-
-        Args:
-            force_limit: Force limit [N].
-            turn: Largest turn of the socket [degrees].
-        """
+        """Return the options of the environment for a force limit [N] and a largest turn of the socket [degrees]."""
         return {
             "guidance": "kgrl",
             "fixture_offset": "per_episode",
@@ -107,14 +102,9 @@ def choose_setting(
 ) -> tuple[Setting, Score, bool]:
     """Return a setting with its score, and whether it has the required success rates.
 
-    Starting at `first`, settings are tried in the direction of the required success rates until one has them, the
-    direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned, and
-    the easiest of several.
-
-    Args:
-        score: Returns the score of a setting.
-        settings: Settings, the easiest first.
-        first: Index of the setting that is tried first.
+    Starting at the index `first`, settings are tried in the direction of the required success rates until one has them,
+    the direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned,
+    and the easiest of several. The settings begin with the easiest.
     """
     tried: dict[int, Score] = {}
     number = first
@@ -132,13 +122,9 @@ def choose_setting(
 def count_successes(
     run: Callable[[int], bool], episodes: int, *, most_successes: float = math.inf, most_failures: float = math.inf
 ) -> tuple[int, int]:
-    """Run episodes until a limit is exceeded or all have run; return the numbers of successes and of episodes.
+    """Run episodes by index until a limit is exceeded or all have run; return the numbers of successes and of episodes.
 
-    Args:
-        run: Runs an episode by its index, and returns whether it succeeded.
-        episodes: Largest number of episodes.
-        most_successes: Number of successes above which no further episode is run.
-        most_failures: Number of failures above which no further episode is run.
+    No further episode is run after more than `most_successes` successes or `most_failures` failures.
     """
     successes = 0
     for index in range(episodes):
@@ -167,14 +153,7 @@ class StopOnRim(gymnasium.Wrapper):
 
 
 def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episodes: int) -> Score:
-    """Return the successes of uniform random actions and of the scripted search.
-
-    Args:
-        task: Name of the task.
-        file: Task file of the task.
-        options: Options of the environment.
-        episodes: Largest number of episodes of each policy.
-    """
+    """Return the successes of uniform random actions and of the scripted search in at most `episodes` episodes."""
     env = StopOnRim(make_environment(task, options), file)
 
     def count(name: str, **limits: float) -> tuple[int, int]:
@@ -198,21 +177,14 @@ def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episod
 
 
 def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
-    """Return the force limit [N]: a multiple of an aligned insertion's peak force, at most the task's limit.
-
-    Args:
-        file: Task file.
-        peak_force: Peak force of an aligned insertion [N].
-    """
+    """Return a multiple of an aligned insertion's peak force as the force limit [N], at most the task's limit."""
     return float(min(file.force_limit, max(MIN_FORCE, math.ceil(FORCE_RATIO * peak_force))))
 
 
 def turn_of(clearance: float | None, radius: float) -> float:
-    """Return the largest turn of the socket that the clearance allows, at most `MAX_TURN` [degrees].
+    """Return the largest turn of the socket that the clearance [m] allows, at most `MAX_TURN` [degrees].
 
-    Args:
-        clearance: Clearance between the walls [m]; None without walls.
-        radius: Largest distance of the plug from the axis [m].
+    The clearance is None without walls, and the radius is the largest distance of the plug from the axis [m].
     """
     if not clearance or clearance < 0.0:
         return 0.0
@@ -224,12 +196,8 @@ def calibrate(
 ) -> PartTaskFile:
     """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
 
-    Args:
-        folder: Folder of the task.
-        file: Task file, as written to the folder.
-        radius: Largest distance of the plug from the axis [m].
-        episodes: Largest number of episodes of each policy for each setting.
-        log: Function called with a sentence on the result.
+    The file is in the task's folder. The radius is the largest distance of the plug from the axis [m], and each policy
+    runs at most `episodes` episodes with each setting. A sentence on the result is logged.
     """
     clearance = file.measured.get("clearance_mm")
     force_limit = force_limit_of(file, float(file.measured["force"]))

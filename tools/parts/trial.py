@@ -207,8 +207,7 @@ def triangles_of(path: Path) -> np.ndarray:
 def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:
     """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, and -1 if away from it.
 
-    Args:
-        pushed: Offset (x, y) of the socket [m] and the recording of each trial.
+    Each trial is given by the offset (x, y) of the socket [m] and its recording.
     """
     towards = 0.0
     for offset, recording in pushed:
@@ -298,12 +297,7 @@ def add_convex_pieces(
 ) -> PartTaskFile:
     """Write convex pieces of both parts, and return the task file with their names; unchanged if they do not work.
 
-    Args:
-        folder: Folder of the task.
-        file: Task file.
-        surfaces: Contact surfaces of plug and socket.
-        tolerance: Largest deviation of pieces [m].
-        log: Function called with a sentence on the result.
+    The pieces deviate from the surfaces by at most `tolerance` [m]. A sentence on the result is logged.
     """
     written: list[Path] = []
     changes: dict[str, PartModel] = {}
@@ -337,12 +331,9 @@ def _try_insertions(folder: Path, file: PartTaskFile) -> tuple[bool, bool]:
 
 
 def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> bool:
-    """Return True if a straight insertion on `station=mujoco` seats the plug.
+    """Return True if a straight insertion, offset along x [m], seats the plug on `station=mujoco`.
 
-    Args:
-        folder: Folder of the task.
-        file: Task file, which need not be written yet.
-        offset: Offset of the motion along x [m].
+    The task file need not be written yet.
     """
     times, poses = file.motion.plan_straight_insertion()
     poses[:, 0] += offset

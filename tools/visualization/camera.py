@@ -33,12 +33,7 @@ class Frames(EnvCallback):
     """
 
     def __init__(self, env: Any, max_frames: int = MAX_FRAMES):
-        """Construct the callback.
-
-        Args:
-            env: Environment.
-            max_frames: Largest number of frames, even.
-        """
+        """Construct the callback; the largest number of frames is even."""
         super().__init__(env)
         self._max_frames = max_frames
 

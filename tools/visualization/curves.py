@@ -17,10 +17,7 @@ from guiderail.tools.visualization.style import color, legend_above, new_figure,
 def draw_passage(axis: Axes, demonstrations: bool = True, *, named: bool = False) -> None:
     """Draw the narrow passage: walls, forbidden zone, obstacle and goal, and in gray the demonstrations.
 
-    Args:
-        axis: Axes.
-        demonstrations: True to draw the demonstrations.
-        named: True to label the items for a legend.
+    With `named`, the items are labeled for a legend.
     """
     passage = PassageGeometry()
     zone, obstacle, goal, path_label = ("forbidden zone", "obstacle", "goal", "demonstration") if named else 4 * ("",)

@@ -42,11 +42,7 @@ class Motion(EnvCallback):
     """
 
     def __init__(self, env: Any):
-        """Construct the callback.
-
-        Args:
-            env: Environment that was made with `render_mode="human"` and was reset.
-        """
+        """Construct the callback of an environment that was made with `render_mode="human"` and was reset."""
         super().__init__(env)
         self._query = self.base.task.query
         self._system = self._query.get_system()

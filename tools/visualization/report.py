@@ -61,13 +61,10 @@ class Table:
 def write_report(
     paths: Sequence[Path], out: Path, *, episodes: int = 0, describe_differences: DescribeDifferences | None = None
 ) -> Path:
-    """Write the report of runs and studies.
+    """Write the report of runs and studies as an HTML file.
 
-    Args:
-        paths: Folders of `guiderail train` or `guiderail study`.
-        out: HTML file to write.
-        episodes: Number of held-out episodes on which to evaluate each run that no study evaluated; 0: none.
-        describe_differences: Returns sentences on how a configuration differs from a reference.
+    Each run that no study evaluated is evaluated on `episodes` held-out episodes. `describe_differences` returns
+    sentences on how a configuration differs from a reference.
 
     Raises:
         InputError: If there is nothing to report on, or `out` is not an HTML file.

@@ -133,10 +133,8 @@ class ReportData:
 def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     """Read runs and studies from their folders.
 
-    Args:
-        paths: Folders of runs, or folders that contain runs.
-        episodes: Number of held-out episodes on which to evaluate each run outside of studies, together with
-            baseline policies; stored episodes are reused.
+    Each run outside of studies is evaluated on `episodes` held-out episodes, together with baseline policies; stored
+    episodes are reused.
 
     Raises:
         InputError: If a folder contains no run, or a file is damaged.

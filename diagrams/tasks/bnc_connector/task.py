@@ -57,10 +57,7 @@ LOCKED_STEPS = 3  # consecutive steps of the default control period that count a
 def reference_trajectory(demonstrations: str, count: int | None = None, **fit: Any) -> ReferenceTrajectory:
     """Return the reference of demonstrations, shipped or in a file, fitted once per process.
 
-    Args:
-        demonstrations: Name of shipped demonstrations, or path of a file.
-        count: Number of demonstrations that are used; None: all.
-        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`.
+    The first `count` demonstrations are used. Further arguments are those of `ReferenceTrajectory.from_demonstrations`.
     """
     return _fit_reference(demonstrations, count, tuple(sorted(fit.items())))
 

@@ -86,10 +86,9 @@ class BncWorkcell(MovableWorkcell):
         return plug_surfaces(self.dimensions, self.friction)
 
     def locks(self, plug: np.ndarray) -> bool:
-        """Return True if a plug is locked and on the jack's axis.
+        """Return True if a plug is locked and on the jack's axis, given X_JPlug as position and rotation vector (6,).
 
-        Args:
-            plug: X_JPlug as position and rotation vector, (6,); for an upright plug, `plug[5]` is the turn about z.
+        For an upright plug, `plug[5]` is the turn about z.
         """
         return bool(
             abs(plug[2] - self.dimensions.locked_height) < LOCKED_HEIGHT

@@ -94,20 +94,12 @@ class ScriptedSearch:
     """
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
-        """Construct the policy.
-
-        Args:
-            file: Task file.
-            duration: Function that returns the duration of the reference trajectory [s]; called at each observation.
-        """
+        """Construct the policy; `duration` returns the duration of the reference trajectory [s] at each observation."""
         self._file, self._duration = file, duration
         self._time, self._action = np.inf, np.zeros(2)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return an action (2,).
-
-        Args:
-            observation: Observation with the center of pressure.
+        """Return an action (2,) for an observation with the center of pressure.
 
         Raises:
             InputError: If the observation has no center of pressure.

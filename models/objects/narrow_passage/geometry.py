@@ -76,9 +76,7 @@ class PassageGeometry:
     def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
         """Return the distance d_t [m] of the robot's center from an obstacle's edge, negative inside (equation 4.24).
 
-        Args:
-            pose: Pose of the robot (2,) [m].
-            obstacle: Position (x, y) of the obstacle [m]; the attribute `obstacle` by default.
+        The center is (2,) [m], and so is the obstacle's, by default the attribute `obstacle`.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius

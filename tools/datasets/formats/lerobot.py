@@ -29,11 +29,7 @@ _CLOCKS = {
 
 
 def read_lerobot(folder: Path, signal: str | None) -> Recorded:
-    """Return one demonstration per episode of a dataset.
-
-    Args:
-        folder: Folder of the dataset.
-        signal: Feature of one dimension, such as action; the only candidate by default.
+    """Return one demonstration per episode of a dataset: a feature of one dimension, by default the only candidate.
 
     Raises:
         InputError: If the folder is not such a dataset, or several features could be imported.

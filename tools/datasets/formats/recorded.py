@@ -29,11 +29,7 @@ class Recorded:
 
 
 def rotations_of(quaternions: np.ndarray, where: str) -> Rotation:
-    """Return the rotations of quaternions (N, 4), [x y z w].
-
-    Args:
-        quaternions: Quaternions.
-        where: Name of the file, for the message.
+    """Return the rotations of quaternions (N, 4), [x y z w]; `where` names their file for the message.
 
     Raises:
         InputError: If a quaternion is not of length one, or contains NaN.
@@ -93,12 +89,7 @@ def choose_signal(candidates: Sequence[str], given: str | None, where: str, opti
     """Return the signal that is imported, with the assumption made.
 
     It is the given one, else the only candidate, else the only commanded one, because primitives should learn commands.
-
-    Args:
-        candidates: Names of all signals.
-        given: Name that was given, or None.
-        where: Name of the file, for messages.
-        option: Option that takes the name, for messages.
+    Messages name the file by `where`, and the option that takes the name.
 
     Raises:
         InputError: If these rules do not determine one signal.
