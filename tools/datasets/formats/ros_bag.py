@@ -47,7 +47,7 @@ def find_bags(path: Path) -> list[Path]:
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
-    """Return one demonstration per bag of a path; the topic is the only candidate by default, the target as of `poses_in_target`.
+    """Return one demonstration per bag of a path, in the target of `poses_in_target`; the only topic by default.
 
     Raises:
         InputError: If a bag cannot be read, or several topics could be imported.
