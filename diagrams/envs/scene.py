@@ -65,23 +65,16 @@ TOOL_VIEW: Viewpoint = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 
 @dataclass(frozen=True)
 class Scene:
-    """Drawing of a task.
+    """Drawing of a task."""
 
-    Attributes:
-        to_world: Function from poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
-        demonstrations: Poses (N, O) of each demonstration.
-        constraint: Corner points (k, 3) of each line that bounds the allowed region [m].
-        viewpoint: Viewpoint of a page.
-        arm_views: Viewpoints of a page with a whole arm, by name; the page opens with the first and offers all.
-        line_radius: Radius of a drawn path [m].
-    """
-
+    # Function from poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
     to_world: Callable[[np.ndarray], np.ndarray]
-    demonstrations: tuple[np.ndarray, ...] = ()
-    constraint: tuple[np.ndarray, ...] = ()
-    viewpoint: Viewpoint | None = None
+    demonstrations: tuple[np.ndarray, ...] = ()  # poses (N, O) of each demonstration
+    constraint: tuple[np.ndarray, ...] = ()  # corner points (k, 3) of each line that bounds the allowed region [m]
+    viewpoint: Viewpoint | None = None  # viewpoint of a page
+    # Viewpoints of a page with a whole arm, by name; the page opens with the first and offers all.
     arm_views: Mapping[str, Viewpoint] = field(default_factory=dict)
-    line_radius: float = 0.0015
+    line_radius: float = 0.0015  # radius of a drawn path [m]
 
 
 def in_plane(poses: np.ndarray) -> np.ndarray:

@@ -34,16 +34,11 @@ def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: M
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Rotations and reflections under which a task is invariant, except for details such as the demonstrated mean.
+    """Rotations and reflections under which a task is invariant, except for details such as the demonstrated mean."""
 
-    Attributes:
-        observations: Signed permutation of the observation for each of K symmetries, (K, n, n).
-        actions: Signed permutation of the action, (K, A, A).
-        privileged: Signed permutation of the privileged observation, (K, m, m); None if it is not declared.
-    """
-
-    observations: np.ndarray
-    actions: np.ndarray
+    observations: np.ndarray  # signed permutation of the observation for each of K symmetries, (K, n, n)
+    actions: np.ndarray  # signed permutation of the action, (K, A, A)
+    # Signed permutation of the privileged observation, (K, m, m); None if it is not declared.
     privileged: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -22,18 +22,13 @@ MARGIN = 1e-4  # share of each limit that is reserved for the solver's rounding 
 
 @dataclass(frozen=True)
 class GuardedChunk:
-    """Chunk within the limits.
+    """Chunk within the limits."""
 
-    Attributes:
-        outputs: Outputs (K, O).
-        rate: Speed along the path of the requested chunk, relative to the requested speed; 1 for a projection and 0 for
-            a fallback.
-        is_fallback: True if no chunk within the limits was found; `outputs` is then the rest of the previous result.
-    """
-
-    outputs: np.ndarray
+    outputs: np.ndarray  # outputs (K, O)
+    # Speed along the path of the requested chunk, relative to the requested speed; 1 for a projection and 0 for a
+    # fallback.
     rate: float
-    is_fallback: bool
+    is_fallback: bool  # True if no chunk within the limits was found; `outputs` is then the rest of the previous result
 
 
 class ChunkGuard:

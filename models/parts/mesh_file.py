@@ -40,17 +40,12 @@ _KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that defin
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A solid of one or several bodies.
+    """A solid of one or several bodies."""
 
-    Attributes:
-        path: Mesh file.
-        bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, counter-clockwise as seen from outside.
-        repair: Changes that made the mesh a solid.
-    """
-
-    path: Path
+    path: Path  # mesh file
+    # Vertices (V, 3) [m] and triangles (T, 3) of each body, counter-clockwise as seen from outside.
     bodies: tuple[tuple[np.ndarray, np.ndarray], ...]
-    repair: Repair = NOTHING_REPAIRED
+    repair: Repair = NOTHING_REPAIRED  # changes that made the mesh a solid
 
     @cached_property
     def solids(self) -> list[Any]:

@@ -40,22 +40,15 @@ Environment = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Axis:
-    """Disturbance, varied over several values.
+    """Disturbance, varied over several values."""
 
-    Attributes:
-        name: Name, as `--axes` takes it.
-        label: Label of the plot's axis, with the unit.
-        values: Values, including the default.
-        default: Value of an environment with default options.
-        change: Function from an environment's options and a value to the options that change.
-        resamples: True if the hidden values of a run are sampled again in every episode, because the axis changes them.
-    """
-
-    name: str
-    label: str
-    values: tuple[float, ...]
-    default: float
+    name: str  # name, as `--axes` takes it
+    label: str  # label of the plot's axis, with the unit
+    values: tuple[float, ...]  # values, including the default
+    default: float  # value of an environment with default options
+    # Function from an environment's options and a value to the options that change.
     change: Callable[[Environment, float], dict[str, Any]]
+    # True if the hidden values of a run are sampled again in every episode, because the axis changes them.
     resamples: bool = False
 
 

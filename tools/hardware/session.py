@@ -31,14 +31,10 @@ from guiderail.tools.learning.run_folder import RunConfig
 
 @dataclass(frozen=True)
 class RobotSession:
-    """Session at a robot.
+    """Session at a robot."""
 
-    Attributes:
-        env: The environment.
-        timing: Function that returns statistics of the intervals between statuses until now.
-    """
-
-    env: RobotEnv
+    env: RobotEnv  # the environment
+    # Function that returns statistics of the intervals between statuses until now.
     timing: Callable[[], Mapping[str, Any]]
 
 

@@ -71,14 +71,10 @@ def _split(flat: torch.Tensor, inputs: int, outputs: int) -> tuple[torch.Tensor,
 
 @dataclass
 class ForwardCache:
-    """Intermediate results of a forward pass that the backward pass needs.
+    """Intermediate results of a forward pass that the backward pass needs."""
 
-    Attributes:
-        inputs: Input of each layer, (n or 1, batch, inputs).
-        normalized: Affine output, its mean and its inverse standard deviation for each normalized hidden layer.
-    """
-
-    inputs: list[torch.Tensor]
+    inputs: list[torch.Tensor]  # input of each layer, (n or 1, batch, inputs)
+    # Affine output, its mean and its inverse standard deviation for each normalized hidden layer.
     normalized: list[tuple[torch.Tensor, ...]]
 
     def first(self, rows: int) -> "ForwardCache":

@@ -141,16 +141,11 @@ class _Snapshot:
 
 @dataclass
 class _Recording:
-    """Demonstration that is being recorded; rests, in which the operator looks and thinks, are shortened.
+    """Demonstration that is being recorded; rests, in which the operator looks and thinks, are shortened."""
 
-    Attributes:
-        commands: Commanded poses of the recorded control steps.
-        resting: Control steps for which the command has not changed.
-        snapshots: States to which undos return; the oldest are dropped.
-    """
-
-    commands: list[np.ndarray] = field(default_factory=list)
-    resting: int = 0
+    commands: list[np.ndarray] = field(default_factory=list)  # commanded poses of the recorded control steps
+    resting: int = 0  # control steps for which the command has not changed
+    # States to which undos return; the oldest are dropped.
     snapshots: deque[_Snapshot] = field(default_factory=lambda: deque(maxlen=MAX_UNDOS))
 
     def add(self, command: np.ndarray, period: float) -> None:
