@@ -30,7 +30,6 @@ def test_baselines_succeed_at_standard_tasks():
     ("study", "baseline"),
     [
         ("connector_hard_baselines", "demonstration"),
-        ("grid_clamp_hard_baselines", "zero"),
         ("pouring_hard_baselines", "zero"),
     ],
 )
@@ -83,11 +82,22 @@ def test_template_needs_least_force_and_residual_most():
         )
     }
     assert force["sct"] < force["none"] < force["residual"]
-    assert len(rows_of("grid_clamp_hard", "sct")) == 10
-    assert rows_of("grid_clamp_hard", "sct")["success_rate"].min() == 0.97
-    residual = rows_of("grid_clamp_hard", "residual")["success_rate"]
-    assert (residual.min(), residual.max()) == (0.22, 0.67)
-    assert (rows_of("grid_clamp_hard", "none")["success_rate"] <= 0.01).all()
+
+
+def test_bounded_force_makes_the_hard_clamp_easy():
+    """docs/results.md: a search ends no episode, so random actions succeed within the time and residual RL learns."""
+    methods = {method: rows_of("grid_clamp_hard", method) for method in ("sct", "residual", "none")}
+    assert all((rows["training_ended_in_collision"] == 0).all() for rows in methods.values())
+    assert len(methods["sct"]) == 10
+    assert methods["sct"]["success_rate"].min() == 0.96
+    assert (methods["residual"]["success_rate"] == 1.0).all()
+    assert (methods["none"]["success_rate"] <= 0.01).sum() == 4
+    baselines = {
+        name: rows_of("grid_clamp_hard_baselines", name)["success_rate"] for name in ("zero", "uniform_random")
+    }
+    assert baselines["zero"].item() == 0.0
+    assert 0.5 < baselines["uniform_random"].item() < 0.55
+    assert rows_of("grid_clamp_hard_baselines", "scripted")["success_rate"].item() >= 0.95
 
 
 def test_kgrl_has_no_wall_collision_in_the_passage():
