@@ -6,12 +6,15 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
 
 from guiderail.models.common.errors import InputError
+
+if TYPE_CHECKING:
+    from guiderail.tools.hardware.connection import RobotConnection
 
 COLUMN = 19  # width of a value in a table with several columns [characters]
 
@@ -337,15 +340,15 @@ def is_hardware(station: Any) -> bool:
     return station in stations.names() and not stations.get(station).is_simulated
 
 
-def hardware_arguments(
-    environment: Mapping[str, Any], *, sim: bool, synchronous: bool, rate: float | None
-) -> dict[str, Any]:
-    """Return the arguments of `RobotConnection.from_scenario` that were given; None for `rate` is its default.
+def connect(
+    environment: Mapping[str, Any], scenario: Path | None, *, sim: bool, synchronous: bool, rate: float | None
+) -> "RobotConnection":
+    """Return the connection to a robot; its address, the robot and the driver are options of the environment."""
+    from guiderail.tools.hardware.connection import RobotConnection
 
-    The address, the robot and the driver are options of the environment.
-    """
     given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
-    return given | {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
+    given |= {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
+    return RobotConnection.from_scenario(scenario, **given)
 
 
 def refuse_hardware_options(**given: Any) -> None:

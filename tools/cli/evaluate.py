@@ -1,8 +1,7 @@
 """`guiderail evaluate`, `guiderail robustness` and `guiderail certify`."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -70,10 +69,25 @@ def evaluate(
                 "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "
                 "--save and --resample-offsets out"
             )
-        connection = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
-        station = str(environment["station"])
-        result = _evaluate_on_hardware(Path(subject), episodes, policy, station, connection, scenario, yes, out)
-        print_result(result, as_json)
+        from guiderail.tools.evaluation.baselines import make_baseline
+        from guiderail.tools.hardware.evaluate import evaluate_on_robot
+        from guiderail.tools.learning.run_folder import RunFolder
+        from guiderail.tools.pretrained import find_run
+
+        connection = cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
+        config = RunFolder(find_run(Path(subject))).config()
+        on_robot = evaluate_on_robot(
+            Path(subject),
+            connection,
+            episodes,
+            station=str(environment["station"]),
+            policy=policy or "",
+            make_policy=None if policy is None else make_baseline(config.task, policy, config.seed),
+            assume_yes=yes,
+            out=out,
+            log=print_message,
+        )
+        print_result(on_robot, as_json)
         return
     cli.refuse_hardware_options(sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes, out=out)
     name = cli.find_task(subject, imports)[0]
@@ -109,38 +123,6 @@ def _split(names: str | None) -> list[str] | None:
     if names is None:
         return None
     return [] if names == "none" else [name.strip() for name in names.split(",")]
-
-
-def _evaluate_on_hardware(
-    run: Path,
-    episodes: int,
-    policy: str | None,
-    station: str,
-    connection: Mapping[str, Any],
-    scenario: Path | None,
-    yes: bool,
-    out: Path | None,
-) -> Mapping[str, Any]:
-    from guiderail.tools.evaluation.baselines import make_baseline
-    from guiderail.tools.hardware.connection import RobotConnection
-    from guiderail.tools.hardware.evaluate import evaluate_on_robot
-    from guiderail.tools.learning.run_folder import RunFolder
-    from guiderail.tools.pretrained import find_run
-
-    robot = RobotConnection.from_scenario(scenario, **connection)
-    config = RunFolder(find_run(run)).config()
-    make_policy = None if policy is None else make_baseline(config.task, policy, config.seed)
-    return evaluate_on_robot(
-        run,
-        robot,
-        episodes,
-        station=station,
-        policy=policy or "",
-        make_policy=make_policy,
-        assume_yes=yes,
-        out=out,
-        log=print_message,
-    )
 
 
 @cli.command("robustness runs/connector --env station=mujoco --episodes 50")

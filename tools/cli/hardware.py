@@ -35,12 +35,10 @@ def deploy(
     present pose, moves it slowly to the start and executes the skill; every control step is recorded. The exit code is
     0 if the skill was executed to its end, and 1 if a limit, a fault or a key stopped it.
     """
-    from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.executor import deploy as deploy_policy
 
     environment = cli.parse_environment(None, robot_url=robot_url, robot=robot, driver=driver)
-    given = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
-    connection = RobotConnection.from_scenario(scenario, **given)
+    connection = cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
     raise typer.Exit(deploy_policy(run, connection, station=station, assume_yes=yes, out=out, log=print_progress))
 
 

@@ -141,16 +141,14 @@ def train(
             )
         if settings.get("num_envs", "0") != "0":
             raise InputError("there is one robot: leave --num-envs out")
-        from guiderail.tools.hardware.connection import RobotConnection
         from guiderail.tools.hardware.train import train_on_robot
 
         given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
         given |= {"step_log": step_log, "imports": modules}
-        connection = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
         result = train_on_robot(
             task,
             out,
-            RobotConnection.from_scenario(scenario, **connection),
+            cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate),
             environment=environment,
             given={name: value for name, value in given.items() if value is not None},
             settings=settings,

@@ -151,6 +151,14 @@ STEPS, VIOLATION = "control steps", "m or rad"
 ENDINGS = "success, collision, spill, blocked, violation, time_limit or simulation_failure"
 COLLISION = "contact force, or the task's own collision signal, above its limit"
 
+
+def _violations(compute: Callable[[str], Callable[[Any], float]]) -> list[Metric]:
+    """Return the largest violations of the commanded and of the measured poses, as `compute` takes them by name."""
+    meaning = "largest constraint violation of any {} pose; negative is slack"
+    pairs = [(f"max_{which}_violation", meaning.format(which)) for which in ("commanded", "measured")]
+    return [Metric(name, VIOLATION, meaning, compute(name)) for name, meaning in pairs]
+
+
 COLUMNS = (
     Metric("episode", "", "number of the episode, from 0", lambda e: e.index),
     Metric("return", "reward", "sum of all rewards, undiscounted", lambda e: e.total),
@@ -165,18 +173,7 @@ COLUMNS = (
         for which in ("commanded", "measured")
         for part, of, unit in (("linear", "position", "m/s³"), ("angular", "orientation (0 without one)", "rad/s³"))
     ),
-    Metric(
-        "max_commanded_violation",
-        VIOLATION,
-        "largest constraint violation of any commanded pose; negative is slack",
-        _statistic("max_commanded_violation"),
-    ),
-    Metric(
-        "max_measured_violation",
-        VIOLATION,
-        "largest constraint violation of any measured pose; negative is slack",
-        _statistic("max_measured_violation"),
-    ),
+    *_violations(_statistic),
     Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
     Metric("saturated_steps", STEPS, "control steps with an actuator at its limit", _count("saturated_steps")),
@@ -305,29 +302,13 @@ _STATISTICS = (
     Metric("mean_force", "N", "each episode's mean force, mean over episodes", _mean("mean_force")),
     Metric("mean_squared_force", "N²", "mean squared force, mean over episodes", _mean("mean_squared_force")),
     Metric(SINCE, "N²", "mean squared force of the episodes after convergence", _force_since_convergence),
-    Metric(
-        "max_commanded_violation",
-        VIOLATION,
-        "largest constraint violation of any commanded pose; negative is slack",
-        _largest("max_commanded_violation"),
-    ),
-    Metric(
-        "max_measured_violation",
-        VIOLATION,
-        "largest constraint violation of any measured pose; negative is slack",
-        _largest("max_measured_violation"),
-    ),
-    Metric(
-        "violating_episodes",
-        "",
-        "episodes with a command outside the constraints",
-        _violating("max_commanded_violation"),
-    ),
-    Metric(
-        "measured_violating_episodes",
-        "",
-        "episodes with a measured pose outside the constraints",
-        _violating("max_measured_violation"),
+    *_violations(_largest),
+    *(
+        Metric(name, "", f"episodes with a {pose} outside the constraints", _violating(of))
+        for name, pose, of in (
+            ("violating_episodes", "command", "max_commanded_violation"),
+            ("measured_violating_episodes", "measured pose", "max_measured_violation"),
+        )
     ),
     Metric("collisions", "", "collisions that began in all episodes", _total("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision, in all episodes", _total("collision_steps")),

@@ -72,10 +72,23 @@ class Choice:
     contact: Contact  # contact geometry and settings
     push: float  # commanded depth below the target [m]
     aligned: Any  # trial with the socket in place
-    deepest: float  # largest penetration in all trials, those with the plug on the rim included [m]
-    speed: float  # smallest real-time factor of the trials
     misaligned: tuple[Any, ...] = ()  # trials at `MISALIGNMENTS`
     seconds: float = 0.0  # CPU time of cutting, meshing and checking geometry, before any trial [s]
+
+    @property
+    def trials(self) -> tuple[Any, ...]:
+        """All trials."""
+        return self.aligned, *self.misaligned
+
+    @property
+    def deepest(self) -> float:
+        """Largest penetration in all trials, those with the plug on the rim included [m]."""
+        return max(trial.penetration for trial in self.trials)
+
+    @property
+    def speed(self) -> float:
+        """Smallest real-time factor of the trials."""
+        return min(trial.real_time_factor for trial in self.trials)
 
 
 MakeFile = Callable[[Contact, float], Any]
@@ -188,8 +201,7 @@ def _adapt_settings(
     for _ in range(MAX_TRIALS):
         choice = _try_contact(folder, contact, surfaces, make_file)
         choices.append(choice)
-        trials = (choice.aligned, *choice.misaligned)
-        resting = max(trial.resting_penetration for trial in trials)
+        resting = max(trial.resting_penetration for trial in choice.trials)
         log(
             f"{contact.describe()}: {'seats' if choice.aligned.success else 'does not seat'}, "
             f"{choice.aligned.peak_force:.1f} N, penetration {1e3 * choice.deepest:.3f} mm, {choice.speed:.1f} × real "
@@ -236,10 +248,8 @@ def _try_contact(folder: Path, contact: Contact, surfaces: dict[str, ContactSurf
                 misaligned = tuple(
                     insert(folder, file, offset=xy, snapping=contact.snapping_pieces) for xy in MISALIGNMENTS
                 )
-                trials = (aligned, *misaligned)
-                deepest = max(trial.penetration for trial in trials)
-                return Choice(contact, push, aligned, deepest, min(t.real_time_factor for t in trials), misaligned)
-    return Choice(contact, push, aligned, aligned.penetration, aligned.real_time_factor)
+                return Choice(contact, push, aligned, misaligned)
+    return Choice(contact, push, aligned)
 
 
 def _write_pieces(folder: Path, contact: Contact, surfaces: dict[str, ContactSurface]) -> None:
