@@ -63,12 +63,10 @@ class RtdeDriver(PoseDriver):
     motion_limits = UR_MOTION_LIMITS
 
     def __init__(self, url: str = "", *, client: Any = None):
-        """Construct the driver; the first `read` connects to the robot.
+        """Construct the driver of the robot at a host or address; the first `read` connects to it.
 
-        Args:
-            url: Host name or address of the robot.
-            client: Namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`; those of
-                ur-rtde by default.
+        The client is a namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`, by default
+        of ur-rtde.
 
         Raises:
             InputError: If ur-rtde is not installed, or no host is named.
