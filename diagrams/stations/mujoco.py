@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 FIXTURE, TOOL, WORKPIECE = "fixture", "tool", "workpiece"
 """Names of the model's bodies. The workpiece is the tool's child; the tool's six joints are the model's first."""
 
+CENTERED: dict[str, Any] = {"ipos": [0.0, 0.0, 0.0], "explicitinertial": True}  # center of mass at a body's origin
 MAX_PAIRS = 31  # number of bits of a contact mask
 
 
@@ -93,9 +94,7 @@ def mujoco_model(
     option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # tolerance [m]; these contacts are 1 µm deep
 
     # The tool is added first, so that its joints are the first.
-    tool = spec.worldbody.add_body(
-        name=TOOL, mass=CARRIAGE_MASS, inertia=[CARRIAGE_INERTIA] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
-    )
+    tool = spec.worldbody.add_body(name=TOOL, mass=CARRIAGE_MASS, inertia=[CARRIAGE_INERTIA] * 3, **CENTERED)
     _add_gantry(mujoco, spec, tool, impedance)
     moments = inertia.Shift(inertia.get_com()).CalcRotationalInertia().get_moments()
     workpiece_body = tool.add_body(
@@ -124,9 +123,7 @@ def mujoco_parts(
     spec = mujoco.MjSpec()
     spec.option.timestep = contact.time_step
     for name, surfaces, side in ((FIXTURE, fixture, "conaffinity"), (WORKPIECE, workpiece, "contype")):
-        body = spec.worldbody.add_body(
-            name=name, mass=1e-3, inertia=[1e-7] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
-        )
+        body = spec.worldbody.add_body(name=name, mass=1e-3, inertia=[1e-7] * 3, **CENTERED)
         for surface in surfaces:
             bits = {"contype": 0, "conaffinity": 0} | {side: masks[surface.pair]}
             _add_surface(mujoco, spec, body, surface, bits, contact)
@@ -163,9 +160,7 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
     spring = surface.spring
     if spring is not None:
         mass = spring.stiffness * (spec.option.timestep / contact.spring_step) ** 2
-        body = body.add_body(
-            name=surface.name, mass=mass, inertia=[1e-7] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
-        )
+        body = body.add_body(name=surface.name, mass=mass, inertia=[1e-7] * 3, **CENTERED)
         body.add_joint(
             name=surface.name,
             type=mujoco.mjtJoint.mjJNT_SLIDE,

@@ -304,23 +304,16 @@ def export_station_ports(
     desired_pose: InputPort,
     command_time: InputPort,
     *,
-    pose: OutputPort,
-    wrench: OutputPort,
-    contact_force: OutputPort,
-    saturation: OutputPort,
-    command_timed_out: OutputPort,
     max_wrench: InputPort | None = None,
+    **outputs: OutputPort,
 ) -> None:
-    """Export the ports of every station, and `max_wrench` if the station has a bounded impedance."""
+    """Export the ports of every station, `OUTPUTS` by name, and `max_wrench` if it has a bounded impedance."""
     if max_wrench is not None:
         builder.ExportInput(max_wrench, "max_wrench")
     builder.ExportInput(desired_pose, "desired_pose")
     builder.ExportInput(command_time, "command_time")
-    builder.ExportOutput(pose, "pose")
-    builder.ExportOutput(wrench, "wrench")
-    builder.ExportOutput(contact_force, "contact_force")
-    builder.ExportOutput(saturation, "saturation")
-    builder.ExportOutput(command_timed_out, "command_timed_out")
+    for name in OUTPUTS:
+        builder.ExportOutput(outputs[name], name)
 
 
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -174,13 +174,9 @@ class InsertionTask(Task):
         return sampled
 
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Move fixture and workpiece of a `MovableWorkcell` by their offsets.
+        """Move fixture and workpiece of a `MovableWorkcell` by their offsets, in the root context.
 
-        Args:
-            station: Station.
-            context: Root context.
-            fixture: (x, y) of the fixture [m], and its turn about z [rad] if it has one.
-            workpiece: (x, y) of the workpiece in the tool [m], and its tilt about x and y [rad] if it has one.
+        The offsets of the fixture are (2,) or (3,), those of the workpiece (2,) or (4,), as in `part_poses`.
         """
         plant, workcell = station.plant, self.workcell()
         own = plant.GetMyMutableContextFromRoot(context)

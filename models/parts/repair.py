@@ -59,7 +59,8 @@ def close_surface(
     if not closed:
         solid = _without_doubled_faces(vertices, triangles)
     if not _is_solid(solid):
-        solid = _wrap(name, vertices, triangles, open_edges, where)
+        gaps = f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()})"
+        solid = _wrap(gaps, vertices, triangles)
     moved = 0.0
     if open_edges or not closed:
         moved = measure_distance(to_arrays(solid), (vertices, triangles))
@@ -105,12 +106,15 @@ def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
     return to_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def _wrap(name: str, vertices: np.ndarray, triangles: np.ndarray, open_edges: int, where: np.ndarray) -> Any:
-    """Return the solid of triangles that may cross or leave gaps: the boundary of their tetrahedral mesh."""
+def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
+    """Return the solid of triangles that may cross or leave gaps: the boundary of their tetrahedral mesh.
+
+    `gaps` are the gaps in words, for messages.
+    """
     if find_spec("pytetwild") is None or find_spec("pyvista") is None:
         raise InputError(
-            f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}): close it in the "
-            "CAD model, and export it again, or pip install 'guiderail[repair]', which closes small gaps"
+            f"{gaps}: close it in the CAD model, and export it again, or pip install 'guiderail[repair]', which closes "
+            "small gaps"
         )
     try:
         points, tetrahedra = run_isolated(
@@ -119,14 +123,10 @@ def _wrap(name: str, vertices: np.ndarray, triangles: np.ndarray, open_edges: in
         solid = to_manifold(*boundary_of(points, tetrahedra))
     except (IsolatedError, ValueError) as error:
         raise InputError(
-            f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}), and the repair "
-            f"failed ({error}): close it in the CAD model, and export it again"
+            f"{gaps}, and the repair failed ({error}): close it in the CAD model, and export it again"
         ) from error
     if not _is_solid(solid):
-        raise InputError(
-            f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()}), and its repair "
-            "still has open edges: close it in the CAD model, and export it again"
-        )
+        raise InputError(f"{gaps}, and its repair still has open edges: close it in the CAD model, and export it again")
     return solid
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
@@ -50,16 +51,16 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
         InputError: If its model file is missing, can't be read, or does not match the robot's data.
     """
     models = _read(plant, robot.model, f"robot {robot.name!r}")
-    joints = [_find_joint(plant, models, name, robot) for name in robot.joints]
+    joints = [_find(plant, models, "joint", name, robot) for name in robot.joints]
     model = joints[0].model_instance()
     if any(joint.model_instance() != model for joint in joints):
         raise InputError(f"robot {robot.name!r}: its joints must all be of one model instance")
-    base = _find_frame(plant, models, robot.base_frame, robot)
+    base = _find(plant, models, "frame", robot.base_frame, robot)
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
     return MountedRobot(
         model=model,
-        flange=_find_frame(plant, models, robot.flange_frame, robot),
+        flange=_find(plant, models, "frame", robot.flange_frame, robot),
         actuators=_list_actuators(plant, joints, f"robot {robot.name!r}"),
     )
 
@@ -118,18 +119,16 @@ def _read(plant: MultibodyPlant, file: Path, label: str, *, only_one: bool = Fal
     return models
 
 
-def _find_frame(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], name: str, robot: Robot) -> Frame:
+def _find(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], kind: str, name: str, robot: Robot) -> Any:
+    """Return the frame or the joint, as `kind` says, with a name."""
+    has, get = {
+        "frame": (plant.HasFrameNamed, plant.GetFrameByName),
+        "joint": (plant.HasJointNamed, plant.GetJointByName),
+    }[kind]
     for model in models:
-        if plant.HasFrameNamed(name, model):
-            return plant.GetFrameByName(name, model)
-    raise InputError(f"robot {robot.name!r}: {robot.model.name} has no frame {name!r}")
-
-
-def _find_joint(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], name: str, robot: Robot) -> Joint:
-    for model in models:
-        if plant.HasJointNamed(name, model):
-            return plant.GetJointByName(name, model)
-    raise InputError(f"robot {robot.name!r}: {robot.model.name} has no joint {name!r}")
+        if has(name, model):
+            return get(name, model)
+    raise InputError(f"robot {robot.name!r}: {robot.model.name} has no {kind} {name!r}")
 
 
 def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:

@@ -18,6 +18,7 @@ from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.geometry import (
     WORLD,
     Frames,
+    StatePart,
     bearing,
     chord_angle,
     largest,
@@ -31,7 +32,7 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, requi
 UNBOUNDED = 1e3  # radius beyond the reach of any robot [m]
 
 
-class ActiveConstraint(ABC):
+class ActiveConstraint(StatePart, ABC):
     """One constraint of project_q (equation 2.21)."""
 
     @abstractmethod
@@ -41,12 +42,6 @@ class ActiveConstraint(ABC):
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
         """Return the distance of X_WE from its projection, the larger of position [m] and angle [rad]; 0 if allowed."""
         return pose_distance(self.project(X_WE, frames), X_WE)
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of the object frames that the constraint refers to."""
-        frame = getattr(self, "frame", WORLD)
-        return () if frame == WORLD else (frame,)
 
 
 class FrameConstraint(ActiveConstraint):

@@ -7,6 +7,7 @@ horizontal axis that is perpendicular to the bearing, the horizontal direction f
 import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,19 @@ from guiderail.models.common.transforms import (
 
 Frames = Mapping[str, RigidTransform]
 WORLD = "world"
+
+
+class StatePart:
+    """Mapping, constraint or distance of a template's state, with at most one frame, the field `frame`."""
+
+    own_frames: ClassVar[tuple[str, ...]] = (WORLD,)  # frames that are not those of objects
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of the object frames that the part refers to."""
+        frame = getattr(self, "frame", WORLD)
+        return () if frame in self.own_frames else (frame,)
+
 
 NEAR_AXIS = 1e-9  # distance from the axis below which the bearing is undefined [m]
 

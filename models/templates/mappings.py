@@ -7,13 +7,13 @@ import numpy as np
 from typing_extensions import override
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, axis_angle_rotation
-from guiderail.models.templates.geometry import WORLD, Frames, bearing, position_in, tilt_axis
+from guiderail.models.templates.geometry import WORLD, Frames, StatePart, bearing, position_in, tilt_axis
 from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
 
 TOOL = "tool"
 
 
-class InputMapping(ABC):
+class InputMapping(StatePart, ABC):
     """One mapping of map_q (equation 2.19), for some of the inputs.
 
     A displacement ΔH is a RigidTransform. Its translation is added to p_WE. Its rotation, about the end effector's
@@ -21,6 +21,7 @@ class InputMapping(ABC):
     """
 
     inputs: tuple[int, ...]
+    own_frames = (WORLD, TOOL)
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
@@ -30,12 +31,6 @@ class InputMapping(ABC):
     def used_inputs(self) -> tuple[int, ...]:
         """Numbers of the inputs that the mapping uses; by default the field `inputs`."""
         return self.inputs
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of the object frames that the mapping refers to."""
-        frame = getattr(self, "frame", WORLD)
-        return () if frame in (WORLD, TOOL) else (frame,)
 
 
 def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:

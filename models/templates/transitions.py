@@ -10,11 +10,11 @@ from typing_extensions import override
 
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.constraints import TiltLimits, axes
-from guiderail.models.templates.geometry import WORLD, Frames, chord_angle, matrix_deg, position_in
+from guiderail.models.templates.geometry import WORLD, Frames, StatePart, chord_angle, matrix_deg, position_in
 from guiderail.models.templates.kinds import TRANSITION_DISTANCES, register, require, require_three
 
 
-class TransitionDistance(ABC):
+class TransitionDistance(StatePart, ABC):
     """Transition distance d_t, which decreases as the task progresses.
 
     Attributes:
@@ -26,12 +26,6 @@ class TransitionDistance(ABC):
     @abstractmethod
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         """Return the distance at X_WE, [m] or [rad]."""
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of the object frames that the distance refers to."""
-        frame = getattr(self, "frame", WORLD)
-        return () if frame == WORLD else (frame,)
 
 
 @register(TRANSITION_DISTANCES, "distance")
