@@ -28,10 +28,13 @@ class DrivenStation:
         num_samples: int,
         add_to_builder: Callable[[DiagramBuilder, Station], None] | None = None,
     ):
-        """Construct the diagram, which the station becomes part of, and its simulator.
+        """Construct the diagram and its simulator.
 
-        The first output of `source` is the desired pose: a trajectory, an input device or a policy. At most
-        `num_samples` control periods are recorded. `add_to_builder` adds further systems, such as a camera.
+        Args:
+            station: Station; it becomes part of the diagram.
+            source: System with the desired pose as first output, such as a trajectory, an input device or a policy.
+            num_samples: Largest number of control periods to record.
+            add_to_builder: Function that adds further systems, such as a camera, before the diagram is built.
         """
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)

@@ -30,8 +30,10 @@ class FciLockstepClock:
     def __init__(self, host: str, timeout: float, period: float):
         """Construct the clock.
 
-        `host` is the address of the simulated robot, `timeout` the longest wait for an answer [s of wall clock time],
-        and `period` the status period of the station [s].
+        Args:
+            host: Address of the simulated robot.
+            timeout: Longest wait for an answer [s of wall clock time].
+            period: Status period of the station [s].
         """
         self._address, self._timeout, self._period = (host, LOCKSTEP_PORT), timeout, period
         self._socket: socket.socket | None = None

@@ -250,11 +250,17 @@ def serve_in_real_time(
     rate: float = 1.0,
     log: Callable[[str], None] = print,
 ) -> None:
-    """Simulate an arm for `seconds` in real time; like a real robot, it does not wait for commands.
+    """Simulate an arm in real time; like a real robot, it does not wait for commands.
 
     Contact makes the simulation slower. If the simulation falls so far behind that its statuses count as old, this is
-    reported once, because the commanding program is not the cause. `rate` is that of the robot's clock relative to the
-    wall clock, and `after_status` is called after every status, for a safety monitor.
+    reported once, because the commanding program is not the cause.
+
+    Args:
+        simulator: Simulator of the arm, initialized.
+        seconds: Simulated time to run [s].
+        after_status: Function that is called after every status, for a safety monitor.
+        rate: Rate of the robot's clock relative to the wall clock.
+        log: Function that shows a message.
 
     Raises:
         InputError: If messages cannot be received in this environment.

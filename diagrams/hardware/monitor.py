@@ -55,10 +55,13 @@ class SafetyMonitor:
         limits: SafetyLimits,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Construct the monitor, with a connection of its own to the robot.
+        """Construct the monitor.
 
-        Only the inertia of the plant is used, the finalized controller plant of arm and tool. The limits are those of
-        the torque and the durations of the phases of a stop. `clock` returns the local time [s].
+        Args:
+            driver: The monitor's own connection to the robot.
+            plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
+            limits: Torque limits, and durations of the phases of a stop.
+            clock: Function that returns the local time [s].
         """
         driver.check_usable()
         self.state, self.fault = MonitorState.IDLE, Fault.NO_STATUS

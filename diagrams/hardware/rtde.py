@@ -63,10 +63,12 @@ class RtdeDriver(PoseDriver):
     motion_limits = UR_MOTION_LIMITS
 
     def __init__(self, url: str = "", *, client: Any = None):
-        """Construct the driver of the robot at a host or address; the first `read` connects to it.
+        """Construct the driver; the first `read` connects to the robot.
 
-        The client is a namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`, by default
-        of ur-rtde.
+        Args:
+            url: Host name or address of the robot.
+            client: Namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`; those of
+                ur-rtde by default.
 
         Raises:
             InputError: If ur-rtde is not installed, or no host is named.

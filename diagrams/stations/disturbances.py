@@ -214,8 +214,12 @@ def disturbed(
 ) -> Station:
     """Build a station with the impedance of a task, and with disturbances if there are any.
 
-    The builder has a parameter `impedance` if that or its stiffness is to be set; None is the station's own.
-    `is_simulated` is False for a robot, and `name` is the station's name in messages.
+    Args:
+        build: Builder of the station, with a parameter `impedance` if that or its stiffness is to be set.
+        disturbances: Disturbances.
+        is_simulated: False for a robot.
+        name: Name of the station, for messages.
+        impedance: Impedance of the task; the station's own by default.
 
     Raises:
         InputError: If the station does not have such a disturbance, or no impedance to set.

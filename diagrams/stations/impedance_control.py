@@ -88,8 +88,10 @@ def make_phase_wrench_limit(
 ) -> PhaseWrenchLimit | None:
     """Return the system that limits the wrench by a template's state, or None if no state has a limit.
 
-    The impedance is the station's, None if its wrench cannot be limited at run time; `period` is the control period
-    [s].
+    Args:
+        template: Shared control template.
+        impedance: Impedance of the station; None if its wrench cannot be limited at run time.
+        period: Control period [s].
 
     Raises:
         InputError: If a state has a limit, and the impedance is not bounded.
@@ -158,8 +160,6 @@ def add_joint_impedance(
 ) -> OutputPort:
     """Add watchdog, tank, governor and monitor of six joints with an impedance, and export the ports of a station.
 
-    Returns the port of the desired positions, (6,).
-
     Args:
         builder: Builder of the station.
         impedance: Impedance of the joints.
@@ -171,6 +171,9 @@ def add_joint_impedance(
         wrench: Port of the measured wrench, (6,).
         impedance_wrench: Port of the forces and torques of the joints, (6,).
         control_period: Time between commands [s].
+
+    Returns:
+        Port of the desired positions, (6,).
     """
     watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(control_period, command_timeout(control_period)))
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))

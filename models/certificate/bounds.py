@@ -80,7 +80,10 @@ def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBound
 
 
 def action_cells(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
-    """Divide the actions into cells, given the null-space units per action (O,).
+    """Divide the actions into cells.
+
+    Args:
+        gains: Null-space units per action (O,).
 
     Returns:
         The corners (C, O) of all cells as raw actions, and the indices of the corners of each cell.

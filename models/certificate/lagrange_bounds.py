@@ -44,10 +44,15 @@ class BudgetedBounds:
 def bound_within_budget(
     loop: CertifiedLoop, free: Bounds, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
 ) -> BudgetedBounds:
-    """Compute bounds for corrections that satisfy a budget, of a primitive with a history in its loop.
+    """Compute bounds for corrections that satisfy a budget.
 
-    `free` are the bounds without active constraints, `middle` and `generators` as `reach` returns them, and `first` is
-    the first step at which a constraint can be active.
+    Args:
+        loop: Primitive in its loop, with a history.
+        free: Bounds without active constraints.
+        middle: Motion without actions, as `reach` returns it.
+        generators: Generators, as `reach` returns them.
+        first: First step at which a constraint can be active.
+        budget: Budget of the corrections.
     """
     primitive, past = loop.primitive, loop.primitive.history
     num_steps, num_outputs = primitive.num_steps, primitive.num_outputs
@@ -143,7 +148,11 @@ class MultiplierSearch:
     ) -> np.ndarray:
         """Compute the largest displacement (O,) of commands in directions (O, ·), proven by multipliers (O, R).
 
-        The directions are generators. Steps and outputs (O, R) are those of each constraint, as are the multipliers.
+        Args:
+            directions: Generators along each direction.
+            steps: Step of each constraint (O, R).
+            outputs: Output of each constraint (O, R).
+            multipliers: Multiplier of each constraint (O, R).
         """
         rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._past + steps, outputs])
         margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]

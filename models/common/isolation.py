@@ -17,10 +17,13 @@ class IsolatedError(Exception):
 
 
 def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int, max_bytes: int | None = None) -> Any:
-    """Return `function(*arguments)`, computed in a forked process with limits of CPU time and memory.
+    """Return `function(*arguments)`, computed in a forked process; the result is pickled.
 
-    `max_bytes` limits the memory that the function allocates; None: no limit. Only the result is pickled. The function
-    needs no import in the child process, which is a copy of this one.
+    Args:
+        function: Function; it needs no import in the child process, which is a copy of this one.
+        arguments: Arguments of the function, which are not pickled.
+        cpu_seconds: Limit of the function's CPU time [s].
+        max_bytes: Limit of the memory that the function allocates [bytes]; default: none.
 
     Raises:
         IsolatedError: If the function raised, or its process aborted or exceeded a limit.

@@ -248,9 +248,12 @@ def pose_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Convert a generalized force along the coordinates of a pose to the wrench (6,) at P in T that does the same work.
 
-    The force (6,) [N, Nm] is along X_TP as [x y z a b c] (6,) [m, rad]. The components of the angles are torques about
-    the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are linearly dependent for b = ±π/2, near which the result is
-    large.
+    The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are
+    linearly dependent for b = ±π/2, near which the result is large.
+
+    Args:
+        pose: X_TP as [x y z a b c] (6,) [m, rad].
+        force: Generalized force (6,) [N, Nm].
     """
     a, b = pose[3], pose[4]
     about_z, about_y, about_x = force[3:]

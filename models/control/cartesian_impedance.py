@@ -33,10 +33,15 @@ class JointTorques:
 def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.ndarray) -> np.ndarray:
     """Compute the wrench (6,) of the potential ½ eᵀ K e with e = [p_error, 2ε].
 
-    The stiffness K (6, 6) is symmetric, positive definite. `p_error` (3,) [m] is the desired minus the actual position,
-    η and ε (3,) are the quaternion of R_desired Rᵀ. The rotational part is E(η, ε)ᵀ times that of K e with E = η I +
-    [ε]× (Caccavale, Natale, Siciliano, Villani 1999). The wrench is the gradient of the potential, so that the spring
-    is passive. For small errors, 2ε is the rotation vector and the wrench is K e.
+    The rotational part is E(η, ε)ᵀ times that of K e with E = η I + [ε]× (Caccavale, Natale, Siciliano, Villani 1999).
+    The wrench is the gradient of the potential, so that the spring is passive. For small errors, 2ε is the rotation
+    vector and the wrench is K e.
+
+    Args:
+        K: Stiffness (6, 6), symmetric, positive definite.
+        p_error: Desired minus actual position (3,) [m].
+        eta: Scalar part of the quaternion of R_desired Rᵀ.
+        epsilon: Vector part (3,) of that quaternion.
     """
     generalized = K @ np.concatenate([p_error, 2.0 * epsilon])
     torque = generalized[3:]
@@ -46,7 +51,10 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
 def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: float) -> np.ndarray:
     """Compute D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ, which gives every mode of (K, Λ) the damping ratio ζ.
 
-    The stiffness K is (6, 6), symmetric and positive definite, as is the inverse inertia at the tool, Λ⁻¹ = J M⁻¹ Jᵀ.
+    Args:
+        K: Stiffness (6, 6), symmetric, positive definite.
+        Lambda_inverse: Inverse inertia at the tool, Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6).
+        damping_ratio: Damping ratio ζ.
     """
     L_modes, eigenvalues = _modes(K, _root_of_inverse(Lambda_inverse))
     return (L_modes * _dampings(eigenvalues, damping_ratio)) @ L_modes.T
@@ -75,10 +83,13 @@ def _dampings(eigenvalues: np.ndarray, damping_ratio: float) -> np.ndarray:
 
 
 def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
-    """Compute Λ without the directions that a singular arm has lost, from Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6), translation first.
+    """Compute Λ without the directions that a singular arm has lost.
 
     Each eigenvalue, a mass m, is multiplied by a factor that falls smoothly with log m, from 1 at `LIGHT` to 0 at
     `HEAVY`. For a regular arm the result equals Λ. In lost directions, the posture's torque then acts on the tool.
+
+    Args:
+        Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6), positive definite, [translational, rotational].
     """
     eigenvalues, directions = np.linalg.eigh(_SCALE[:, None] * Lambda_inverse * _SCALE)
     masses = 1.0 / eigenvalues

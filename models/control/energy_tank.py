@@ -6,10 +6,14 @@ import numpy as np
 
 
 def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) -> float:
-    """Return the energy [J] of springs K e (n,) that are clipped at a limit F (n,) each, the sum of Huber's functions.
+    """Return the energy [J] of springs K e that are clipped at a limit F each, the sum of Huber's functions.
 
-    The energy of a spring is ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond; K is positive [N/m, Nm/rad], F not
-    negative [N, Nm], and e in [m, rad].
+    The energy of a spring is ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond.
+
+    Args:
+        stiffness: K (n,) [N/m, Nm/rad], positive.
+        limits: F (n,) [N, Nm], not negative.
+        error: e (n,) [m, rad].
     """
     # Plain numbers, as NumPy's overhead would exceed the computation, which runs several times per plant step.
     energy = 0.0
@@ -28,9 +32,14 @@ def admissible_share(
 ) -> float:
     """Return the largest share from 0 to 1 of a change of reference and limits that adds at most `energy` [J].
 
-    The limits and the errors, reference minus measured pose, are pairs (n,) before and after the change. The energy is
-    convex in the reference, so the share is found by bisection. The share is 1 if the whole change is admissible. No
-    limit may decrease: a lower limit is applied at once, which removes energy from the spring.
+    The energy is convex in the reference, so the share is found by bisection. The share is 1 if the whole change is
+    admissible. No limit may decrease: a lower limit is applied at once, which removes energy from the spring.
+
+    Args:
+        stiffness: Stiffness (n,).
+        limits: Limits (n,) before and after the change.
+        errors: Reference minus measured pose (n,) before and after the change.
+        energy: Energy that may be added [J].
     """
     before = spring_energy(stiffness, limits[0], errors[0])
 

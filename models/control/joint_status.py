@@ -13,11 +13,20 @@ MAX_MISSED_MESSAGES = 6  # consecutive status messages that may be missing befor
 
 
 def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: float) -> np.ndarray:
-    """Compute the torque (n,) [Nm] that damps all joint velocities v (n,) [rad/s] with one decay time T [s].
+    """Compute the torque that damps all joint velocities with one decay time.
 
         τ = −M(q) v (1 − exp(−h / T)) / h
 
-    Held for a period h [s], it multiplies the velocity by exp(−h / T).
+    Held for a period h, it multiplies the velocity by exp(−h / T).
+
+    Args:
+        M: Mass matrix, (n, n).
+        v: Joint velocities, (n,) [rad/s].
+        decay_time: T [s].
+        period: h [s].
+
+    Returns:
+        Joint torques, (n,) [Nm].
     """
     return (M @ v) * (np.expm1(-period / decay_time) / period)
 
@@ -152,7 +161,10 @@ class StatusLimits:
     def at_rate(cls, velocity: Sequence[float], period: float, **others: float) -> "StatusLimits":
         """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`.
 
-        `velocity` are the velocity limits of the joints, (n,) [rad/s], and `others` further limits by name.
+        Args:
+            velocity: Velocity limits of the joints, (n,) [rad/s].
+            period: Period of the statuses [s].
+            others: Further limits by name.
         """
         timeout = MAX_MISSED_MESSAGES * period
         return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout, **others)
@@ -168,9 +180,13 @@ class LastStatus:
 
 
 def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
-    """Compare a status with the last readable one and return the first fault, or `Fault.NONE`.
+    """Compare a status with its predecessor and return the first fault, or `Fault.NONE`.
 
-    The status is None before the first message; `now` is the local time [s].
+    Args:
+        status: Newest status; None before the first message.
+        last: Last readable status.
+        now: Local time [s].
+        limits: Plausibility limits.
     """
     if status is None:
         return Fault.NO_STATUS

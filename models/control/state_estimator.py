@@ -164,10 +164,14 @@ class StateEstimator:
     def evaluate(
         self, before: EstimatorState, status: JointStatus | None, now: float, M: np.ndarray, drag: np.ndarray
     ) -> Estimate:
-        """Check the newest status, None before the first, given the state after the last check.
+        """Check the newest status.
 
-        `now` is the local time [s]. M (n, n) is the mass matrix at the accepted positions; `drag` (n,) [Nm] are the
-        torques that oppose the estimated velocity in the model (Coriolis, damping).
+        Args:
+            before: State after the last check.
+            status: Newest status; None before the first.
+            now: Local time [s].
+            M: Mass matrix at the accepted positions, (n, n).
+            drag: Torques that oppose the estimated velocity in the model (Coriolis, damping), (n,) [Nm].
         """
         state = self._predict(before, now, M, drag)
         is_doubted = np.isfinite(before.doubt_time)

@@ -64,10 +64,14 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
 
 
 def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:
-    """Move a bound straight towards another one, so that no number changes by more than its positive `max_change`.
+    """Move a bound straight towards another one, so that no number changes by more than `max_change`.
 
-    All are (8,), bounds as signals. If the limits of the norms are at least the limits per axis at both ends, they are
-    so on the whole line.
+    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line.
+
+    Args:
+        bound: Bound as a signal (8,).
+        target: Bound to approach (8,).
+        max_change: Largest changes (8,), positive.
     """
     change = target - bound
     excess = float(np.max(np.abs(change) / max_change))
@@ -89,10 +93,16 @@ def slow_down(
 ) -> np.ndarray:
     """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates to at most F / √(k m).
 
-    d = vᵀ D v / |v|² is the damping in the direction of motion, from the damper's force D v [N] and the velocity v
-    [m/s], (3,) each. `force` is F [N], and `impedance` is √(k m) [N s/m], the `approach_impedance`. Only a force
+    d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
     that does positive work is reduced, so that no energy is added: while it moves to its rest position, the spring
     returns at most what it stored.
+
+    Args:
+        spring: Force of the spring [N], (3,).
+        damping: Force of the damper D v [N], (3,).
+        velocity: Velocity v [m/s], (3,).
+        impedance: √(k m) of contact and moving mass [N s/m].
+        force: Limit F of the norm of the force [N].
     """
     speed = float(np.sqrt(velocity @ velocity))
     if speed == 0.0 or spring @ velocity <= 0.0:
@@ -112,9 +122,15 @@ def bounded_wrench(
 ) -> np.ndarray:
     """Compute s − β D v, with the clipped spring s and the largest share β ≤ 1 of the damper that the bound allows.
 
-    Spring and damper are wrenches (6,), the velocity (3,) [m/s] is translational, and the mass [kg] moves in its
-    direction. The clipped spring has a potential, and the damper only dissipates at every share: for a constant bound
-    and rest position the law is passive.
+    The clipped spring has a potential, and the damper only dissipates at every share: for a constant bound and rest
+    position the law is passive.
+
+    Args:
+        spring: Wrench of the spring (6,).
+        damping: Wrench of the damper D V (6,).
+        velocity: Translational velocity (3,) [m/s].
+        mass: Moving mass in the direction of the velocity [kg].
+        bound: Bound.
     """
     s = clip_wrench(spring, bound.axes, bound.force, bound.torque)
     impedance = approach_impedance(bound.contact_stiffness, mass)
@@ -123,7 +139,13 @@ def bounded_wrench(
 
 
 def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -> float:
-    """Return the largest β from 0 to 1 with s − β d (6,) inside the bound, for a spring's wrench s inside it."""
+    """Return the largest β from 0 to 1 with s − β d inside the bound, for a spring's wrench s inside it.
+
+    Args:
+        spring: s (6,).
+        damping: d (6,).
+        bound: Bound.
+    """
     wrench = spring - damping
     f, t = wrench[:3], wrench[3:]
     if (np.abs(wrench) <= bound.axes).all() and f @ f <= bound.force**2 and t @ t <= bound.torque**2:

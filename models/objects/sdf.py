@@ -181,10 +181,15 @@ def model(
     contents: str,
     source: str = "guiderail.models.objects",
 ) -> str:
-    """Return an SDF file with one model of one link, both of the same name.
+    """Return an SDF file with one model of one link.
 
-    Mass [kg], center of mass (3,) [m] and radius of gyration [m] are the link's, `contents` its collision and visual
-    elements. A comment names `source`, the module or file that the dimensions come from.
+    Args:
+        name: Name of the model and the link.
+        mass: Mass [kg].
+        center: Center of mass (3,) [m].
+        radius_of_gyration: Radius of gyration [m].
+        contents: Collision and visual elements.
+        source: Module or file that the dimensions come from, named in a comment.
     """
     inertia = mass * radius_of_gyration**2
     return f"""<?xml version="1.0"?>

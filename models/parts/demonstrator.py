@@ -27,8 +27,11 @@ _CENTERING = 0.9  # part of the mean of the five random curves that is removed
 def plan_straight_insertion(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) and poses (N, 6) of an insertion: down, slowly past the rim, a push, a turn, and to the target.
 
-    The motion starts at the height `travel` [m]; a plug at the height `rim` [m] stands on the rim. The turn [rad] is at
-    the bottom; the push commands a distance [m] below the target.
+    Args:
+        travel: Height of the start [m].
+        rim: Height of a plug that stands on the rim [m].
+        turn: Angle of the turn at the bottom [rad].
+        push: Distance of the command below the target [m].
     """
     low = rim - TOUCH
     points = [
@@ -47,7 +50,12 @@ def plan_straight_insertion(travel: float, rim: float, turn: float, push: float)
 def plan_search(travel: float, rim: float, turn: float, push: float, press: float) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) and poses (N, 6) of a demonstration: to the rim, a search there, the insertion and a turn.
 
-    In the search, a distance `press` [m] below the rim is commanded; the rest is as in `plan_straight_insertion`.
+    Args:
+        travel: Height of the start [m].
+        rim: Height of a plug that stands on the rim [m].
+        turn: Angle of the turn at the bottom [rad].
+        push: Distance of the command below the target [m].
+        press: Distance of the command below the rim in the search [m].
     """
     down = (travel - rim + press) / DESCENT_SPEED + 0.3
     points = [

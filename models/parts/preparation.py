@@ -66,10 +66,15 @@ def decimate(part: Part, tolerance: float) -> tuple[Part, float]:
 def prepare_surfaces(
     plug: Part, socket: Part, motion: InsertionMotion, tolerance: float, moved: float, snapping: frozenset[int]
 ) -> tuple[ContactSurface, ContactSurface]:
-    """Return the contact surfaces of both parts, given at the target in the target frame, decimated by `decimate`.
+    """Return the contact surfaces of both parts.
 
-    They deviate from the drawing by at most `tolerance` [m], of which the given parts have `moved` [m]. Bodies of the
-    plug with indices in `snapping` deflect; they are neither united nor cropped.
+    Args:
+        plug: Plug at its target, in the target frame, decimated by `decimate`.
+        socket: Socket in the target frame, decimated by `decimate`.
+        motion: Motion of the plug.
+        tolerance: Largest deviation of the result from the drawing [m].
+        moved: Deviation of the given parts from the drawing [m].
+        snapping: Indices of bodies of the plug that deflect; they are neither united nor cropped.
     """
     plug_solids, socket_solids = make_solids(plug), make_solids(socket)
     rigid = _unite([solid for number, solid in enumerate(plug_solids) if number not in snapping])
@@ -117,8 +122,11 @@ def make_compliant(
 ) -> Iterator[tuple[str, list[Piece]]]:
     """Yield the compliant geometries to try: name of the part and its pieces, the part with fewer triangles first.
 
-    Only the parts of the surfaces may be compliant; the kind is one of `KINDS` and the tolerance the largest deviation
-    [m]. `log` is called with a sentence on each part that does not decompose or that Drake refuses.
+    Args:
+        kind: One of `KINDS`.
+        surfaces: Surfaces by name; only these parts may be compliant.
+        tolerance: Largest deviation [m].
+        log: Function called with a sentence on each part that does not decompose or that Drake refuses.
     """
     order = sorted(surfaces, key=lambda name: surfaces[name].num_triangles)
     failure, make, seconds = {

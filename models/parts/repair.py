@@ -47,8 +47,12 @@ def close_surface(
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Repair]:
     """Return the bodies of a mesh as closed surfaces with outward faces, and the repair.
 
-    Equal vertices (V, 3) [m] are one vertex. Triangles (T, 3) of no area must not be removed before: they close
-    T-junctions. `name` is the file's, for messages.
+    Triangles of no area must not be removed before: they close T-junctions.
+
+    Args:
+        name: Name of the file, for error messages.
+        vertices: Vertices (V, 3) [m]; equal points are one vertex.
+        triangles: Triangles (T, 3).
 
     Raises:
         InputError: If the mesh cannot be closed, or only by moving its surface by more than `MAX_MOVED`.

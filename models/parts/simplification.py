@@ -50,11 +50,17 @@ def as_hull_if_near(solid: Any, tolerance: float) -> tuple[Any, float]:
 
 
 def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plug: bool) -> Any:
-    """Return the region of a solid that can come within `margin` [mm] of the other while the plug moves down along z.
+    """Return the region of a part that can come within `margin` of the other while the plug moves down along z.
 
-    The other is at the target, where the plug turns about z by `turn` [rad]; `is_plug` is True if the plug is cropped.
     A slab of the plug above z0 meets only the region of the socket above z0. A slab of the socket below z1 meets only
     the region of the plug below z1. Each slab keeps the projection of that region along z, widened by the margin.
+
+    Args:
+        part: Solid to crop.
+        other: The other solid at the target.
+        margin: Largest distance from the nominal motion [mm].
+        turn: Turn of the plug about z at the target [rad].
+        is_plug: True if `part` is the plug.
     """
     manifold3d = import_extra("manifold3d")
     low, high = part.bounding_box()[2], part.bounding_box()[5]

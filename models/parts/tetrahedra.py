@@ -18,8 +18,12 @@ def tetrahedralize(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points (P, 3) [m] and tetrahedra (N, 4) of the volume of any triangles, crossing or open ones included.
 
-    The boundary deviates by at most `tolerance` [m], and `edge` is the desired length of an edge, as a fraction of the
-    diagonal of the bounding box. `optimize` improves the shape of the tetrahedra, which takes most of the time.
+    Args:
+        vertices: Vertices (V, 3) [m].
+        triangles: Triangles (T, 3).
+        tolerance: Largest deviation of the boundary [m].
+        edge: Desired length of an edge, as a fraction of the diagonal of the bounding box.
+        optimize: True to improve the shape of the tetrahedra, which takes most of the time.
     """
     scale = 1e3  # tolerances of fTetWild are meant for numbers around one
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))

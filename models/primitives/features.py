@@ -32,12 +32,17 @@ def window_features(
 ) -> WindowFeatures:
     """Condition the kernel on the history and factor the conditional kernel.
 
-    The inputs of the history are (P,) or (P, I), P = 0 allowed, and those of the window (H+1,) or (H+1, I). The
-    history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs. The
-    history is kept out of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ with both would lose accuracy.
+    The history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs.
+    The history is kept out of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ with both would lose accuracy.
+
+    Args:
+        kernel: k.
+        history_inputs: Inputs of the history, (P,) or (P, I), may be empty.
+        future_inputs: Inputs of the window, (H+1,) or (H+1, I).
+        history_noise: ħρ, positive if there is a history.
 
     Raises:
-        InputError: If `history_noise` ħρ is too small for the length of the history.
+        InputError: If `history_noise` is too small for the length of the history.
     """
     history_map, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
     return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))

@@ -470,10 +470,16 @@ _SHARED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
 def get_shared_primitive(
     reference: ReferenceTrajectory, constraints: LinearConstraints, kernel: Kernel, **arguments: Any
 ) -> LcNsKmp:
-    """Return the existing primitive with these arguments of `LcNsKmp` if there is one, otherwise a new one.
+    """Return the existing primitive with these arguments if there is one, otherwise a new one.
 
-    Kernels that compare equal share a primitive, which is possible because a primitive's state, the factored steps,
-    does not change results. The caller must not modify the primitive.
+    Primitives can be shared because their state, the factored steps, does not change results. The caller must not
+    modify the primitive.
+
+    Args:
+        reference: As in `LcNsKmp`.
+        constraints: As in `LcNsKmp`.
+        kernel: As in `LcNsKmp`; kernels that compare equal share a primitive.
+        arguments: Further arguments of `LcNsKmp`, numbers and names.
 
     Raises:
         InputError: As `LcNsKmp`.

@@ -38,9 +38,13 @@ class StateProgress:
             raise InputError(f"the largest lag of progress is a number of steps from 0, not {brief(self.max_lag)}")
 
     def next_step(self, step: int, clock: int, command: np.ndarray, pose: np.ndarray) -> int:
-        """Return the step of the next command, given the last command (O,), its step and the measured pose (O,).
+        """Return the step of the next command.
 
-        `clock` is the number of the next control step, from 0. NaN in the pose counts as not near.
+        Args:
+            step: Step of the last command.
+            clock: Number of the next control step, from 0.
+            command: Last command (O,).
+            pose: Measured pose (O,); NaN counts as not near.
         """
         is_pose = len(command) == POSE_SIZE
         error = pose_difference(command, pose) if is_pose else command - pose

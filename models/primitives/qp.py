@@ -104,9 +104,13 @@ def find_solver(name: str) -> Solver:
 def solve_least_norm(
     rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: Solver = _daqp
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Solve min ½‖v‖² subject to lower ≤ rows v ≤ upper, with rows (m, r) of unit length (or zero).
+    """Solve min ½‖v‖² subject to lower ≤ rows v ≤ upper.
 
-    A bound of ±inf is none; at least one bound excludes v = 0.
+    Args:
+        rows: Constraint rows (m, r), of unit length (or zero).
+        lower: Lower bounds (m,), −inf for none; at least one bound excludes v = 0.
+        upper: Upper bounds (m,), inf for none.
+        solver: One of `SOLVERS`.
 
     Returns:
         v (r,), and the multipliers (m,) with v = −rowsᵀ multipliers: positive where `upper` is active, negative where

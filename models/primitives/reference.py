@@ -381,8 +381,12 @@ def information_criteria(
 ) -> dict[int, float]:
     """Compute the Bayesian information criterion of mixtures by number of components; less is better.
 
-    The numbers of components increase, and the search stops once two in a row are not better than the best before. The
-    other arguments are those of `fit_mixture`.
+    Args:
+        times: Common clock (N,) [s].
+        outputs: Outputs (M, N, O).
+        candidates: Increasing numbers of components; the search stops once two in a row are not better than the best
+            before.
+        seed: Seed of scikit-learn's generator.
 
     Raises:
         InputError: If there are fewer points than the components need.
@@ -410,10 +414,17 @@ def _fit_candidates(
 
 
 def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute Gaussian mixture regression on time of a mixture of (time, outputs), at times (N,) [s].
+    """Compute Gaussian mixture regression on time.
 
-    Conditioned on time, each component is a line with a constant covariance. The result is the mean (N, O) and the
-    covariance (N, O, O) of their mixture, weighted by the likelihood of the time under each component.
+    Conditioned on time, each component is a line with a constant covariance. The result is the mean and the covariance
+    of their mixture, weighted by the likelihood of the time under each component.
+
+    Args:
+        mixture: Mixture of (time, outputs).
+        times: Times (N,) [s].
+
+    Returns:
+        Means (N, O) and covariances (N, O, O).
     """
     offset = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
     variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]

@@ -19,9 +19,16 @@ def solve_inverse_kinematics(
 ) -> np.ndarray:
     """Return the joint positions (n,) nearest to `posture` that put the tool center at X in the reference frame.
 
-    Minimizes ‖q − posture‖² [rad] subject to the pose and the joint limits, starting at `posture`, so that the result
-    is deterministic; all joints of the finalized plant may move. If no solution is found, further searches start at
-    random postures and the solution nearest to `posture` is returned.
+    Minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`, so that the result is
+    deterministic. If no solution is found, further searches start at random postures and the solution nearest
+    to `posture` is returned.
+
+    Args:
+        plant: Finalized plant; the solution may move all of its joints.
+        reference: Frame in which X is expressed.
+        tool_center: Frame to place at X.
+        X: Pose of the tool center in the reference frame.
+        posture: Joint positions (n,) [rad].
 
     Raises:
         InputError: If the pose is out of reach, or can only be reached beyond the joint limits.

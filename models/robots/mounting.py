@@ -68,10 +68,14 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
 def add_end_effector(
     plant: MultibodyPlant, robot: Robot, mounted: MountedRobot, end_effector: EndEffector, *, as_rigid: bool = False
 ) -> MountedEndEffector:
-    """Mount an end effector to the flange of a robot in a plant that is not finalized.
+    """Mount an end effector to a robot's flange.
 
-    The robot's `tool_turn` defines the orientation of the mount. `as_rigid` adds an open gripper as one rigid body, for
-    a controller's plant.
+    Args:
+        plant: Plant with the robot, not finalized.
+        robot: Robot, whose `tool_turn` defines the orientation of the mount.
+        mounted: The robot in the plant.
+        end_effector: End effector to mount.
+        as_rigid: Add an open gripper as one rigid body, for a controller's plant.
 
     Raises:
         InputError: If its model file is missing, can't be read, or does not match its data.

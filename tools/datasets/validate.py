@@ -147,8 +147,10 @@ def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
 def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
     """Read demonstrations and return their number, durations, ranges, spread, and the deviation of a default primitive.
 
-    `file` may be a folder of files. The picture `draw` shows the mean, two standard deviations and the range. With
-    `fit`, a primitive is fitted, which takes seconds.
+    Args:
+        file: File of demonstrations, or a folder of files.
+        draw: Picture to write, with the mean, two standard deviations and the range.
+        fit: True to fit a primitive to them, which takes seconds.
 
     Raises:
         InputError: If the demonstrations are invalid, or cannot be drawn or fitted.

@@ -203,10 +203,13 @@ class EpisodeProgress:
     def __init__(
         self, episodes: int, *, name: str = "training", window: int | None = WINDOW, console: Console | None = None
     ):
-        """Construct the progress of a run of `episodes`, including those before it was resumed; `name` is the bar's.
+        """Construct the progress.
 
-        Success and return are averaged over the last `window` episodes, None for all. The console is standard error by
-        default, so that results can be piped.
+        Args:
+            episodes: Number of episodes of the whole run, including those before it was resumed.
+            name: Name of the bar.
+            window: Number of last episodes over which success and return are averaged; None for all episodes.
+            console: Console; standard error by default, so that results can be piped.
         """
         from rich.console import Console  # slow to import
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -41,8 +41,11 @@ DescribeDifferences: TypeAlias = Callable[..., list[str]]
 def run_study(study: Study, out: Path, engine: Engine | None = None, console: Console | None = None) -> pd.DataFrame:
     """Run the jobs of a study that are not done.
 
-    Runs in the folder `out` are used again, and interrupted ones resume. The engine that runs the jobs has two
-    processes by default; the console of the progress is standard error.
+    Args:
+        study: Study.
+        out: Folder of the study; runs in it are used again, and interrupted ones resume.
+        engine: Engine that runs the jobs; two processes by default.
+        console: Console of the progress; standard error by default.
 
     Returns:
         A row for each method, seed, number of training episodes and evaluation set, in this order.

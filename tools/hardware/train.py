@@ -41,11 +41,17 @@ def train_on_robot(
     assume_yes: bool = False,
     log: Log = print,
 ) -> dict[str, Any]:
-    """Train a policy on a robot, write the run folder `out`, and return statistics of the training.
+    """Train a policy on a robot, write a run folder, and return statistics of the training.
 
-    The task is an insertion with `observable_success`, success estimated from the measured pose. `given` are arguments
-    of `configure`: algorithm, preset, episodes, seed. `assume_yes` skips the confirmation of the checks and, with a
-    simulated driver, of resuming after a stop.
+    Args:
+        task: Name of an insertion task that defines `observable_success`, success estimated from the measured pose.
+        out: Run folder.
+        connection: Connection to the robot driver.
+        environment: Environment options by name, with a hardware station.
+        given: Arguments of `configure`: algorithm, preset, episodes, seed.
+        settings: Settings of the learner.
+        assume_yes: Skip the confirmation of the checks and, with a simulated driver, of resuming after a stop.
+        log: Function that shows a message.
 
     Raises:
         InputError: If the task cannot be trained on hardware, or a check fails or is not confirmed.

@@ -32,10 +32,13 @@ class Linear:
     """
 
     def __init__(self, values: torch.Tensor, gradient: torch.Tensor, inputs: int, outputs: int):
-        """Construct the layer, with the numbers of inputs and outputs of one network.
+        """Construct the layer.
 
-        `values` (n, outputs · inputs + outputs) are weights and biases, a view of the buffer of all parameters.
-        `backward` writes `gradient`, a view of the parameters' gradient of the same shape.
+        Args:
+            values: (n, outputs · inputs + outputs): weights and biases, a view of the buffer of all parameters.
+            gradient: View of the parameters' gradient, of the same shape, which `backward` writes.
+            inputs: Number of inputs of one network.
+            outputs: Number of outputs of one network.
         """
         self.weight, bias = _split(values, inputs, outputs)
         self._transposed, self._bias = self.weight.mT, bias[:, None]
@@ -85,10 +88,12 @@ class BatchedMLP:
     """Networks with rectified hidden layers and an affine output; later layers may have more networks than earlier."""
 
     def __init__(self, layers: Sequence[Linear], layer_norm: bool):
-        """Construct the networks from their layers, input first.
+        """Construct the networks.
 
-        A layer of one network is shared by all networks of the layers after it. `layer_norm` normalizes hidden layers,
-        without learned parameters, before they are rectified.
+        Args:
+            layers: Layers from input to output. A layer of one network is shared by all networks of the layers after
+                it.
+            layer_norm: Normalize hidden layers, without learned parameters, before they are rectified.
         """
         self._layers = list(layers)
         self._layer_norm = layer_norm

@@ -103,10 +103,15 @@ def choose_contact(
     clearance: float,
     log: Callable[[str], None],
 ) -> Choice:
-    """Return the best contact by `rank`, and write its files into the task's folder.
+    """Return the best contact by `rank`, and write its files into the folder.
 
-    `tolerance` is the largest deviation of the pieces from the surfaces, `clearance` the distance between the walls
-    [m]. `log` is called with a sentence on each result.
+    Args:
+        folder: Folder of the task.
+        surfaces: Contact surfaces of plug and socket.
+        make_file: See `MakeFile`.
+        tolerance: Largest deviation of the pieces from the surfaces [m].
+        clearance: Clearance between the walls [m].
+        log: Function called with a sentence on each result.
 
     Raises:
         InputError: If no part can be made compliant, or Drake accepts none of the geometries.

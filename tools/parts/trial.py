@@ -73,8 +73,11 @@ class Depths:
     ):
         """Construct the measurement.
 
-        `surfaces` are those [m] of the compliant bodies by name, each in its own frame, and `snapping` names geometries
-        that overlap on purpose. From `rest_from` [s] on the plug is at rest, apart from the push.
+        Args:
+            station: Station with the parts.
+            surfaces: Surface [m] of each compliant body by name, in its own frame.
+            snapping: Names of geometries that overlap on purpose.
+            rest_from: Time from which the plug is at rest, apart from the push [s].
         """
         self._station, self._surfaces, self._snapping = station, surfaces, snapping
         self._rest_from = rest_from

@@ -174,11 +174,16 @@ def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
 
 
 def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None) -> dict[str, Any]:
-    """Run episodes and write them as a page, .html; return the row of the policy's first episode.
+    """Run episodes and write them as a page; return the row of the policy's first episode.
 
-    Each episode is run twice from the same conditions: by the policy and by a baseline without learning. The baseline
-    is the demonstration alone (an action of zero) if the guidance has one, and otherwise uniform random actions.
-    `episode` is the first of `episodes`, by default `EPISODES`; the others have the following seeds.
+    Each episode is run twice from the same conditions: by the policy and by a baseline without learning.
+    The baseline is the demonstration alone (an action of zero) if the guidance has one, and otherwise uniform random
+    actions.
+
+    Args:
+        html: Page, .html.
+        episode: First episode; the others have the following seeds.
+        episodes: Number of episodes; `EPISODES` by default.
 
     Raises:
         InputError: If the task has no animation, there is no episode, or `html` is not a page.

@@ -75,10 +75,16 @@ def draw_runs(
     band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = range_band,
     **line: Any,
 ) -> None:
-    """Draw the learning curve of a method: the mean over runs of a moving mean over `window` episodes, and a band.
+    """Draw the learning curve of a method: the mean over runs of a moving mean, and a band.
 
-    Longer runs are cut to the shortest. `band` returns its lower and upper end, (n,) each, from smoothed values (runs,
-    n). `label` is that of a legend, and `line` are further arguments of the line.
+    Args:
+        axis: Axes.
+        runs: Values over the episodes of each run; longer runs are cut to the shortest.
+        color: Color of line and band.
+        label: Label for a legend.
+        window: Episodes of the moving mean.
+        band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each.
+        line: Further arguments of the line.
     """
     length = min(len(run) for run in runs)
     smooth = np.stack([rolling(run, window)[:length] for run in runs])

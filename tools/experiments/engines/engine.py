@@ -42,7 +42,9 @@ class Engine(AbstractContextManager[Any]):
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
         """Yield keys and outcomes of the jobs as they finish, in any order.
 
-        Jobs and `work`, the function from a job to its outcome, can be pickled; `work` raises nothing.
+        Args:
+            work: Function from a job to its outcome; it can be pickled and raises nothing.
+            jobs: Jobs by key; they can be pickled.
         """
 
 
