@@ -115,6 +115,15 @@ def test_settling_time_is_exact():
     assert LIMITS.settling_time < rig.now <= LIMITS.settling_time + PERIOD + 1e-9
 
 
+@pytest.mark.parametrize(("share", "is_over"), [(1.0, False), (1.0005, True)])
+def test_fault_and_doubt_end_after_the_settling_time(share, is_over):
+    rig = Rig().settle()
+    since = rig.now + 2.0 * PERIOD - share * LIMITS.settling_time  # seen from the check after the next one
+    rig.state = replace(rig.state, fault=float(Fault.FUTURE), fault_time=since, doubt_time=since)
+    rig.check()
+    assert (rig.state.fault == Fault.NONE, np.isnan(rig.state.doubt_time)) == (is_over, is_over)
+
+
 def shifted(**by):
     def change(status):
         return replace(status, **{name: getattr(status, name) + np.array(value) for name, value in by.items()})
@@ -202,6 +211,14 @@ def test_prediction_is_exact_without_external_torque():
         np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, rtol=1e-9)
 
 
+@pytest.mark.parametrize(("share", "is_known"), [(1.0, True), (1.0005, False)])
+def test_velocity_is_unknown_after_the_prediction_time(share, is_known):
+    rig = Rig()
+    rig.state = replace(rig.state, accepted_time=0.0, velocity=CRUISE)
+    rig.check(None, gap=share * module.MAX_PREDICTION_TIME)
+    assert rig.estimate.state.velocity.any() == is_known
+
+
 @pytest.mark.parametrize("drift", [-9e-4, 9e-4])
 def test_clock_drift_is_no_fault(drift):
     rig = Rig().settle()
@@ -257,6 +274,27 @@ def test_offset_follows_early_statuses_by_a_fraction():
     rig.check()
     assert rig.state.last_offset == pytest.approx(offset + LIMITS.clock_drift * PERIOD)
     assert rig.state.early == pytest.approx(0.2 * lead * np.exp(-3 * PERIOD / 0.5))
+
+
+@pytest.mark.parametrize(("share", "fault"), [(1.0, Fault.NONE), (1.0005, Fault.CLOCK_RATE)])
+def test_sum_of_early_statuses_is_checked_at_its_limit(share, fault):
+    rig = Rig(velocity=np.zeros(2)).settle()
+    early, offset = share * (module.MAX_EARLY * LIMITS.max_lead), rig.state.last_offset
+    rig.state = replace(rig.state, early=early, receipt_time=rig.now + PERIOD)  # so that the sum does not decay
+    late = 0.25 * PERIOD
+    assert rig.check(shifted(time=-late)) == fault
+    expected = (offset + late, 0.0) if fault else (offset + LIMITS.clock_drift * PERIOD, early)
+    assert (rig.state.last_offset, rig.state.early) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(("share", "is_late"), [(1.0, True), (1.0005, False)])
+def test_clocks_are_synchronized_again_after_the_maximum_age(share, is_late):
+    """A stale status belongs to the same clock if the last one was received within the maximum age."""
+    rig = Rig(velocity=np.zeros(2), limits=replace(LIMITS, max_age=8 * PERIOD)).settle()
+    before, gap = rig.state, share * 8 * PERIOD
+    assert rig.check(lambda true: replace(true, time=before.last_time - PERIOD), gap=gap) == Fault.STALE
+    change = LIMITS.clock_drift * PERIOD if is_late else gap + PERIOD
+    assert rig.state.last_offset - before.last_offset == pytest.approx(change, abs=1e-9)
 
 
 def test_single_early_status_is_no_fault():
@@ -457,6 +495,25 @@ def test_counters_restart_when_values_change():
         np.testing.assert_array_equal(rig.estimate.state.equal_positions, [0.0, 0.0])
 
 
+@pytest.mark.parametrize(("share", "count"), [(1.0, 0.0), (1.0005, 1.0)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(
+    ("counter", "joint", "before", "after"),
+    [
+        ("equal_positions", 0, [0, 0, 0, 0], [0, 0, module.MIN_MOTION / PERIOD, 0]),
+        ("equal_velocities", 0, [0, 0, module.MIN_SPEED, 0], [0, 0, module.MIN_SPEED, 0]),
+        ("equal_velocities", 0, [0, 0, 0, 0], [module.MIN_SPEED * PERIOD + 2.0 * module.RESOLUTION, 0, 0, 0]),
+        ("equal_values", 1, [0, 0, 0, 0], [0, 0, module.MIN_SPEED, 0]),
+    ],
+)
+def test_equal_values_are_counted_above_the_minimum_motion(counter, joint, before, after, sign, share, count):
+    before, after = (sign * share * np.array([*values, 0.0, 0.0]) for values in (before, after))
+    rig = Rig(velocity=np.zeros(2)).settle()
+    rig.state = replace(rig.state, last_values=before)
+    rig.check(lambda true: JointStatus(true.time, *np.split(after, 3)))
+    assert getattr(rig.state, counter)[joint] == count
+
+
 # Checks of the position against the velocity.
 
 
@@ -525,6 +582,16 @@ def test_velocity_is_restored_when_a_second_robot_is_detected(number):
     assert speed < 0.15
 
 
+@pytest.mark.parametrize(
+    ("name", "fault"), [("conflicts", Fault.CONFLICT), ("foreign_commands", Fault.SECOND_COMMANDER)]
+)
+def test_one_more_contradiction_is_a_fault_after_many(name, fault):
+    rig = Rig().settle()
+    rig.state = replace(rig.state, **{name: 2000.0})
+    assert rig.check(lambda true: replace(true, **{name: 2000})) == Fault.NONE
+    assert rig.check(lambda true: replace(true, **{name: 2001})) == fault
+
+
 def test_second_program_is_a_fault_and_statuses_are_accepted():
     rig = Rig().settle()
     assert rig.check(lambda status: replace(status, foreign_commands=3)) == Fault.SECOND_COMMANDER
@@ -581,6 +648,19 @@ def test_reaction_is_checked_at_its_tolerance(share, is_fault):
     frozen_status = rig.status()
     result = rig.detected(lambda status: replace(frozen_status, time=status.time), 400, rig.balance + [push, 0.0])
     assert (result is not None) == is_fault
+
+
+@pytest.mark.parametrize(("share", "fault"), [(0.9995, Fault.NONE), (1.0005, Fault.NOT_REACTING)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_momentum_is_checked_at_its_tolerance(joint, share, fault):
+    """After one status |M⁻¹ (p − m)| may be Δv_noise + |M⁻¹| h tolerance."""
+    rig, zero = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle(), np.zeros(2)
+    decay = np.exp(-PERIOD / module.MOMENTUM_WINDOW)
+    allowed = LIMITS.velocity_noise + decay * PERIOD * np.abs(np.linalg.inv(M)) @ TOLERANCE
+    names = ("velocity", "bias", "measured", "commanded", "reaction", "tolerance", "variation", "external")
+    rig.state = replace(rig.state, **dict.fromkeys(names, zero), last_values=np.zeros(6))
+    rig.state = replace(rig.state, predicted=M @ (share * allowed * np.eye(2)[joint]) / decay, torque=zero + 1e-9)
+    assert rig.check(shifted(velocities=-rig.status().velocities)) == fault
 
 
 def test_reacting_joint_is_no_fault():
@@ -668,6 +748,16 @@ def test_velocity_is_the_median_of_three_sources():
     np.testing.assert_allclose(third.estimate.state.velocity, true, atol=1e-6)
 
 
+def test_velocity_is_the_median_when_no_torque_is_missing():
+    """Without commanded torque the momentum sums are zero, so that a frozen position does not change the median."""
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    last = np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+    rig.state = replace(rig.state, torque=np.zeros(2), velocity=np.array([0.3, 0.0]), last_values=last)
+    rig.state = replace(rig.state, equal_positions=np.array([1.0, 0.0]))
+    assert rig.check(lambda true: JointStatus(true.time, *np.split(last, 3))) == Fault.FROZEN
+    np.testing.assert_allclose(rig.state.velocity, [0.3, 0.0], atol=1e-3)
+
+
 def test_accepted_velocity_is_limited_to_the_other_sources():
     rig = Rig().settle()
     true = rig.v.copy()
@@ -689,8 +779,8 @@ def test_external_torque_of_the_prediction_follows_at_a_limited_rate():
 # Acceptance of statuses in doubt.
 
 
-def rig_in_doubt():
-    rig = Rig().settle()
+def rig_in_doubt(**arguments):
+    rig = Rig(**arguments).settle()
     rig.check(WRONG[Fault.MALFORMED])
     rig.state = replace(rig.state, doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
     return rig
@@ -716,13 +806,32 @@ def test_status_in_doubt_is_accepted_when_it_agrees(change, is_accepted):
     assert rig.estimate.is_new == is_accepted
 
 
-@pytest.mark.parametrize(("late", "is_accepted"), [(0.45, True), (0.55, False)])
+@pytest.mark.parametrize(("late", "is_accepted"), [(0.5, True), (0.50025, False)])
 def test_status_in_doubt_must_be_fresh(late, is_accepted):
-    rig = rig_in_doubt()
+    max_age = 8 * PERIOD
+    rig = rig_in_doubt(limits=replace(LIMITS, max_age=max_age))
     for _ in range(6):
         rig.check(None)
-    rig.check(shifted(time=-late * LIMITS.max_age, positions=-late * LIMITS.max_age * CRUISE))
+    rig.check(shifted(time=-late * max_age, positions=-late * max_age * CRUISE))
     assert rig.estimate.is_new == is_accepted
+
+
+@pytest.mark.parametrize(("share", "is_accepted"), [(1.0, True), (1.0005, False)])
+@pytest.mark.parametrize("index", range(4))
+def test_status_in_doubt_must_agree_up_to_the_tolerances(index, share, is_accepted):
+    """The accepted status and the prediction are zero, so that the difference is exact."""
+    rig, zero = rig_in_doubt(velocity=np.zeros(2), external=np.zeros(2)), np.zeros(2)
+    rig.state = replace(rig.state, velocity=zero, torque=zero, bias=zero, accepted_values=np.zeros(6))
+    values = share * np.array([LIMITS.position_tolerance] * 2 + [module.AGREEMENT] * 2 + [0.0] * 2) * np.eye(6)[index]
+    rig.check(lambda true: JointStatus(true.time, *np.split(values, 3)))
+    assert rig.estimate.is_new == is_accepted
+
+
+def test_repeated_accepted_status_is_compared_with_the_last_one():
+    rig = Rig().settle()
+    accepted = rig.status()
+    assert rig.check(shifted(time=-1.0)) == Fault.OUT_OF_ORDER
+    assert rig.check(accepted) == Fault.FUTURE
 
 
 def test_new_clock_is_not_accepted_before_settling():
@@ -846,11 +955,12 @@ def test_torque_that_is_not_finite_counts_as_zero():
         np.testing.assert_array_equal(rig.estimator.advance(rig.estimate, np.array([wrong, 2.0])).torque, [0.0, 2.0])
 
 
-def test_estimator_is_finite_when_its_state_is_not():
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_estimator_is_finite_when_its_state_is_not(wrong):
     rig = Rig().settle()
-    rig.state = replace(rig.state, velocity=np.array([np.nan, 0.1]))
-    rig.check(None)
-    np.testing.assert_array_equal(rig.estimate.state.velocity, 0.0)
+    state = replace(rig.state, velocity=np.array([wrong, 0.1]))
+    estimate = rig.estimator.evaluate(state, None, rig.now + PERIOD, M, np.zeros(2))
+    np.testing.assert_array_equal(estimate.state.velocity, 0.0)
 
 
 @pytest.mark.parametrize("tolerance", [(1.0,), (1.0,) * 3, (0.0, 1.0), (np.inf, 1.0), (np.nan, 1.0), (-1.0, 1.0)])
@@ -922,10 +1032,18 @@ def test_statuses_are_compared_up_to_the_maximum_age(periods, is_compared):
     """Between statuses that are further apart, values may have changed and returned."""
     rig = Rig(limits=replace(LIMITS, max_age=8 * PERIOD, max_lead=1.0)).settle()
     rig.check(lambda true: replace(true, positions=true.positions + 4e-4))
-    before = rig.state
+    counters = ("equal_positions", "equal_velocities", "equal_values")
+    before = rig.state = replace(rig.state, **dict.fromkeys(counters, np.ones(2)))
     assert before.residual.any()
     rig.check(lambda true: replace(true, time=before.last_time + periods * PERIOD), gap=periods * PERIOD)
     assert rig.state.residual.any() == is_compared
+    assert not any(getattr(rig.state, name).any() for name in counters)
+
+
+def test_age_is_infinite_before_the_first_status():
+    rig = Rig()
+    rig.check(None)
+    assert rig.estimate.age == np.inf
 
 
 def test_first_status_has_no_age():
