@@ -265,21 +265,35 @@ class RobotEnv(DiagramEnv):
         return bool(self.pose[2] - before[2] < MAX_PULL_MOTION and force > MIN_PULL_FORCE)
 
     def _return_to_start(self) -> None:
-        """Move back along the return path, and slowly to the start."""
+        """Move back along the return path, and slowly to the start.
+
+        Friction can leave a bayonet locked by the first return; then the path is followed once more, there and back.
+        """
         self._switch_to_transfer()
         self._retry_until_ok(self._take_control)
-        while self._return_path:
-            # After a stop the motion continues with the rest of the path.
-            self._retry_until_ok(lambda: self._command(self._return_path[-1]))
-            self._return_path.pop()
-        self._retry_until_ok(self._approach_start)
-        if not is_near(self.pose, self._start):
+        path = self._return_path.copy()
+        self._follow_return_path()
+        if path and not self._is_at_start():
+            self._log("the arm did not reach the start; it repeats its path once")
+            self._return_path = path + path[::-1]
+            self._follow_return_path()
+        if not self._is_at_start():
             distance, angle = pose_distance(self.pose, self._start)
             raise InputError(
                 f"the arm did not reach the start: {distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are "
                 "left; is something in its way?"
             )
         gc.collect()
+
+    def _is_at_start(self) -> bool:
+        return is_near(self.pose, self._start)
+
+    def _follow_return_path(self) -> None:
+        while self._return_path:
+            # After a stop the motion continues with the rest of the path.
+            self._retry_until_ok(lambda: self._command(self._return_path[-1]))
+            self._return_path.pop()
+        self._retry_until_ok(self._approach_start)
 
     def _rejoin_return_path(self) -> None:
         """If the arm was moved by hand, prepend a slow motion to the nearest pose of the return path."""

@@ -329,6 +329,37 @@ def test_fault_truncates_and_the_next_reset_resumes(env):
     assert row["termination"] == "time_limit"
 
 
+def test_reset_repeats_its_path_once_if_the_start_is_not_reached(env, monkeypatch):
+    env.reset()
+    env.step(np.zeros(2))
+    env._extend_return_path()
+    path, commanded, command = env._return_path.copy(), [], env._command
+
+    def record(pose):
+        commanded.append(pose)
+        command(pose)
+
+    monkeypatch.setattr(env, "_command", record)
+    at_start = iter([False, True])
+    monkeypatch.setattr(env, "_is_at_start", lambda: next(at_start))
+    env.reset()
+    back = [tuple(pose) for pose in path[::-1]]
+    commanded = [tuple(pose) for pose in commanded]
+    second = commanded.index(back[-1], commanded.index(back[-1]) + 1)
+    there_and_back = back[::-1] + back
+    assert commanded[second : second + len(there_and_back)] == there_and_back
+
+
+def test_reset_raises_if_the_start_is_not_reached_twice(env, monkeypatch):
+    env.reset()
+    env.step(np.zeros(2))
+    env._extend_return_path()
+    with monkeypatch.context() as patch:
+        patch.setattr(env, "_is_at_start", lambda: False)
+        with pytest.raises(InputError, match="did not reach the start"):
+            env.reset()
+
+
 def test_reset_completes_after_a_stop(env):
     env.clock.happens = {env.clock.step + 20: env.keys.request_stop}
     env.reset()
