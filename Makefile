@@ -13,7 +13,7 @@ export OMP_NUM_THREADS ?= 1
 help:  ## print this help
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 20
 
-demo: $(VENV)/.ready  ## train sKGRL in the narrow passage, about two minutes
+demo: $(VENV)/.ready  ## install into .venv, then train sKGRL in the narrow passage in under a minute
 	$(BIN)/guiderail demo
 
 # Bytecode is cached, because the tests start many processes.

@@ -1,4 +1,4 @@
-"""`guiderail demo`: train a policy in a minute or two, and show what the run folder contains."""
+"""`guiderail demo`: train a policy in about a minute, and show what the run folder contains."""
 
 import shutil
 import sys

@@ -202,7 +202,7 @@ def demo(
     episodes: Annotated[int, option("Number of training episodes.")] = 24,
     seed: Annotated[int, option("Seed of all random numbers.")] = 0,
 ) -> None:
-    """Train sKGRL to avoid an obstacle, in a minute or two, and show the result."""
+    """Train sKGRL to avoid an obstacle, in about a minute, and show the result."""
     from guiderail.tools.cli.demo import run_demo
 
     run_demo(out, episodes=episodes, seed=seed)
