@@ -11,7 +11,7 @@ Data sheets and papers that the numbers come from, by their number in docs/bibli
 
 Noise of 0.01 % of a joint's largest torque gives the first arm's tool the noise of its data sheet; friction of 0.02 %
 stays within its repeatability. Offsets and errors of the model are much larger before the tare: newtons at the tool.
-Strain gauges drift with temperature, but hardly within one episode. docs/concepts/robustness.md has the resulting
+Strain gauges drift with temperature, but hardly within one episode. docs/concepts/sensors.md has the resulting
 errors of each arm.
 """
 

@@ -4,7 +4,7 @@ It bounds the commands y for all actions a. W h is the window's mean given the h
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
-must leave room for these errors (see docs/concepts/robustness.md). `guiderail certify SKILL --verify FOLDER` also
+must leave room for these errors (see docs/concepts/certificates.md). `guiderail certify SKILL --verify FOLDER` also
 compares subject, primitive, impedance and budget with those of the skill; this program only reads them.
 The digest detects accidental changes only, as anyone can compute it; a signature needs the key.
 """
