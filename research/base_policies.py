@@ -2,19 +2,20 @@
 
 import numpy as np
 
-from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTER, POSE_SCALE
 from guiderail.diagrams.tasks.bnc_connector.task import (
     CENTER_OF_PRESSURE,
     COMMAND,
     HOLD_UNTIL,
     MAY_PRESS,
     ON_RIM,
+    POSE_CENTER,
+    POSE_SCALE,
     TIME,
     Z,
     reference_trajectory,
 )
+from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.insertion import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.models.policy import register_base_policy
 
 CHUNK_STEPS = 40  # K

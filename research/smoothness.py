@@ -19,8 +19,8 @@ import pandas as pd
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.diagrams.tasks.insertion import MAX_GIVEN_OFFSET
+from guiderail.diagrams.tasks.options import HISTORY_VARIANCE
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.insertion import HISTORY_VARIANCE
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy

@@ -25,8 +25,7 @@ from guiderail.diagrams.envs.observation import (
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig, limits_per_output
-from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Station

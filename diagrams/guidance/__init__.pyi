@@ -1,7 +1,7 @@
 from .guidance import FunctionGuidance as FunctionGuidance
 from .guidance import Guidance as Guidance
-from .primitive_config import PrimitiveConfig as PrimitiveConfig
 from .prior import PlacedTemplate as PlacedTemplate
+from .prior import PrimitiveConfig as PrimitiveConfig
 from .prior import PriorKnowledge as PriorKnowledge
 from .prior import ScriptedApproach as ScriptedApproach
 from .registry import GUIDANCE as GUIDANCE

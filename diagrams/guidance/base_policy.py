@@ -11,8 +11,7 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from guiderail.diagrams.guidance.options import BasePolicyOptions, GuardOptions
 from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig, limits_per_output
-from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
 from guiderail.models.common.errors import InputError

@@ -9,8 +9,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
-from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem

@@ -2,19 +2,183 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
-from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives.gains import authority_gains
+from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
 
 if TYPE_CHECKING:
+    from guiderail.models.control.keep_out import KeepOut
+    from guiderail.models.control.motion_constraints import MotionConstraints
+    from guiderail.models.primitives.progress import StateProgress
     from guiderail.models.templates import SharedControlTemplate
+
+
+HISTORY_SOURCES = ("commanded", "measured")
+
+
+def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.ndarray:
+    """Return limits (O,), given O of them, or one for all positions and a second one for all angles.
+
+    Angles have no limit (infinity) if only that of the positions is given.
+
+    Raises:
+        InputError: If there are more than two limits, and not O; `name` is their name in the message.
+    """
+    if len(limits) == outputs:
+        return np.array(limits)
+    if len(limits) > 2:
+        raise InputError(f"{name} is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(limits)}")
+    return np.where(np.arange(outputs) < 3, limits[0], (*limits, np.inf)[1])
+
+
+@dataclass(frozen=True)
+class PrimitiveConfig:
+    """Configuration of a movement primitive: demonstrations, constraints, and the range of a policy's actions.
+
+    Attributes:
+        reference: Reference trajectory of the demonstrations, in steps of the control period.
+        constraints: G y ≥ c on every command.
+        motion: Further constraints of the commanded motion, enforced behind the primitive; None if there are none.
+        control_period: Control period [s].
+        history: P, number of past outputs that sKGRL's motion passes through.
+        history_variance: ρ, variance of the past outputs [output²].
+        adaptive_history: True if sKGRL's history halves, down to a single output, during contact.
+        history_source: "commanded" or "measured" poses. Use commanded poses under impedance control, where a long
+            measured history at a high rate would follow the robot, so that its force vanishes. Use measured poses if an
+            operator may push a robot that tracks well.
+        horizon: H, number of future points at which the constraints are satisfied.
+        lambda_: λ of problem 4.5.
+        beta: β of problem 4.5.
+        kernel: k of the movement primitive.
+        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_dims: Indices of the outputs that an action moves, one entry each; default: all.
+        gains: Null-space action per unit of the policy's action, (O,); default: computed from κ.
+        isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all
+            outputs of a group. Default: one group.
+        solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
+        keep_out: Walls that safe residual learning stops at, if the task provides any.
+        progress: Rule by which the motion waits for the robot; None if the clock drives the motion.
+        wrench_size: W, size of a measured wrench.
+    """
+
+    reference: ReferenceTrajectory
+    constraints: LinearConstraints
+    control_period: float
+    history: int = 10
+    history_variance: float = 1e-6
+    history_source: str = "commanded"
+    adaptive_history: bool = False
+    horizon: int = 40
+    lambda_: float = 6.0
+    beta: float = 6.0
+    kernel: Kernel = SquaredExponential()  # noqa: RUF009 (it is immutable)
+    action_scale: float = 1.0
+    action_dims: tuple[int, ...] | None = None
+    gains: tuple[float, ...] | None = None
+    isotropic_groups: tuple[tuple[int, ...], ...] | None = None
+    solver: str = "daqp"
+    keep_out: KeepOut | None = None
+    motion: MotionConstraints | None = None
+    progress: StateProgress | None = None
+    wrench_size: int = 6
+
+    def __post_init__(self) -> None:
+        if self.history_source not in HISTORY_SOURCES:
+            raise InputError(f"a history is {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
+        if not (np.isfinite(self.action_scale) and self.action_scale > 0):
+            raise InputError(f"action_scale must be positive, not {self.action_scale}")
+        if self.progress is not None and self.constraints.num_steps is not None:
+            raise InputError("constraints that differ from step to step need progress=clock")
+        if self.history < 1:
+            raise InputError(f"history must be at least 1 past output, not {self.history}")
+        if self.action_dims is not None and not self.action_dims:
+            raise InputError("a policy must move at least one output: name it in action_dims")
+        if len(set(self.action_dims or ())) < len(self.action_dims or ()):
+            raise InputError(f"action_dims names an output twice, {self.action_dims}: each has one action")
+        if any(not 0 <= o < self.num_outputs for o in self.action_dims or ()):
+            raise InputError(f"action_dims names outputs 0 … {self.num_outputs - 1}, not {self.action_dims}")
+
+    @property
+    def num_outputs(self) -> int:
+        """O, size of a pose."""
+        return self.reference.num_outputs
+
+    @property
+    def explored_outputs(self) -> tuple[int, ...]:
+        """Indices of the outputs that an action moves, in the order of its entries."""
+        return tuple(range(self.num_outputs)) if self.action_dims is None else self.action_dims
+
+    @property
+    def num_actions(self) -> int:
+        """A, size of an action."""
+        return len(self.explored_outputs)
+
+    @cached_property
+    def selection(self) -> np.ndarray:
+        """Matrix (O, A) from an action to all outputs."""
+        return np.eye(self.num_outputs)[:, list(self.explored_outputs)]
+
+    @property
+    def shorter_histories(self) -> tuple[int, ...]:
+        """Lengths of an adaptive history other than P: P/2, P/4, … 1."""
+        lengths, length = [], self.history
+        while self.adaptive_history and length > 1:
+            length //= 2
+            lengths.append(length)
+        return tuple(lengths)
+
+    def primitive_of_length(self, history: int) -> LcNsKmp:
+        """Return sKGRL's movement primitive with another length of the history."""
+        return replace(self, history=history).primitive(history=True)
+
+    def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
+        """Return the movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""
+        return get_shared_primitive(
+            self.reference,
+            self.constraints if constrained else LinearConstraints.none(self.num_outputs),
+            self.kernel,
+            lambda_=self.lambda_,
+            beta=self.beta,
+            horizon=self.horizon,
+            history=self.history if history else 0,
+            history_variance=self.history_variance,
+            solver=self.solver,
+        )
+
+    def null_space_gains(self, primitive: LcNsKmp) -> np.ndarray:
+        """Return the null-space action per unit of the policy's action, (O,).
+
+        Raises:
+            InputError: If `gains` are not O finite numbers, or actions have no effect on this primitive.
+        """
+        if self.gains is None:
+            return authority_gains(primitive, self.action_scale, outputs=np.array(self.explored_outputs))
+        gains = np.array(self.gains, dtype=float)
+        if gains.shape != (self.num_outputs,) or not np.isfinite(gains).all():
+            raise InputError(f"gains are {self.num_outputs} finite numbers, one per output, not {self.gains}")
+        return gains
+
+    def residual_gains(self) -> np.ndarray:
+        """Return the displacement of the command by an action of one, (O,), equal for all outputs of a group.
+
+        It is √3 κ times the RMS of the demonstrations' standard deviations over the motion and the group. A null-space
+        action of one displaces the command as much on average, but differently over time and direction.
+        """
+        variances = np.mean(self.reference.standard_deviations**2, axis=0)
+        gains = np.zeros(self.num_outputs)
+        for group in self.isotropic_groups or (tuple(range(self.num_outputs)),):
+            gains[list(group)] = np.sqrt(3.0) * self.action_scale * np.sqrt(variances[list(group)].mean())
+        return gains
 
 
 @dataclass(frozen=True)

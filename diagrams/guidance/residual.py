@@ -13,8 +13,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, primitive_config_of
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
-from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
 from guiderail.models.common.errors import InputError

@@ -22,7 +22,7 @@ from franky_sim.mujoco_simulator import FrankaMujocoRobot, MujocoSimulator
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.hardware.fci_lockstep import LockstepServer
-from guiderail.diagrams.hardware.pose_control import payload_on_flange
+from guiderail.diagrams.hardware.station import payload_on_flange
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.mujoco import FIXTURE, WORKPIECE, MujocoContact, constraint_torques, mujoco_parts
 from guiderail.diagrams.stations.workcell import ConvexWorkcell

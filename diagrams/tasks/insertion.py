@@ -16,11 +16,11 @@ from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.envs.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
-from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm

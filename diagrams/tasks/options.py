@@ -8,9 +8,21 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options
-from guiderail.models.common.transforms import MM, POSE_SIZE
-from guiderail.models.objects.insertion import COLLISION_FORCE
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.primitives.reference import interpolate_prior
+
+COLLISION_FORCE = 35.0  # contact force above which an episode ends [N]
+MIN_CONTACT_FORCE = 0.5  # smallest force of a plug in contact [N]
+
+# Scales of the observed center of pressure and of the observed command. The center of pressure, unlike the torque, does
+# not grow with the push. The command shows the effect of an action; the measured pose of a plug on a rim does not.
+CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
+
+# Variance ρ of the history [m², rad²]; the thesis's 1e-8, (0.1 mm)², is too large for demonstrations that vary by 1 mm.
+HISTORY_VARIANCE = 1e-11
+
+# Standard deviation of a hand's repeatability [x y z Rz Ry Rx], added to the demonstrations' covariance.
+REPEATABILITY_STD = (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE)
 
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # larger ones are probably in mm or degrees [m], [rad]

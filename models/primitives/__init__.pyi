@@ -11,11 +11,11 @@ from .lc_ns_kmp import LcNsKmp as LcNsKmp
 from .poses import pose_demonstrations as pose_demonstrations
 from .poses import pose_outputs as pose_outputs
 from .poses import pose_rotation as pose_rotation
-from .prediction import BatchPrediction as BatchPrediction
-from .prediction import Modification as Modification
-from .prediction import Prediction as Prediction
 from .promp import ProMp as ProMp
 from .qp import UnsolvableError as UnsolvableError
 from .reference import ReferenceTrajectory as ReferenceTrajectory
 from .stepper import Command as Command
 from .stepper import PrimitiveStepper as PrimitiveStepper
+from .window import BatchPrediction as BatchPrediction
+from .window import Modification as Modification
+from .window import Prediction as Prediction

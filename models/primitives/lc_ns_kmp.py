@@ -23,10 +23,9 @@ from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.deviation import MAX_DEVIATION, check_deviation
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
-from guiderail.models.primitives.prediction import BatchPrediction, Modification, Prediction
 from guiderail.models.primitives.qp import UnsolvableError, find_solver
 from guiderail.models.primitives.reference import ReferenceTrajectory
-from guiderail.models.primitives.window import StepFactor, Window
+from guiderail.models.primitives.window import BatchPrediction, Modification, Prediction, StepFactor, Window
 
 if TYPE_CHECKING:
     from guiderail.models.control.motion_constraints import MotionConstraintFilter

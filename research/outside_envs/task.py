@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from guiderail import Demonstrations, Frame, GuidedEnv, LinearConstraints, Segment, cut_demonstrations
-from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.tools.guided.guide import Guide
 
 BARE_REPEAT = 5  # steps of the bare environment for which an action is applied

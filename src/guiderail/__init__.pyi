@@ -10,8 +10,8 @@ from .diagrams.envs.options import ResetOptions as ResetOptions
 from .diagrams.envs.task_diagram import TaskDiagram as TaskDiagram
 from .diagrams.guidance.guidance import FunctionGuidance as FunctionGuidance
 from .diagrams.guidance.guidance import Guidance as Guidance
-from .diagrams.guidance.primitive_config import PrimitiveConfig as PrimitiveConfig
 from .diagrams.guidance.prior import PlacedTemplate as PlacedTemplate
+from .diagrams.guidance.prior import PrimitiveConfig as PrimitiveConfig
 from .diagrams.guidance.prior import PriorKnowledge as PriorKnowledge
 from .diagrams.guidance.prior import ScriptedApproach as ScriptedApproach
 from .diagrams.guidance.registry import register_guidance as register_guidance

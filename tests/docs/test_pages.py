@@ -118,9 +118,9 @@ def test_robot_page_has_the_limits_of_the_code():
     from guiderail.diagrams.hardware.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE
     from guiderail.diagrams.hardware.station import HardwareStation
     from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+    from guiderail.diagrams.tasks.options import COLLISION_FORCE
     from guiderail.models.common.transforms import MM
     from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
-    from guiderail.models.objects.insertion import COLLISION_FORCE
     from guiderail.tools.hardware.sim_driver import START
 
     page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("\n## Limits\n")[2].partition("\n## ")[0]

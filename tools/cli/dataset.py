@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from guiderail.models.objects.insertion import COLLISION_FORCE
+from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, command, option, print_progress, print_result
 

@@ -13,7 +13,7 @@ from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import Bounds, PartTaskFile, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
-from guiderail.models.primitives.bounds import DemonstratedBounds, compute_bounds
+from guiderail.models.primitives.demonstrations import DemonstratedBounds, compute_bounds
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
 from guiderail.tools.files import (
     ENDINGS,

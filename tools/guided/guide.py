@@ -15,7 +15,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
-from guiderail.models.primitives.bounds import DemonstratedBounds
+from guiderail.models.primitives.demonstrations import DemonstratedBounds
 from guiderail.models.primitives.fit import Selection, fit
 from guiderail.models.primitives.gains import authority_gains, deviation
 from guiderail.models.primitives.poses import Orientation

@@ -15,7 +15,7 @@ from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
-from guiderail.models.primitives.bounds import DemonstratedBounds
+from guiderail.models.primitives.demonstrations import DemonstratedBounds
 from guiderail.models.primitives.poses import Orientation, pose_rotation
 
 MIN_STEPS = 12  # minimum control steps of a segment, for the fit of the Gaussian mixture

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
-from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.models.parts.assembly_check import (
     MAX_RESTING_OVERLAP,
     MAX_SHRINK,

@@ -18,14 +18,13 @@ from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.diagrams.tasks.part.file import PartModel, PartTaskFile
-from guiderail.diagrams.tasks.part.task import write_workcell
-from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
+from guiderail.diagrams.tasks.part.task import PLUG, SOCKET, write_workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
-from guiderail.models.objects.insertion import MIN_CONTACT_FORCE
 from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS, demonstrator_motions
 from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies

@@ -29,7 +29,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.systems.meshcat_device import MeshcatDevice
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout

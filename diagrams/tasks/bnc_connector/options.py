@@ -12,11 +12,16 @@ from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Integer, Number
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
-from guiderail.diagrams.tasks.options import FORCE_LIMITS, FixtureOffsetOptions, ForceOptions, PriorOptions
+from guiderail.diagrams.tasks.options import (
+    COLLISION_FORCE,
+    FORCE_LIMITS,
+    FixtureOffsetOptions,
+    ForceOptions,
+    PriorOptions,
+)
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
-from guiderail.models.objects.insertion import COLLISION_FORCE
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell

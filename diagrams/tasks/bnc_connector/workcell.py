@@ -13,8 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
 from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_of
-from guiderail.models.objects.bnc_connector.surfaces import jack_surfaces, plug_surfaces
+from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_of, jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 
 # Surfaces of jack and plug that cannot touch in a connector of these dimensions, or whose contact another pair carries.

@@ -14,7 +14,7 @@ from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION
 
 if TYPE_CHECKING:
-    from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+    from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 
 
 # Force of a collision [N]. Commands in the cuboid are at most 6 mm below the seat and 8 mm sideways; an impedance of
@@ -60,7 +60,7 @@ class GridClampOptions(ForceOptions):
 
     def workcell(self) -> GridClampWorkcell:
         """Return the workcell with these options."""
-        from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell  # imports Drake
+        from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell  # imports Drake
 
         dimensions = replace(
             NOMINAL.with_clearance(self.clearance), hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer

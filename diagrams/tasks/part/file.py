@@ -15,13 +15,12 @@ from pydantic import Field, ValidationInfo, field_validator
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
 from guiderail.diagrams.stations.options import ContactOptions
 from guiderail.diagrams.tasks.offsets import reference_of_file
-from guiderail.diagrams.tasks.options import PriorOptions
+from guiderail.diagrams.tasks.options import COLLISION_FORCE, REPEATABILITY_STD, PriorOptions
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.common.yaml import load_yaml
-from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATABILITY_STD
 from guiderail.models.parts.demonstrator import plan_search, plan_straight_insertion
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory

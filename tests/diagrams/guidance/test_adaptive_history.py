@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
-from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 

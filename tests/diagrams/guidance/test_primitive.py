@@ -9,8 +9,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.options import PrimitiveOptions
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
-from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut

@@ -10,8 +10,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware import fci as fci
 from guiderail.diagrams.hardware.fci import FORCE_THRESHOLD_SHARE, NO_ERRORS, FciDriver
-from guiderail.diagrams.hardware.pose_control import make_robot_impedance
-from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.hardware.station import HardwareStation, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell

@@ -11,9 +11,8 @@ from pydrake.systems.analysis import Simulator
 from rtde_server import END_FORCE_MODE, FORCE_MODE, DirectClient, RtdeProcess, RtdeServer
 
 from guiderail.diagrams.hardware import rtde
-from guiderail.diagrams.hardware.pose_control import make_robot_impedance
 from guiderail.diagrams.hardware.rtde import RtdeDriver
-from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.hardware.station import HardwareStation, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell

@@ -11,7 +11,7 @@ from guiderail import InputError, make_env
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 

@@ -2,18 +2,19 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.bnc_connector import task as connector
-from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTER, POSE_SCALE
 from guiderail.diagrams.tasks.bnc_connector.task import (
+    POSE_CENTER,
+    POSE_SCALE,
     REACH,
     STEP,
     scripted_center_of_pressure,
     scripted_torque_search,
 )
 from guiderail.diagrams.tasks.grid_clamp.task import CENTER, LANE_ENDS, LANES, SCALE, scripted_search
+from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import RIM
-from guiderail.models.objects.insertion import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 
 
 def seen_plug(**values):

@@ -6,8 +6,14 @@ import pytest
 from guiderail.models.parts.assembly_check import make_solids, measure_side_clearance, plan_motion
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import load_part
-from guiderail.models.parts.preparation import choose_tolerance, decimate, make_compliant, prepare_surfaces
-from guiderail.models.parts.simplification import crop_to_contact, simplify
+from guiderail.models.parts.preparation import (
+    choose_tolerance,
+    crop_to_contact,
+    decimate,
+    make_compliant,
+    prepare_surfaces,
+    simplify,
+)
 from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, to_arrays
 
 pytest.importorskip("trimesh")

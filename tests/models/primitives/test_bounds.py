@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.models.primitives.demonstrations import compute_bounds
 
 
 def make_demonstrations():

@@ -11,7 +11,7 @@ from guiderail.models.common.transforms import RigidTransform, RotationMatrix, p
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import UnsolvableError
-from guiderail.models.primitives.bounds import compute_bounds
+from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.models.templates import load_template
 from guiderail.tools.guided import guide
 
