@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.envs.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
-from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
-from guiderail.diagrams.tasks.task import EpisodeConstant, Task
+from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE, MIN_CONTACT_FORCE
+from guiderail.diagrams.tasks.task import EpisodeConstant, Task, terminal_reward
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
@@ -25,6 +26,7 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
+from guiderail.systems.reward_system import RewardTerm
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimeters
 
@@ -201,14 +203,72 @@ def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransfo
     return RigidTransform(turn, [*fixture[:2], 0.0]), RigidTransform(tilt, [*workpiece[:2], 0.0])
 
 
+# The thesis gives no units of the wrench f; here they are 10 N and 0.5 Nm.
+ACTION_WEIGHT = FORCE_WEIGHT = 0.01
+REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
+TERMINAL = {"success": 60.0, "collision": -50.0}
+# Reward per depth gained [1/mm]. The connector locks when the demonstrations end, however early the plug drops. With a
+# terminal reward alone, a policy that moves at random until the plug drops would earn as much as one that uses the
+# contact, and would sometimes fail. The path from start to lock is 15.6 mm long, with the last 5.5 mm in the jack.
+DEPTH_REWARD = 5.0
+# Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
+ALIGNMENT_REWARD = 5.0
+
+
+def _force_cost(wrench: np.ndarray) -> float:
+    scaled = wrench / REWARD_WRENCH
+    return -FORCE_WEIGHT * float(scaled @ scaled)
+
+
+def _depth_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
+    return DEPTH_REWARD * float(last_plug[2] - plug[2]) / MM
+
+
+def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
+    nearer = np.hypot(*last_plug[:2]) - np.hypot(*plug[:2])
+    return ALIGNMENT_REWARD * float(nearer) / MM
+
+
+def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
+
+    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components along and about
+    the axis of pose and wrench are unchanged.
+
+    Returns:
+        Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if
+        actions move only one of x and y, or only one of the tilts.
+    """
+    quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
+    turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
+    observations, actions, privileged, outputs = [], [], [], list(action_dims)
+    for across in [*turns[1:], *(turn @ mirror for turn in turns)]:
+        axial = np.linalg.det(across).round() * across
+        # In a pose, Ry comes before Rx.
+        pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
+        wrench = block_diag(across, np.eye(1), axial, np.eye(1))
+        further = () if observation == "state" else (across, across)
+        observations.append(block_diag(np.eye(1), pose, wrench, *further))
+        actions.append(pose[np.ix_(outputs, outputs)])
+        privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
+    if any((np.abs(action).sum(0) != 1).any() for action in actions):
+        return None
+    return np.array(observations), np.array(actions), np.array(privileged)
+
+
 WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pixels]
 
 
 class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
 
-    The observation "center_of_pressure" adds the center of pressure and the commanded x and y to the state. "image" is
-    the wrist camera's image alone; "image_and_state" adds it to the state.
+    Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
+    and y. "image" is the wrist camera's image alone; "image_and_state" adds it to the state.
+
+    Rewards: "sparse" is the thesis's reward (4.27, 4.28), with costs of actions and forces and a terminal reward.
+    "shaped" adds the depth gained, and "aligned" also the distance gained towards the fixture's axis. This distance is
+    privileged: the policy does not observe this simulation state. Depth gained and distance gained are differences of
+    potentials. The workpiece is the plug.
 
     Attributes:
         insertion_length: Length of the insertion, which scales the distance of the wrist camera [m].
@@ -231,6 +291,37 @@ class DemonstratedInsertion(InsertionTask):
         system = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
         builder.Connect(station.get_wrench_output_port(), system.get_wrench_input_port())
         return {**super().signals(builder, station), "center_of_pressure": system.get_center_of_pressure_output_port()}
+
+    def scaled_terms(
+        self, center: np.ndarray, scale: np.ndarray, wrench_scale: np.ndarray
+    ) -> Sequence[ObservationTerm] | Camera:
+        """Return the terms of the observation, for center and scale of the pose (6,) and scale of the wrench (6,)."""
+        if self.config.observation == "image":
+            return self.wrist_camera()
+        half = 0.5 * self.num_steps * self.control_period
+        terms = [
+            ObservationTerm("time", half, half),
+            ObservationTerm("pose", center, scale),
+            ObservationTerm("wrench", 0.0, wrench_scale),
+        ]
+        if self.config.observation == "center_of_pressure":
+            terms.append(ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE))
+            terms.append(ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
+        return *terms, *self.force_limit_terms()
+
+    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+        """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
+        plug = {"plug": POSE_SIZE, "last_plug": POSE_SIZE}
+        terms = [
+            RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),
+            RewardTerm("force_cost", {"wrench": 6}, _force_cost),
+            terminal_reward(TERMINAL),
+        ]
+        if self.config.reward in ("shaped", "aligned"):
+            terms.append(RewardTerm("depth", plug, _depth_gained))
+        if self.config.reward == "aligned":
+            terms.append(RewardTerm("alignment", plug, _alignment_gained))
+        return terms
 
     @property
     def has_image(self) -> bool:

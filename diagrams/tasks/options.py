@@ -24,6 +24,10 @@ HISTORY_VARIANCE = 1e-11
 # Standard deviation of a hand's repeatability [x y z Rz Ry Rx], added to the demonstrations' covariance.
 REPEATABILITY_STD = (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE)
 
+# Observations and rewards of `DemonstratedInsertion`.
+OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
+REWARDS = ("sparse", "shaped", "aligned")
+
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # larger ones are probably in mm or degrees [m], [rad]
 FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]

@@ -24,7 +24,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, TIME_UNIT, Imped
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
+from guiderail.systems.episode_monitor import TERMINATIONS, TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
@@ -68,6 +68,11 @@ class Threshold:
 
     signal: str = "contact_force"
     above: float = 0.0
+
+
+def terminal_reward(rewards: Mapping[str, float], name: str = "terminal_reward") -> RewardTerm:
+    """Return the term `name`: the reward of an episode's end by the name of its termination, zero without a reward."""
+    return RewardTerm(name, {"termination": 1}, lambda termination: rewards.get(TERMINATIONS[int(termination[0])], 0.0))
 
 
 @lru_cache(maxsize=32)

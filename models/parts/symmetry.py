@@ -13,7 +13,7 @@ from guiderail.models.common.errors import import_extra
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids, move_solid
 from guiderail.models.parts.mesh_file import Part
 
-# Map of (x, y) of each candidate, in the order of `diagrams.tasks.bnc_connector.task.sides_of_the_rim`.
+# Map of (x, y) of each candidate, in the order of `diagrams.tasks.insertion.sides_of_the_rim`.
 SYMMETRIES = {
     "quarter turn": np.array([[0, -1], [1, 0]]),
     "half turn": np.array([[-1, 0], [0, -1]]),

@@ -34,8 +34,6 @@ OFFSET_RANGES = {
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
 LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a faulty grasp
-OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
-REWARDS = ("sparse", "shaped", "aligned")
 
 
 class BncUncertainty(HiddenOffsets):

@@ -23,13 +23,13 @@ from guiderail.diagrams.tasks.grid_clamp.options import HARD, REWARDS, GridClamp
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold, terminal_reward
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.grid_clamp.geometry import CLAMP_SDF, TABLE_SDF, GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION, clamp_surfaces, folder_of, table_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.templates import SharedControlTemplate, load_template
-from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, TerminationTerm
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
@@ -111,33 +111,8 @@ SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
 
-def reward_terms(reward: str, num_actions: int, action_repeat: int) -> list[RewardTerm]:
-    """Return the terms of a reward.
-
-    "shaped" is the thesis's reward; "no_force" omits its cost of force, and "sparse" its distance gained downwards.
-    "aligned" adds to "shaped" a cost of collisions and the distance gained towards the holes' axis, a privileged value
-    that the policy does not observe. Values per action in the thesis are divided among `action_repeat` control steps.
-    """
-    terms = [
-        RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
-        RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
-    ]
-    if reward != "no_force":
-        terms.append(RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / action_repeat))
-    if reward != "sparse":
-        terms.append(RewardTerm("shaping", {"pose": POSE_SIZE, "last_pose": POSE_SIZE}, _distance_gained))
-    if reward == "aligned":
-        terms.append(RewardTerm("alignment", {"clamp": POSE_SIZE, "last_clamp": POSE_SIZE}, _alignment_gained))
-        terms.append(RewardTerm("collision_cost", {"termination": 1}, _collision_cost))
-    return terms
-
-
-def _terminal_reward(termination: np.ndarray) -> float:
-    return SUCCESS_REWARD * (termination[0] == SUCCESS)
-
-
-def _force_cost(force: np.ndarray) -> float:
-    return -FORCE_WEIGHT * float(force @ force)
+def _force_cost(wrench: np.ndarray) -> float:
+    return -FORCE_WEIGHT * float(wrench[:3] @ wrench[:3])
 
 
 def _distance_gained(pose: np.ndarray, last_pose: np.ndarray) -> float:
@@ -146,10 +121,6 @@ def _distance_gained(pose: np.ndarray, last_pose: np.ndarray) -> float:
 
 def _alignment_gained(clamp: np.ndarray, last_clamp: np.ndarray) -> float:
     return ALIGNMENT * float(np.hypot(*last_clamp[:2]) - np.hypot(*clamp[:2]))
-
-
-def _collision_cost(termination: np.ndarray) -> float:
-    return COLLISION_REWARD * (TERMINATIONS[int(termination[0])] == "collision")
 
 
 NUM_PLACES = 6  # pick-up places of clamps
@@ -276,7 +247,9 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 class GridClamp(InsertionTask):
     """Insert the clamp.
 
-    Rewards: "shaped" is the thesis's reward (3.11, 3.12); see `reward_terms` for "no_force", "sparse" and "aligned".
+    Rewards: "shaped" is the thesis's reward (3.11, 3.12); "no_force" omits its cost of force, and "sparse" its distance
+    gained downwards. "aligned" adds to "shaped" a cost of collisions and the distance gained towards the holes' axis, a
+    privileged value that the policy does not observe.
     Without `active_constraints`, only the impedance limits the forces of a policy.
     """
 
@@ -326,8 +299,25 @@ class GridClamp(InsertionTask):
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of the reward `config.reward`."""
-        return reward_terms(self.config.reward, num_actions, self.config.action_repeat)
+        """Return the terms of the reward `config.reward`.
+
+        Values per action in the thesis are divided among the `action_repeat` control steps.
+        """
+        reward, action_repeat = self.config.reward, self.config.action_repeat
+        terms = [
+            terminal_reward({"success": SUCCESS_REWARD}),
+            RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
+        ]
+        if reward != "no_force":
+            terms.append(
+                RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / action_repeat)
+            )
+        if reward != "sparse":
+            terms.append(RewardTerm("shaping", {"pose": POSE_SIZE, "last_pose": POSE_SIZE}, _distance_gained))
+        if reward == "aligned":
+            terms.append(RewardTerm("alignment", {"clamp": POSE_SIZE, "last_clamp": POSE_SIZE}, _alignment_gained))
+            terms.append(terminal_reward({"collision": COLLISION_REWARD}, "collision_cost"))
+        return terms
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success when seated, and collision above the force limit."""

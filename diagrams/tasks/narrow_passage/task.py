@@ -22,7 +22,7 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task
+from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, terminal_reward
 from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
@@ -30,7 +30,7 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.objects.narrow_passage import demonstrations
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import SUCCESS, TerminationTerm
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
@@ -58,65 +58,8 @@ SUCCESS_REWARD = 200.0
 PROGRESS = 100.0  # shaped reward for progress [1/m]
 
 
-def reward_terms(reward: str, geometry: PassageGeometry, has_sampled_obstacles: bool = False) -> list[RewardTerm]:
-    """Return the terms of a reward.
-
-    "sparse" is the thesis's reward (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
-    With `has_sampled_obstacles`, the signal `obstacles` holds the obstacles' positions, and each obstacle adds a cost.
-    """
-    two_poses = {"pose": 2, "last_pose": 2}
-
-    def progress(pose: np.ndarray, last_pose: np.ndarray) -> float:
-        return PROGRESS * (math.dist(last_pose, geometry.goal) - math.dist(pose, geometry.goal))
-
-    def costs(pose: np.ndarray, obstacles: np.ndarray) -> float:
-        return sum(geometry.obstacle_cost(pose, obstacle) for obstacle in obstacles.reshape(-1, 2))
-
-    obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2}, geometry.obstacle_cost)
-    if has_sampled_obstacles:
-        obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2, "obstacles": geometry.obstacles.size}, costs)
-    terms = [
-        RewardTerm("action_cost", two_poses, lambda pose, last_pose: action_cost(pose - last_pose)),
-        obstacle_cost,
-        RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
-    ]
-    return [*terms, RewardTerm("progress", two_poses, progress)] if reward == "shaped" else terms
-
-
-def _terminal_reward(termination: np.ndarray) -> float:
-    return SUCCESS_REWARD * (termination[0] == SUCCESS)
-
-
 BLOCKED_STEPS = 20  # control steps at a wall without progress after which the robot is blocked
 BLOCKED_PROGRESS = 1e-4  # [m] smallest increase of y that counts as progress
-
-
-def termination_terms(geometry: PassageGeometry, is_touching_collision: bool = False) -> list[TerminationTerm]:
-    """Return the termination terms: success at the goal, and blocked at a wall without progress.
-
-    With `is_touching_collision` an episode also ends, with priority, when the robot's center is in an obstacle of the
-    signal `obstacles`.
-    """
-
-    def blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
-        return (contact_force[0] > 0 or fallback[0] > 0) and geometry.in_passage(pose)
-
-    def touched(pose: np.ndarray, obstacles: np.ndarray) -> bool:
-        return any(geometry.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
-
-    terms = [
-        TerminationTerm("success", {"pose": 2}, geometry.at_goal),
-        TerminationTerm(
-            "blocked",
-            {"pose": 2, "contact_force": 1, "fallback": 1},
-            blocked,
-            steps=BLOCKED_STEPS,
-            progress=lambda pose, contact_force, fallback: pose[1],
-            min_progress=BLOCKED_PROGRESS,
-        ),
-    ]
-    collision = TerminationTerm("collision", {"pose": 2, "obstacles": geometry.obstacles.size}, touched)
-    return [collision, *terms] if is_touching_collision else terms
 
 
 # Phases, from −1 to 1, in which the demonstrations pass the first and the second obstacle.
@@ -228,11 +171,50 @@ class NarrowPassage(Task):
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Return costs of motion and obstacles, the terminal reward, and progress with the shaped reward."""
-        return reward_terms(self.config.reward, self._geometry, self.options.has_sampled_obstacles)
+        geometry, poses = self._geometry, {"pose": 2, "last_pose": 2}
+
+        def costs(pose: np.ndarray, obstacles: np.ndarray) -> float:
+            return sum(geometry.obstacle_cost(pose, obstacle) for obstacle in obstacles.reshape(-1, 2))
+
+        def progress(pose: np.ndarray, last_pose: np.ndarray) -> float:
+            return PROGRESS * (math.dist(last_pose, geometry.goal) - math.dist(pose, geometry.goal))
+
+        obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2}, geometry.obstacle_cost)
+        if self.options.has_sampled_obstacles:
+            obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2, "obstacles": geometry.obstacles.size}, costs)
+        terms = [
+            RewardTerm("action_cost", poses, lambda pose, last_pose: action_cost(pose - last_pose)),
+            obstacle_cost,
+            terminal_reward({"success": SUCCESS_REWARD}),
+        ]
+        return [*terms, RewardTerm("progress", poses, progress)] if self.config.reward == "shaped" else terms
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Return success, blocked, and collision with an obstacle if it ends the episode."""
-        return termination_terms(self._geometry, self.options.obstacles_end)
+        """Return success at the goal, blocked at a wall without progress, and collision if obstacles end the episode.
+
+        Collision, which has priority, is the robot's center in an obstacle.
+        """
+        geometry = self._geometry
+
+        def blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
+            return (contact_force[0] > 0 or fallback[0] > 0) and geometry.in_passage(pose)
+
+        def touched(pose: np.ndarray, obstacles: np.ndarray) -> bool:
+            return any(geometry.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
+
+        terms = [
+            TerminationTerm("success", {"pose": 2}, geometry.at_goal),
+            TerminationTerm(
+                "blocked",
+                {"pose": 2, "contact_force": 1, "fallback": 1},
+                blocked,
+                steps=BLOCKED_STEPS,
+                progress=lambda pose, contact_force, fallback: pose[1],
+                min_progress=BLOCKED_PROGRESS,
+            ),
+        ]
+        collision = TerminationTerm("collision", {"pose": 2, "obstacles": geometry.obstacles.size}, touched)
+        return [collision, *terms] if self.options.obstacles_end else terms
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any

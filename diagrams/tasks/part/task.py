@@ -21,16 +21,13 @@ from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell
-from guiderail.diagrams.tasks.bnc_connector.options import OBSERVATIONS, REWARDS, BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.task import (
-    observation_terms,
-    reward_terms,
-    sides_of_the_rim,
-)
-from guiderail.diagrams.tasks.insertion import DemonstratedInsertion
+from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     HISTORY_VARIANCE,
+    OBSERVATIONS,
+    REWARDS,
     FixtureOffsetOptions,
     ForceOptions,
 )
@@ -45,7 +42,6 @@ from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
@@ -267,19 +263,10 @@ class PartInsertion(DemonstratedInsertion):
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
-        if self.config.observation == "image":
-            return self.wrist_camera()
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
-        terms = observation_terms(
-            self.config.observation, self.num_steps * self.control_period, center, scale, WRENCH_SCALE
-        )
-        return *terms, *self.force_limit_terms()
-
-    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of `config.reward`."""
-        return reward_terms(self.config.reward, num_actions)
+        return self.scaled_terms(center, scale, WRENCH_SCALE)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success at the target, and collision above the force limit."""

@@ -32,17 +32,15 @@ from guiderail.diagrams.tasks.pouring.options import (
     make_template,
 )
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, Threshold
+from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, Threshold, terminal_reward
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import transform_to_pose
-from guiderail.systems.episode_monitor import TERMINATIONS, TerminationTerm
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-
-REWARDS = ("sparse", "shaped", "hand_shaped")
 
 TERMINAL = {"success": 200.0, "collision": -10.0}  # equation 3.5
 SHAPING = 200.0  # equation 3.7
@@ -55,44 +53,8 @@ AIM = np.array([0.0, -0.045])  # [m] position of the tip in the mug's frame from
 AIMING = 2000.0  # reward per distance gained towards `AIM` [1/m]: 50 mm earn half as much as the whole tilt
 
 
-def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = False) -> list[RewardTerm]:
-    """Return the terms of a reward, one of `REWARDS`.
-
-    The reward of an action is the sum over its control steps. Values that the thesis defines per action are therefore
-    divided by `action_repeat`. If `aimed`, "shaped" includes the distance gained towards `AIM` in the state Pour.
-
-    Raises:
-        InputError: If there is no such reward.
-    """
-    terms = [
-        RewardTerm(
-            "terminal_reward",
-            {"termination": 1},
-            lambda termination: TERMINAL.get(TERMINATIONS[int(termination[0])], 0.0),
-        ),
-        RewardTerm("action_cost", {"action": inputs}, lambda action: -float(action @ action) / action_repeat),
-    ]
-    if reward == "sparse":
-        return terms
-    if reward == "shaped":
-        shaping = RewardTerm(
-            "shaping",
-            {"progress": 1, "last_progress": 1},
-            lambda progress, last_progress: SHAPING * float(progress[0] - last_progress[0]),
-        )
-        aiming = RewardTerm("aiming", {"tip_in_mug": 6, "last_tip_in_mug": 6, "state": 1}, _aiming)
-        return [*terms, shaping, aiming] if aimed else [*terms, shaping]
-    if reward == "hand_shaped":
-        poses = {"tip_in_mug": 6, "last_tip_in_mug": 6}
-
-        def approach(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
-            return _approach(tip_in_mug, last_tip_in_mug, action_repeat)
-
-        def tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
-            return _tilting(tip_in_mug, last_tip_in_mug) / 4  # equation 3.8
-
-        return [*terms, RewardTerm("approach", poses, approach), RewardTerm("tilting", poses, tilting)]
-    raise InputError(f"there is no reward '{reward}': use {', '.join(REWARDS)}")
+def _progress_gained(progress: np.ndarray, last_progress: np.ndarray) -> float:
+    return SHAPING * float(progress[0] - last_progress[0])
 
 
 def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarray) -> float:
@@ -103,20 +65,16 @@ def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarr
     return AIMING * (before - after)
 
 
-def _approach(tip: np.ndarray, last: np.ndarray, action_repeat: int) -> float:
-    """Return the reward of equation 3.9."""
-    distance = np.linalg.norm(tip[:3])
-    bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
-    return float(APPROACH * (np.linalg.norm(last[:3]) - distance) + bonus)
+def _tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
+    """Return a quarter of the reward of equation 3.10, as in equation 3.8.
 
-
-def _tilting(tip: np.ndarray, last: np.ndarray) -> float:
-    """Return the reward of equation 3.10; the thermos is on the mug's −y side, so that a negative roll pours."""
-    change = _euler(tip) - _euler(last)
+    The thermos is on the mug's −y side, so that a negative roll pours.
+    """
+    change = _euler(tip_in_mug) - _euler(last_tip_in_mug)
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
-    if np.linalg.norm(tip[:3]) > NEAR:
-        return -float(np.abs(change).sum())
-    return float(-TILT * change[0] - abs(change[1]) - abs(change[2]))
+    if np.linalg.norm(tip_in_mug[:3]) > NEAR:
+        return -float(np.abs(change).sum()) / 4
+    return float(-TILT * change[0] - abs(change[1]) - abs(change[2])) / 4
 
 
 def _euler(tip: np.ndarray) -> np.ndarray:
@@ -136,37 +94,6 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
     if np.linalg.norm(reset.mug_error) > MAX_MUG_ERROR:
         raise InputError(f"the reset option 'mug_error' is at most {MAX_MUG_ERROR:g} m long, not {reset.mug_error}")
     return np.array(reset.mug_error)
-
-
-def termination_terms(config: PouringConfig, needed: int, poured_steps: int) -> list[TerminationTerm]:
-    """Return the termination terms; a collision has priority, so that an episode that touched the mug is no success.
-
-    An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug. It is a
-    success when they have been in the mug for `poured_steps` control steps, because a ball can bounce out again.
-    """
-    mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2
-    fall = config.mug.height + config.stand_height
-
-    def positions(balls: np.ndarray) -> np.ndarray:
-        return balls.reshape(-1, 6)[:, :3]
-
-    def poured(balls_in_mug: np.ndarray) -> bool:
-        return sum(mug.contains(p_MB) for p_MB in positions(balls_in_mug)) >= needed
-
-    def spilled(balls_in_mug: np.ndarray, balls_in_thermos: np.ndarray) -> bool:
-        # A ball that is in neither vessel and has fallen to the table, or past it.
-        fallen = sum(
-            p_MB[2] < radius - fall + 0.01 and not mug.contains(p_MB) and not thermos.contains(p_PB, 0.01)
-            for p_MB, p_PB in zip(positions(balls_in_mug), positions(balls_in_thermos), strict=True)
-        )
-        return bool(fallen > config.num_balls - needed)
-
-    balls = {"balls_in_mug": 6 * config.num_balls, "balls_in_thermos": 6 * config.num_balls}
-    return [
-        TerminationTerm("collision", {"touched": 1}, lambda touched: touched[0] > 0),
-        TerminationTerm("success", {"balls_in_mug": 6 * config.num_balls}, poured, steps=poured_steps),
-        TerminationTerm("spill", balls, spilled),
-    ]
 
 
 MAX_TRACKING_ERROR = 0.05  # [m]
@@ -309,12 +236,63 @@ class Pouring(Task):
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of the reward `config.reward`."""
-        return reward_terms(self.config.reward, num_actions, self.config.action_repeat, self.options.aim)
+        """Return the terms of the reward `config.reward`.
+
+        The reward of an action is the sum over its control steps. Values that the thesis defines per action are
+        therefore divided by `action_repeat`. With the option `aim`, "shaped" includes the distance gained towards `AIM`
+        in the state Pour.
+        """
+        reward, action_repeat, poses = self.config.reward, self.config.action_repeat, ("tip_in_mug", "last_tip_in_mug")
+        sizes = dict.fromkeys(poses, 6)
+        terms = [
+            terminal_reward(TERMINAL),
+            RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
+        ]
+        if reward == "shaped":
+            terms.append(RewardTerm("shaping", {"progress": 1, "last_progress": 1}, _progress_gained))
+            if self.options.aim:
+                terms.append(RewardTerm("aiming", {**sizes, "state": 1}, _aiming))
+        if reward == "hand_shaped":
+
+            def approach(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
+                """Return the reward of equation 3.9."""
+                distance = np.linalg.norm(tip_in_mug[:3])
+                bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
+                return float(APPROACH * (np.linalg.norm(last_tip_in_mug[:3]) - distance) + bonus)
+
+            terms += [RewardTerm("approach", sizes, approach), RewardTerm("tilting", sizes, _tilting)]
+        return terms
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Return collision when touched, success when poured, and spill."""
-        return termination_terms(self._scene_config, self.options.needed, self.steps_of(POURED_STEPS))
+        """Return collision, success and spill; an episode that touched the mug is no success.
+
+        An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug. It is
+        a success when they have been in the mug for `POURED_STEPS`, because a ball can bounce out again.
+        """
+        config, needed = self._scene_config, self.options.needed
+        mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2
+        fall = config.mug.height + config.stand_height
+
+        def positions(balls: np.ndarray) -> np.ndarray:
+            return balls.reshape(-1, 6)[:, :3]
+
+        def poured(balls_in_mug: np.ndarray) -> bool:
+            return sum(mug.contains(p_MB) for p_MB in positions(balls_in_mug)) >= needed
+
+        def spilled(balls_in_mug: np.ndarray, balls_in_thermos: np.ndarray) -> bool:
+            # A ball that is in neither vessel and has fallen to the table, or past it.
+            fallen = sum(
+                p_MB[2] < radius - fall + 0.01 and not mug.contains(p_MB) and not thermos.contains(p_PB, 0.01)
+                for p_MB, p_PB in zip(positions(balls_in_mug), positions(balls_in_thermos), strict=True)
+            )
+            return bool(fallen > config.num_balls - needed)
+
+        size, steps = 6 * config.num_balls, self.steps_of(POURED_STEPS)
+        return [
+            TerminationTerm("collision", {"touched": 1}, lambda touched: touched[0] > 0),
+            TerminationTerm("success", {"balls_in_mug": size}, poured, steps=steps),
+            TerminationTerm("spill", {"balls_in_mug": size, "balls_in_thermos": size}, spilled),
+        ]
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any

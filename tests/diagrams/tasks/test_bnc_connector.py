@@ -10,13 +10,11 @@ import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.task import (
-    ALIGNMENT_REWARD,
-    DEPTH_REWARD,
     NUM_STEPS,
     reference_trajectory,
     scripted_torque_search,
 )
-from guiderail.diagrams.tasks.insertion import InsertionReset
+from guiderail.diagrams.tasks.insertion import ALIGNMENT_REWARD, DEPTH_REWARD, InsertionReset
 from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
