@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, PassThrough, TrajectorySource, ZeroOrderHold
+from pydrake.systems.primitives import MatrixGain, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.guidance.guidance import Guidance
@@ -17,7 +17,7 @@ from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.systems.command_filter import CommandFilter
@@ -53,17 +53,12 @@ class ResidualDescent(Guidance):
         residual = builder.AddNamedSystem("residual", Residual(np.array([approach.reach] * 3 + [0.0] * 3)))
         constraints = ActiveConstraintFilter(template, placed.frames, period)
         builder.AddNamedSystem("active_constraints", constraints)
-        wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
         builder.Connect(line.get_output_port(), held.get_input_port())
         builder.Connect(held.get_output_port(), residual.get_reference_input_port())
         builder.Connect(hold.get_output_port(), spread.get_input_port())
         builder.Connect(spread.get_output_port(), residual.get_action_input_port())
         builder.Connect(residual.get_desired_pose_output_port(), constraints.GetInputPort("requested_pose"))
-        builder.ExportInput(hold.get_input_port(), "action")
-        builder.ExportInput(constraints.GetInputPort("pose"), "pose")
-        builder.ExportInput(wrench.get_input_port(), "wrench")
-        builder.ExportOutput(hold.get_output_port(), "held_action")
-        constraints.export_outputs(builder)
+        constraints.export_ports(builder, hold)
         builder.BuildInto(self)
 
 

@@ -73,8 +73,14 @@ class ActiveConstraintFilter(Diagram):
                 builder.ExportOutput(system.GetOutputPort(name), name)
         builder.BuildInto(self)
 
-    def export_outputs(self, builder: DiagramBuilder) -> None:
-        """Export this filter's outputs from a guidance diagram that contains it."""
+    def export_ports(self, builder: DiagramBuilder, hold: ZeroOrderHold) -> None:
+        """Export the ports of a guidance diagram that contains this filter and the hold of its action."""
+        builder.ExportInput(hold.get_input_port(), "action")
+        builder.ExportInput(self.GetInputPort("pose"), "pose")
+        # The wrench is unused, but all guidance has this port.
+        wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
+        builder.ExportInput(wrench.get_input_port(), "wrench")
+        builder.ExportOutput(hold.get_output_port(), "held_action")
         names = ("desired_pose", "fallback", "state", "transition_distance", "progress", "measured_violation")
         for name in names:
             builder.ExportOutput(self.GetOutputPort(name), name)
@@ -133,14 +139,7 @@ class SctGuidance(Guidance):
         builder.Connect(state, self._mapping.get_state_input_port())
         builder.Connect(self._filter.GetOutputPort("last_desired_pose"), self._mapping.get_pose_input_port())
         builder.Connect(self._mapping.get_requested_pose_output_port(), self._filter.GetInputPort("requested_pose"))
-
-        builder.ExportInput(hold.get_input_port(), "action")
-        builder.ExportInput(self._filter.GetInputPort("pose"), "pose")
-        # The wrench is unused, but all guidance has this port.
-        wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
-        builder.ExportInput(wrench.get_input_port(), "wrench")
-        self._filter.export_outputs(builder)
-        builder.ExportOutput(hold.get_output_port(), "held_action")
+        self._filter.export_ports(builder, hold)
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:

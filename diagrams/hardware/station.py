@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.tree import JacobianWrtVariable, SpatialInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from guiderail.diagrams.hardware.driver import (
@@ -211,8 +211,12 @@ class HardwareStation(Station):
         ):
             builder.Connect(source, target)
         if isinstance(self.driver, PoseDriver):
-            limited_pose, arm_state = rate_limiter.get_limited_pose_output_port(), limiter.get_arm_state_output_port()
-            add_pose_publisher(builder, self.driver, model, limited_pose, arm_state, period)
+            X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
+            poses = builder.AddNamedSystem(
+                "publisher", PosePublisher(self.driver.write_pose, self.driver.stop, X_BaseTarget, period=period)
+            )
+            builder.Connect(rate_limiter.get_limited_pose_output_port(), poses.get_pose_input_port())
+            builder.Connect(limiter.get_arm_state_output_port(), poses.get_arm_state_input_port())
             # The torques of the robot's own controller are unknown: velocities are compared with positions only.
             no_torque = builder.AddSystem(ConstantVectorSource(np.zeros(n)))
             builder.Connect(no_torque.get_output_port(), status.get_torque_input_port())
@@ -367,23 +371,6 @@ def make_rate_limiter(driver: Driver, period: float) -> PoseRateLimiter:
 
         return PoseMotionLimiter(driver.motion_limits, period=period)
     return PoseRateLimiter(period=period)
-
-
-def add_pose_publisher(
-    builder: DiagramBuilder,
-    driver: PoseDriver,
-    model: ArmControllerPlant,
-    pose: OutputPort,
-    arm_state: OutputPort,
-    period: float,
-) -> None:
-    """Add a publisher that sends `pose` to the robot while `arm_state` permits, and otherwise stops it."""
-    X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
-    publisher = builder.AddNamedSystem(
-        "publisher", PosePublisher(driver.write_pose, driver.stop, X_BaseTarget, period=period)
-    )
-    builder.Connect(pose, publisher.get_pose_input_port())
-    builder.Connect(arm_state, publisher.get_arm_state_input_port())
 
 
 def payload_on_flange(model: ArmControllerPlant) -> SpatialInertia:
