@@ -6,11 +6,11 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.task import Pouring, scripted_pour_aimed, termination_terms
+from guiderail.diagrams.tasks.pouring.task import Pouring, scripted_pour_aimed
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import Ball
 
-CONFIG = PouringConfig(ball=Ball(diameter=0.026), num_balls=6)
+OPTIONS = {"balls": 6, "balls_in": 5, "ball_diameter": 0.026}
 IN, FALLEN, KEPT = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]  # in the frame of the mug's tip
 
 
@@ -18,7 +18,7 @@ def outcome(in_mug, fallen):
     """Return success and spill if five of six balls are needed; the others are in the thermos."""
     places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
     balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
-    _, success, spill = termination_terms(CONFIG, needed=5, poured_steps=10)
+    _, success, spill = Pouring(EnvConfig.resolve("Pouring", OPTIONS)).termination_terms()
     return success.condition(balls), spill.condition(balls, balls)
 
 
@@ -63,7 +63,7 @@ def test_options_that_do_not_go_together_are_refused():
 
 
 def test_aimed_policy_pours_enough_balls():
-    env = make_env("Pouring", difficulty="hard", balls=6, balls_in=5, ball_diameter=0.026)
+    env = make_env("Pouring", difficulty="hard", **OPTIONS)
     observation, _ = env.reset(seed=1, options={"mug_error": (0.045, 0.0)})
     ended = False
     while not ended:
