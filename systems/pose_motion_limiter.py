@@ -6,7 +6,7 @@ from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.motion_limits import MotionLimits
+from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
 # Modes in order of preference. If the axes cannot be synchronized for numerical reasons (about one of 10,000

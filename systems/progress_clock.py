@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.primitives.progress import StateProgress
+from guiderail.models.primitives.stepper import StateProgress
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 

@@ -41,7 +41,7 @@ from guiderail.systems.image_observation import ImageObservation
 from guiderail.systems.reward_system import RewardSystem
 
 if TYPE_CHECKING:
-    from guiderail.models.primitives.progress import StateProgress
+    from guiderail.models.primitives.stepper import StateProgress
 
 HALF_TURN_MARGIN = 0.1  # smallest distance of demonstrated angles from ±180° [rad]; actions and contact turn further
 
@@ -98,7 +98,7 @@ def _state_progress(task: Task, period: float) -> StateProgress | None:
     options = task.config.part("primitive")
     if options.get("progress", "clock") == "clock":
         return None
-    from guiderail.models.primitives.progress import StateProgress
+    from guiderail.models.primitives.stepper import StateProgress
 
     return StateProgress(options["progress_tolerance"], round(options["max_lag"] / period))
 

@@ -19,7 +19,7 @@ from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
 if TYPE_CHECKING:
     from guiderail.models.control.keep_out import KeepOut
     from guiderail.models.control.motion_constraints import MotionConstraints
-    from guiderail.models.primitives.progress import StateProgress
+    from guiderail.models.primitives.stepper import StateProgress
     from guiderail.models.templates import SharedControlTemplate
 
 

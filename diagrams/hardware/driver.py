@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 from guiderail.models.control.joint_status import Heartbeat, JointStatus, StatusLimits
-from guiderail.models.control.motion_limits import MotionLimits
+from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.robot import Robot
 from guiderail.systems.torque_safety_limiter import SafetyLimits
 

@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
-from guiderail.models.control.motion_limits import MotionLimits
+from guiderail.models.control.motion_constraints import MotionLimits
 
 logger = logging.getLogger(__name__)
 

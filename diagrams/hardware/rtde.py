@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance, register_driver
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
-from guiderail.models.control.motion_limits import MotionLimits
+from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import find_robot
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.hardware.fci import FciDriver
 from guiderail.diagrams.hardware.rtde import UR_MOTION_LIMITS
-from guiderail.models.control.motion_limits import FRANKA_LIMITS, MotionLimits
+from guiderail.models.control.motion_constraints import FRANKA_LIMITS, MotionLimits
 from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
 
 START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])

@@ -6,7 +6,7 @@ from pydrake.systems.analysis import Simulator
 from ruckig import ControlInterface, Ruckig, RuckigError, Synchronization
 from scipy.spatial.transform import Rotation
 
-from guiderail.models.control.motion_limits import FRANKA_LIMITS
+from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems import pose_motion_limiter
 from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
 

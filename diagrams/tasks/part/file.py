@@ -178,13 +178,8 @@ def _is_row(row: Any) -> bool:
 
 
 def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
-    return np.array(_replaced(rows, missing), dtype=float)
-
-
-def _replaced(rows: Any, missing: float) -> Any:
-    if isinstance(rows, list | tuple):
-        return [_replaced(one, missing) for one in rows]
-    return missing if rows is None else rows
+    numbers = np.array(rows, dtype=float)  # None becomes NaN, which no bound is
+    return np.where(np.isnan(numbers), missing, numbers)
 
 
 class DemonstrationFile(PriorOptions):

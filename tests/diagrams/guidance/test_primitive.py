@@ -17,7 +17,7 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority
-from guiderail.models.primitives.progress import StateProgress
+from guiderail.models.primitives.stepper import StateProgress
 
 PERIOD, STEPS = 0.02, 60
 PRIMITIVE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl", "residual_covariance")

@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
-from guiderail.models.control.motion_limits import FRANKA_LIMITS
+from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.motion_limits import FRANKA_LIMITS, MotionLimits
+from guiderail.models.control.motion_constraints import FRANKA_LIMITS, MotionLimits
 
 
 def left_jacobian(r):
