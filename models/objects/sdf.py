@@ -50,6 +50,14 @@ class TriangleMesh:
         has_area = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
         return TriangleMesh(vertices, triangles[has_area])
 
+    @staticmethod
+    def from_obj(path: Path) -> "TriangleMesh":
+        """Read the vertices and triangles of an OBJ file, such as one with the text of `to_obj`."""
+        lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        vertices = [line[1:4] for line in lines if line[:1] == ["v"]]
+        corners = [[corner.split("/")[0] for corner in line[1:]] for line in lines if line[:1] == ["f"]]
+        return TriangleMesh(np.array(vertices, dtype=float), np.array(corners, dtype=int) - 1)
+
     def normals(self) -> np.ndarray:
         """Return the unit normals (T, 3) of the triangles."""
         normal = area_vectors(self.vertices, self.triangles)

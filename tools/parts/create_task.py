@@ -13,6 +13,7 @@ import numpy as np
 from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
+from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.parts.assembly_check import (
     MAX_RESTING_OVERLAP,
     MAX_SHRINK,
@@ -333,7 +334,7 @@ def _write_task(
     """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
     from guiderail.diagrams.tasks.part.file import write_task_file
     from guiderail.tools.parts.difficulty import calibrate
-    from guiderail.tools.parts.trial import demonstrate, triangles_of, write_preview
+    from guiderail.tools.parts.trial import demonstrate, write_preview
 
     duration = float(file.motion.plan_search()[0][-1])
     log(f"recording demonstrations: about {5.0 * duration / measured['real_time_factor']:.0f} s")
@@ -348,7 +349,8 @@ def _write_task(
     file = file.model_copy(update={"measured": measured})
     write_task_file(folder, file)
     if hard_episodes:
-        radius = float(np.hypot(*triangles_of(folder / file.plug.visual).reshape(-1, 3)[:, :2].T).max())
+        mesh = TriangleMesh.from_obj(folder / file.plug.visual)
+        radius = float(np.hypot(*mesh.vertices[mesh.triangles].reshape(-1, 3)[:, :2].T).max())
         file = calibrate(folder, file, radius, hard_episodes, log)
         if "hard" in file.measured:
             file.measured["hard"]["seconds"] = round(clock.read() - measured["total_s"], 2)

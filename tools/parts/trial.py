@@ -25,6 +25,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
+from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS, demonstrator_motions
 from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
@@ -139,11 +140,11 @@ def insert(
     station = GantryStation(workcell, time_step=file.time_step)
     driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     workcell.set_fixture_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
-    compliant = {
-        name: _locator(folder / part.visual)
-        for name, part in ((PLUG, file.plug), (SOCKET, file.socket))
-        if part.pieces[0].modulus is not None
-    }
+    compliant = {}
+    for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
+        if part.pieces[0].modulus is not None:
+            mesh = TriangleMesh.from_obj(folder / part.visual)
+            compliant[name] = SurfaceLocator(mesh.vertices, mesh.triangles)
     depths = Depths(station, compliant, set(snapping), times[-1] - _AT_REST)
     driven.start(poses[0])
     steps, blocked, lowest = 0, 0, np.inf
@@ -191,18 +192,6 @@ def _plug_pose(driven: DrivenStation) -> np.ndarray:
     return np.concatenate([X.translation(), rotation.angle() * rotation.axis()])
 
 
-def triangles_of(path: Path) -> np.ndarray:
-    """Return the triangles (T, 3, 3) [m] of an OBJ file of a task folder."""
-    vertices, corners = [], []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        kind, *rest = line.split()
-        if kind == "v":
-            vertices.append([float(one) for one in rest])
-        elif kind == "f":
-            corners.append([int(one.split("/")[0]) - 1 for one in rest])
-    return np.array(vertices)[np.array(corners)]
-
-
 def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:
     """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, and -1 if away from it.
 
@@ -213,11 +202,6 @@ def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) 
         levers = [center_of_pressure(wrench, MIN_CONTACT_FORCE) for wrench in recording["wrench"]]
         towards += float(np.sum(np.asarray(levers) @ np.asarray(offset)))
     return 1 if towards > 0.0 else -1
-
-
-def _locator(path: Path) -> SurfaceLocator:
-    triangles = triangles_of(path)
-    return SurfaceLocator(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
 
 
 _SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}
@@ -251,7 +235,8 @@ def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) ->
 
 
 def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
-    corners = _SCALE * triangles_of(file).reshape(-1, 3)
+    mesh = TriangleMesh.from_obj(file)
+    corners = _SCALE * mesh.vertices[mesh.triangles].reshape(-1, 3)
     triangles = [SurfaceTriangle(3 * i, 3 * i + 1, 3 * i + 2) for i in range(len(corners) // 3)]
     meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), color)
 

@@ -37,6 +37,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.parsing import add_models
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
+from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.parts.mesh_file import part_sdf
 from guiderail.models.parts.symmetry import SYMMETRIES
@@ -107,15 +108,11 @@ class PartWorkcell(MovableWorkcell):
                 f"the {body} in {self.folder} has no convex pieces, which MuJoCo needs: choose station='gantry'"
             )
         return [
-            Surface(f"{body}_{number}", "parts", Hull(read_vertices(self.folder / file)), self.friction)
+            Surface(
+                f"{body}_{number}", "parts", Hull(TriangleMesh.from_obj(self.folder / file).vertices), self.friction
+            )
             for number, file in enumerate(files)
         ]
-
-
-def read_vertices(path: Path) -> np.ndarray:
-    """Return the vertices (V, 3) [m] of an OBJ file."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)
 
 
 COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
