@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_multibody import transform_to_vector
 
 
 class RelativePoses(LeafSystem):
@@ -59,8 +59,4 @@ class RelativePoses(LeafSystem):
         poses = self._body_poses_port.Eval(context)
         X_WR = poses[self._reference]
         for i, body in enumerate(self._bodies):
-            X_RB = X_WR.InvertAndCompose(poses[body])
-            turn = X_RB.rotation().ToAngleAxis()
-            output.get_mutable_value()[6 * i : 6 * i + 6] = np.concatenate(
-                [X_RB.translation(), turn.angle() * turn.axis()]
-            )
+            output.get_mutable_value()[6 * i : 6 * i + 6] = transform_to_vector(X_WR.InvertAndCompose(poses[body]))

@@ -25,6 +25,7 @@ from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import find_robot
+from guiderail.systems.support.drake_multibody import transform_to_vector
 
 logger = logging.getLogger(__name__)
 
@@ -112,7 +113,7 @@ class RtdeDriver(PoseDriver):
             ),
             "payload",
         )
-        self._check(self._control.setTcp(_to_vector(impedance.X_FlangeTool)), "tool center")
+        self._check(self._control.setTcp(transform_to_vector(impedance.X_FlangeTool).tolist()), "tool center")
         force = float(np.linalg.norm(self._receiver.getActualTCPForce()[:3]))
         if force > MAX_ZEROED_FORCE:
             raise InputError(f"the robot measures {force:.0f} N: free its tool before the force sensor is zeroed")
@@ -295,12 +296,6 @@ def _import_client() -> Any:
 def _turn(wrench: np.ndarray) -> np.ndarray:
     """Convert a wrench (6,) from the controller's base axes to the model's, or back."""
     return np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0]) * wrench
-
-
-def _to_vector(X: RigidTransform) -> list[float]:
-    """Return position and rotation vector (6,)."""
-    turn = X.rotation().ToAngleAxis()
-    return [*X.translation(), *(turn.angle() * turn.axis())]
 
 
 def _to_transform(vector: list[float]) -> RigidTransform:

@@ -33,6 +33,12 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
     return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
 
 
+def transform_to_vector(X: RigidTransform) -> np.ndarray:
+    """Return the position and the rotation vector (6,) of a transform [m, rad]."""
+    turn = X.rotation().ToAngleAxis()
+    return np.concatenate([X.translation(), turn.angle() * turn.axis()])
+
+
 def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
     """Return the quaternion (η, ε) of R_desired Rᵀ with η ≥ 0, which is the shorter rotation and has no singularity."""
     q = (R_desired @ R.inverse()).ToQuaternion()

@@ -32,7 +32,7 @@ from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_
 from guiderail.models.parts.solids import SurfaceLocator
 from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
-from guiderail.systems.support.drake_multibody import pose_to_transform
+from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_vector
 
 _VERTICES = 8  # number of vertices with the highest pressure at which the depth of a contact surface is measured
 _AT_REST = 1.0  # time at the end of a motion in which the plug does not move [s]
@@ -187,9 +187,7 @@ def insert(
 def _plug_pose(driven: DrivenStation) -> np.ndarray:
     """Return the pose of the plug in the socket, position and rotation vector (6,) [m, rad]."""
     plant = driven.station.plant
-    X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
-    rotation = X.rotation().ToAngleAxis()
-    return np.concatenate([X.translation(), rotation.angle() * rotation.axis()])
+    return transform_to_vector(plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET)))
 
 
 def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:

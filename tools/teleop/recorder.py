@@ -31,6 +31,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.systems.meshcat_device import MeshcatDevice
+from guiderail.systems.support.drake_multibody import transform_to_vector
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.files import check_new
@@ -304,8 +305,7 @@ class DemonstrationRecorder:
         plant = self.station.plant
         context = plant.GetMyContextFromRoot(self.simulator.get_context())
         X = plant.GetFrameByName(task.workpiece).CalcPose(context, plant.GetFrameByName(task.fixture))
-        rotation = X.rotation().ToAngleAxis()
-        return bool(success.condition(np.concatenate([X.translation(), rotation.angle() * rotation.axis()])))
+        return bool(success.condition(transform_to_vector(X)))
 
     def summarize(self) -> dict[str, Any]:
         """Replay the mean of the demonstrations, draw it with its spread, and return statistics."""
