@@ -606,9 +606,9 @@ def files() -> str:
     page += f"Presets are {', '.join(code(name) for name in PRESETS)}; `--set name=value` changes one setting.\n\n"
     page += _fields(OffPolicyConfig)
     page += (
-        "### episodes.csv\n\nBesides these, `reward_…` is the sum of each reward term. `collisions` and "
-        "`collision_steps` are of the signal that `Task.collision` names. An episode that a "
-        "`TerminationTerm` ends as `collision` counts only where that signal is above its limit too.\n\n"
+        "### episodes.csv\n\nFurther columns `reward_…` are the sums of the reward terms. `collisions` and "
+        "`collision_steps` count the signal that `Task.collision` names. An episode that a "
+        "`TerminationTerm` ends as `collision` is counted only if that signal is above its limit too.\n\n"
     )
     page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
     page += "### Step log\n\n`…_i` are columns for the numbers of a pose or a wrench.\n\n"
@@ -616,8 +616,9 @@ def files() -> str:
     page += (
         f"## Demonstrations\n\n{paragraphs(inspect.getdoc(Demonstrations.load) or '').split('Raises:')[0]}\n"
         f"{paragraphs(inspect.getdoc(Demonstrations.save) or '').split('Raises:')[0]}\n"
-        "An `.npz` that `save` writes has `times` and `outputs` with all samples one after the other, `lengths` with "
-        f"how many each demonstration has, and `names`. At most {limits.MAX_DEMONSTRATIONS} demonstrations, "
+        "An `.npz` that `save` writes has `times` and `outputs` with the samples of all demonstrations one after the "
+        "other, `lengths` with their numbers of samples, and `names`. "
+        f"At most {limits.MAX_DEMONSTRATIONS} demonstrations, "
         f"{limits.MAX_NUMBERS:,} numbers and {limits.MAX_FILE_SIZE:,} bytes.\n\n"
         "## Templates and studies\n\n[Template files](templates.md) and [study files](studies.md) are YAML.\n"
     )
@@ -643,7 +644,7 @@ def metrics() -> str:
         "`EpisodeTrace`. `guiderail list metrics` prints them.\n\n## Episodes\n\n"
     )
     page += table(heads, [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
-    page += "## Statistics of many episodes\n\nIn a study's table, those of training have the prefix `training_`.\n\n"
+    page += "## Statistics of many episodes\n\nIn tables of studies, those of training have the prefix `training_`.\n\n"
     return page + table(heads, [(code(m.name), cell(m.unit), cell(m.description)) for m in statistics_of().values()])
 
 
@@ -674,7 +675,7 @@ def examples() -> str:
         source = path.read_text(encoding="utf-8")
         doc = ast.get_docstring(ast.parse(source)) or ""
         title, _, description = doc.partition(": ")
-        body = source.split('"""', 2)[2].strip()
+        body, description = source.split('"""', 2)[2].strip(), description[:1].upper() + description[1:]
         page += f"## {title}\n\n{prose(description)}\n\n`examples/{path.name}`\n\n```python\n{body}\n```\n\n"
     return page
 

@@ -1,4 +1,4 @@
-"""Use an environment with your own learner: it is a Gymnasium environment, with safety numbers in `info`."""
+"""Use an environment with your own learner: tasks are Gymnasium environments, with violations in `info`."""
 
 import gymnasium
 import numpy as np
@@ -11,7 +11,7 @@ rng = np.random.default_rng(0)
 observation, info = env.reset(seed=0)
 total = 0.0
 for _ in range(20):
-    action = rng.uniform(-1, 1, env.action_space.shape)  # your learner's
+    action = rng.uniform(-1, 1, env.action_space.shape)  # replace by your learner's action
     observation, reward, terminated, truncated, info = env.step(action)
     total += float(reward)
     if terminated or truncated:
@@ -21,5 +21,5 @@ print(f"a return of {total:.2f} after {info['control_steps']} control steps, end
 print(f"worst violation, commanded: {info['constraint_violation']:.2g}, measured: {info['measured_violation']:.2g}")
 print(f"contact force now: {info['contact_force']:.1f} N")
 
-observation, info = env.reset(seed=1, options={"held_out": True})  # from where training never starts
+observation, info = env.reset(seed=1, options={"held_out": True})  # a start that training does not sample
 env.close()

@@ -1,6 +1,6 @@
-"""Write guidance with memory: its discrete state is restored by a reset.
+"""Write guidance with memory: a reset restores the discrete state of a system.
 
-This one adds each action to its last command, not to where the robot is.
+This guidance adds each action to its last command, not to the measured pose.
 """
 
 import numpy as np
@@ -10,23 +10,23 @@ from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOr
 from guiderail import Guidance, PriorKnowledge, make_env, register_guidance
 from guiderail.systems import ConstraintViolation
 
-STEP = 0.01  # of a full action [m]
+STEP = 0.01  # displacement by an action of 1 [m]
 
 
 class Creep(LeafSystem):
-    """Commands command[k] = command[k − 1] + STEP action[k], from where the robot is at first."""
+    """Command command[k] = command[k − 1] + STEP action[k], with the measured pose as the first command."""
 
     def __init__(self, known: PriorKnowledge):
         super().__init__()
         self.action = self.DeclareVectorInputPort("action", known.pose_size)
         self.pose = self.DeclareVectorInputPort("pose", known.pose_size)
-        # Of the state alone: where an input fed through, the loop with the station's measured pose would be algebraic.
+        # Depends on the state only: direct feedthrough would close an algebraic loop with the station.
         self.DeclareStateOutputPort("desired_pose", self.DeclareDiscreteState(known.pose_size))
         self.DeclareInitializationDiscreteUpdateEvent(self.start)
         self.DeclarePeriodicDiscreteUpdateEvent(known.period, 0.0, self.step)
 
     def start(self, context: Context, state: DiscreteValues) -> None:
-        """The first command is the measured pose: anything else would pull the robot there."""
+        """Set the first command to the measured pose, so that the robot does not jump."""
         state.set_value(self.pose.Eval(context))
 
     def step(self, context: Context, state: DiscreteValues) -> None:
@@ -38,15 +38,15 @@ def creep(known: PriorKnowledge) -> Guidance:
     guidance, builder = Guidance(), DiagramBuilder()
     command = builder.AddNamedSystem("creep", Creep(known))
     held = builder.AddNamedSystem("held_action", ZeroOrderHold(known.period, known.pose_size))
-    judge = builder.AddNamedSystem("violation", ConstraintViolation(known.constraints, known.period))
-    builder.Connect(command.get_output_port(), judge.get_pose_input_port())
+    check = builder.AddNamedSystem("violation", ConstraintViolation(known.constraints, known.period))
+    builder.Connect(command.get_output_port(), check.get_pose_input_port())
     builder.ExportInput(command.GetInputPort("pose"), "pose")
     builder.ExportInput(command.GetInputPort("action"), "action")
     builder.ConnectInput("action", held.get_input_port())
     builder.ExportInput(builder.AddSystem(PassThrough(known.wrench_size)).get_input_port(), "wrench")  # unused
     builder.ExportOutput(command.get_output_port(), "desired_pose")
     builder.ExportOutput(held.get_output_port(), "held_action")
-    builder.ExportOutput(judge.get_violation_output_port(), "constraint_violation")
+    builder.ExportOutput(check.get_violation_output_port(), "constraint_violation")
     builder.ExportOutput(builder.AddSystem(ConstantVectorSource([0.0])).get_output_port(), "fallback")
     builder.BuildInto(guidance)
     return guidance

@@ -1,6 +1,6 @@
-"""Run a learned skill without Gymnasium: it is a Drake diagram, observation → policy → guidance → station.
+"""Run a learned skill without Gymnasium: observation, policy, guidance and station are one Drake diagram.
 
-Give a run's folder as an argument to run what was learned there; without one, a policy that does nothing stands in.
+The argument is the folder of a run, whose policy acts; without it, the action is zero.
 """
 
 import sys

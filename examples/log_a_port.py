@@ -17,14 +17,14 @@ commanded: list[float] = []
 
 
 def look(root_context):
-    """Called after every step; it only reads."""
+    """Store the requested and the commanded position; called after every step of the simulator."""
     asked.append(mapping.get_requested_pose_output_port().Eval(mapping.GetMyContextFromRoot(root_context))[0])
     commanded.append(guidance.get_desired_pose_output_port().Eval(guidance.GetMyContextFromRoot(root_context))[0])
 
 
 simulator.set_monitor(look)
 for _ in range(10):
-    env.step(np.array([1.0, 0.0, 0.0]))  # to the side, where the template's cuboid ends
+    env.step(np.array([1.0, 0.0, 0.0]))  # to the side, beyond the template's cuboid
 simulator.clear_monitor()
 print(
     f"{len(asked)} looks, to the side: {1000 * max(asked):.1f} mm asked for, {1000 * max(commanded):.1f} mm commanded"

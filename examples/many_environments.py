@@ -1,4 +1,4 @@
-"""Step many environments at once: Gymnasium's vector environment runs one process each, best one per core."""
+"""Step many environments at once: Gymnasium's vector environment runs each in a process of its own."""
 
 import multiprocessing
 
@@ -7,7 +7,7 @@ import gymnasium
 import guiderail  # noqa: F401 (registers the environments)
 
 if __name__ == "__main__":  # each process imports this file first
-    multiprocessing.set_forkserver_preload(["guiderail.diagrams.envs.make"])  # once, and not by each of them
+    multiprocessing.set_forkserver_preload(["guiderail.diagrams.envs.make"])  # imported once for all processes
     envs = gymnasium.make_vec(
         "guiderail/NarrowPassage-v0",
         num_envs=2,

@@ -1,4 +1,4 @@
-"""Modify a whole motion at once: null-space actions at some of its points change the rest smoothly."""
+"""Modify a whole motion at once: null-space actions at some points displace the motion between them smoothly."""
 
 import numpy as np
 

@@ -1,6 +1,6 @@
-"""Compose your own guidance: build it from the systems, with the ports of all guidance.
+"""Compose your own guidance: connect systems in a diagram with the ports of guidance.
 
-This one is KGRL with a single action: a policy chooses how far to go along one direction, and nothing across it.
+This guidance is KGRL with a single action, which displaces the motion along one direction.
 """
 
 import numpy as np

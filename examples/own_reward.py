@@ -1,4 +1,4 @@
-"""Change the reward of a task: derive from it; terms name signals, and each has a column of its own."""
+"""Change the reward of a task: override `reward_terms` of a subclass; each term is a column of the results."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
 
 @gr.register_task("examples/Hurry")
 class Hurry(GridClamp):
-    """The grid clamp, where time costs, and so does a command that jumps."""
+    """Grid clamp with costs of time and of jumps of the command."""
 
     def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
         def jump(desired_pose: np.ndarray, last_desired_pose: np.ndarray) -> float:

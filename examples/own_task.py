@@ -1,4 +1,4 @@
-"""Make your own task: declare it; this one is a plane with another gap and another goal."""
+"""Make your own task: this one is a narrow passage with another gap and another goal."""
 
 from collections.abc import Sequence
 from typing import Any

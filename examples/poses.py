@@ -8,7 +8,7 @@ from guiderail.models.primitives import pose_demonstrations, pose_rotation
 
 rng = np.random.default_rng(0)
 times, positions, quaternions = [], [], []
-for _ in range(4):  # what a robot recorded: p_WE and R_WE, each time from somewhere else
+for _ in range(4):  # recorded p_WE and R_WE, each from another start
     s = np.linspace(0, 1, 80)[:, None]
     start = np.array([0.4, 0.0, 0.5]) + 0.02 * rng.standard_normal(3)
     target = np.array([0.6, 0.1, 0.2])
@@ -17,11 +17,11 @@ for _ in range(4):  # what a robot recorded: p_WE and R_WE, each time from somew
     yaw = 0.5 * s[:, 0] + 0.05 * rng.standard_normal() * (1 - s[:, 0])
     quaternions.append(np.array([RollPitchYaw(np.pi, 0.0, angle).ToQuaternion().wxyz() for angle in yaw]))
 
-demonstrations = pose_demonstrations(times, positions, quaternions)  # relative to each one's own last pose
+demonstrations = pose_demonstrations(times, positions, quaternions)  # relative to the last pose of each
 print(", ".join(demonstrations.names))
 reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=4, floor=1e-3)
 
-bound = np.array([0.3, 0.3, 0.35, 1.0, 1.0, 1.0])  # of how far from the target it may be
+bound = np.array([0.3, 0.3, 0.35, 1.0, 1.0, 1.0])  # largest distance from the target [m], [rad]
 primitive = LcNsKmp(reference, constraints=LinearConstraints.box(-bound, bound))
 pose = primitive.predict(reference.num_steps // 2).output
 print("half way:", pose[:3].round(2), "m from the target,", pose_rotation(pose[3:]).magnitude().round(2), "rad turned")

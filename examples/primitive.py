@@ -1,4 +1,4 @@
-"""Use the primitive alone: it maps demonstrations to a constrained and modulated motion with NumPy."""
+"""Use the primitive alone: demonstrations become a constrained motion that actions displace, with NumPy."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ primitive = LcNsKmp(
     history_variance=1e-6,
     constraints=LinearConstraints.box([-np.inf, -1.0], [np.inf, 0.9]),
 )
-gains = authority_gains(primitive)  # what an action of one is worth
+gains = authority_gains(primitive)  # null-space action of an action of 1
 history = np.tile(reference.means[0], (10, 1))
 for step in range(reference.num_steps):
     output = primitive.predict(step, gains * np.array([0.0, 1.0]), history).output

@@ -1,4 +1,4 @@
-"""Use a shared control template alone: it is guidance in a diagram, here with constant inputs."""
+"""Use a shared control template alone: its guidance diagram moves an end effector, here with constant inputs."""
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -11,7 +11,7 @@ from guiderail.diagrams.guidance.sct import SctGuidance
 from guiderail.models.common.transforms import transform_to_pose
 
 PERIOD = 0.02
-template = load_template("pouring", mug_radius_m=0.05)  # a wider mug than the file's own
+template = load_template("pouring", mug_radius_m=0.05)  # a wider mug than that of the file
 guidance = SctGuidance(template, {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, PERIOD)
 
 builder = DiagramBuilder()

@@ -291,7 +291,7 @@ _STATISTICS = (
     Metric(
         "episodes_to_convergence",
         "episodes",
-        "before the first ten consecutive successes of the learner",
+        "training episodes before the first ten consecutive successes of the learner",
         episodes_to_convergence,
     ),
     Metric("mean_return", "reward", "return, mean over episodes", _mean("return")),
@@ -317,7 +317,10 @@ _STATISTICS = (
     Metric("ended_in_collision", "", "episodes that a collision ended", _ended("collision")),
     Metric("ended_in_spill", "", "episodes that a spill ended", _ended("spill")),
     Metric("ended_blocked", "", "episodes that ended because the robot made no progress", _ended("blocked")),
-    *(Metric(f"{kind}_first_10", unit, "mean over ten episodes", _mean(kind, FIRST)) for kind, unit in JERKS.items()),
+    *(
+        Metric(f"{kind}_first_10", unit, "jerk, mean over the first ten episodes", _mean(kind, FIRST))
+        for kind, unit in JERKS.items()
+    ),
     Metric("wall_time", "s", "duration of acting and learning", lambda rows: float(rows["wall_time"].sum())),
 )
 STATISTICS = {metric.name: metric for metric in _STATISTICS}
