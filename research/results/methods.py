@@ -420,7 +420,9 @@ def knowledge(section: Section, tables: Path) -> list[str]:
             methods.setdefault(demonstrated_episodes(row), []).append(row.name)
     if len(methods) < 2:
         return []
-    parts = [f"{number or 'no'} demonstrated episodes: {', '.join(names)}" for number, names in sorted(methods.items())]
+    counts = sorted(filter(None, methods), reverse=True)
+    parts = [f"{number} demonstrated episodes: {', '.join(methods[number])}" for number in counts]
+    parts += ["none: the other methods"] if 0 in methods else []
     return [f"**The methods do not have equal knowledge.** {'; '.join(parts)}."]
 
 

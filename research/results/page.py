@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -130,8 +130,7 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
 def _page_head(title: str) -> str:
     return (
         f"# {title}\n\nWritten by `python -m research.results` from the tables in `research/results`. All results are "
-        "simulated.\nHeld-out episodes have initial conditions that training never samples. Every seed is listed by "
-        "itself.\n"
+        "simulated.\nHeld-out episodes have initial conditions that training never samples.\n"
     )
 
 
@@ -191,15 +190,25 @@ def _study_section(study: Study, rows: pd.DataFrame) -> str:
         lines.append(f"| {' | '.join(map(cell, cells))} |")
     if missing := [method for method in study.methods if method not in set(rows["method"])]:
         lines += ["", f"Not run: {', '.join(missing)}."]
+    return "\n".join([*lines, *_difference_lines(study, set(rows["method"])), ""])
+
+
+def _difference_lines(study: Study, evaluated: Collection[str]) -> list[str]:
+    """Return the differences of the learned methods from the thesis: those of all methods, and then those of each."""
     import_modules(study.imports)
-    differences: dict[str, list[str]] = {}
-    for method in (m for m, one in study.methods.items() if one.policy == LEARNED and m in set(rows["method"])):
-        job = Job(study, method, study.seeds[0], Path())
-        words = describe_differences(job.config(job.after_episodes[-1]))
-        differences.setdefault("; ".join(words), []).append(method)
-    for sentence, methods in differences.items():
-        lines += ["", f"Differences from the thesis ({', '.join(methods)}): {sentence}."]
-    return "\n".join([*lines, ""])
+    jobs = {
+        method: Job(study, method, study.seeds[0], Path())
+        for method, one in study.methods.items()
+        if one.policy == LEARNED and method in evaluated
+    }
+    words = {method: describe_differences(job.config(job.after_episodes[-1])) for method, job in jobs.items()}
+    common = [one for one in next(iter(words.values()), ()) if all(one in own for own in words.values())]
+    further: dict[str, list[str]] = {}
+    for method, own in words.items():
+        further.setdefault("; ".join(one for one in own if one not in common), []).append(method)
+    lines = ["", f"Differences from the thesis ({', '.join(words)}): {'; '.join(common)}."] if common else []
+    single = [f"- {', '.join(names)}: {sentence}." for sentence, names in further.items() if sentence]
+    return [*lines, "", *single] if single else lines
 
 
 def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:

@@ -113,7 +113,7 @@ def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
 def test_methods_of_unequal_knowledge_are_marked():
     (hard,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp, hard")
     (sentence,) = knowledge(hard, TABLES)
-    assert "equal knowledge.** no demonstrated episodes: residual RL, RL of 6D velocities; 3 demonstrated" in sentence
+    assert "equal knowledge.** 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other" in sentence
     assert knowledge(SECTIONS["BncConnector"][0], TABLES) == []
 
 

@@ -48,6 +48,16 @@ def test_page_has_every_seed_the_thesis_and_the_differences(finished, tmp_path):
     assert "Not run: kgrl" in page
 
 
+def test_differences_of_all_methods_are_stated_once(finished, tmp_path):
+    table = read_table(finished / "connector.csv")
+    both = pd.concat([table, table[table["method"] == "skgrl"].assign(method="kgrl")], ignore_index=True)
+    write_table(tmp_path / "both" / "connector", both)
+    page = write_results([tmp_path / "both"], tmp_path / "results")
+    assert "Differences from the thesis (skgrl, kgrl): " in page
+    assert page.count("reward shaped (thesis: sparse)") == 1
+    assert "\n- skgrl: history of poses: commanded (thesis: measured)" in page
+
+
 def test_page_has_the_rows_of_a_study_without_evaluation(finished, tmp_path):
     table = read_table(finished / "connector.csv").iloc[:2]
     table = table.drop(columns="success_rate").assign(eval_set="", training_success_rate=0.5)
