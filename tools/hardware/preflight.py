@@ -9,7 +9,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.hardware.clock import Clock
-from guiderail.diagrams.hardware.driver import Check
+from guiderail.diagrams.hardware.driver import Check, PoseDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, pose_difference
@@ -131,7 +131,14 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     p_WT = arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     payload = sum(body.default_mass() for body in arm.tool)
-    torque_share, axis_limits = station.max_torque_shares(positions).max(), station.impedance.limits[:3]
+    torque_shares, axis_limits = station.max_torque_shares(positions), station.impedance.limits[:3]
+    if isinstance(driver, PoseDriver):
+        # Nothing clips the torques of the robot's own impedance: the limits of the external torques stop the arm.
+        torque_share = (torque_shares * np.divide(limits.torque, limits.external_torque)).max()
+        torques = f"stopped at external torques of {list(limits.external_torque)} Nm"
+        hint = "; above 100% choose a smaller force_limit"
+    else:
+        torque_share, torques, hint = torque_shares.max(), f"at most {list(limits.torque)} Nm sent", ""
     has_monitor = station.has_safety_monitor(context)
     if driver.has_command_timeout:
         monitor = "not needed: this driver stops the arm when commands stop"
@@ -171,7 +178,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
         ),
         Check(
             "torques",
-            f"at most {list(limits.torque)} Nm sent; the full force takes {torque_share:.0%} of the nearest limit",
+            f"{torques}; the full force takes {torque_share:.0%} of the nearest limit{hint}",
         ),
         Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
         *driver.check_setup(),

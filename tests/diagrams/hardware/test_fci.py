@@ -18,6 +18,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems.torque_safety_limiter import ArmState
+from guiderail.tools.hardware.preflight import check_robot
 from guiderail.tools.hardware.sim_driver import START
 
 WORKCELL = BncWorkcell()
@@ -386,3 +387,13 @@ def test_station_stops_the_robot_after_a_reflex(robot):
     assert loop.arm_state == ArmState.DAMPING
     assert motions(robot)[-1][0] == "stop"
     assert Fault(int(loop.station.get_fault_output_port().Eval(loop.context)[0])) == Fault.MALFORMED
+
+
+def test_check_compares_the_full_force_with_the_limits_that_stop_the_arm(robot):
+    loop = Loop(robot)
+    loop.go(1.0)
+    (check,) = (check for check in check_robot(loop.station, loop.context, START, 0) if check.name == "torques")
+    torques = loop.station.max_torque_shares(robot.positions) * loop.station.limits.torque
+    share = (torques / loop.station.limits.external_torque).max()
+    assert f"takes {share:.0%} of the nearest limit" in check.description
+    assert "external torques of [16.0, 16.0, 14.4" in check.description

@@ -28,6 +28,7 @@ from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.train import train_on_robot
 
 REFERENCE_PERIOD = 0.01  # [s]
+FORCE_LIMIT = 20.0  # [N]; at the default of 40 N a firm push exceeds the limits of the external joint torques
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,13 @@ def main() -> None:
     connection = KilledRobot(robot="panda", driver="fci", sim=True, kill_after=tuple(arguments.kill_after))
     result: Any
     if arguments.command == "train":
-        environment = {"station": "hardware", "guidance": "kgrl", "reward": "shaped", "fixture_offset": "per_run"}
+        environment: dict[str, Any] = {
+            "station": "hardware",
+            "guidance": "kgrl",
+            "reward": "shaped",
+            "fixture_offset": "per_run",
+        }
+        environment["force_limit"] = FORCE_LIMIT
         given = {"episodes": arguments.episodes, "seed": arguments.seed}
         result = train_on_robot(
             "BncConnector", arguments.run, connection, environment=environment, given=given, assume_yes=True
