@@ -151,7 +151,9 @@ def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str
     known = sorted(known)
     lower = {word.lower(): word for word in known}
     near = difflib.get_close_matches(str(name).lower(), lower, n=1)
-    return f"did you mean {lower[near[0]]}?" if near else f"choose one of {', '.join(known) or 'none'}{otherwise}"
+    if near:
+        return f"did you mean {lower[near[0]]}?"
+    return (f"choose one of {', '.join(known)}" if known else "none is registered") + otherwise
 
 
 def _folders(package: str) -> list[Path]:

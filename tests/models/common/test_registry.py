@@ -24,6 +24,11 @@ def test_unknown_name_is_refused_with_the_closest_name():
         shapes.get("spere")
 
 
+def test_unknown_name_is_refused_when_none_is_registered():
+    with pytest.raises(InputError, match="there is no shape 'sphere': none is registered"):
+        Registry("shape").get("sphere")
+
+
 @dataclass(frozen=True)
 class _Kind:
     build: object
