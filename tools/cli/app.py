@@ -194,7 +194,7 @@ Env = Annotated[
 Imports = Annotated[
     list[str] | None,
     option(
-        "Module or file (.py) that registers a task, guidance, a station or a learner; stored in the run.",
+        "Module or file (.py) that registers a task, guidance, a station or a learner; a run stores its name.",
         "--import",
         metavar="MODULE",
     ),
