@@ -8,8 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
-from guiderail.models.control.energy_tank import admissible_share, spring_energy
-from guiderail.models.control.wrench import MAX_WRENCH_SIZE, POSE_ORDER, WrenchBound
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, POSE_ORDER, WrenchBound, admissible_share, spring_energy
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
 

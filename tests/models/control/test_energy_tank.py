@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.control.energy_tank import admissible_share, spring_energy
+from guiderail.models.control.wrench import admissible_share, spring_energy
 
 K, F = np.array([1500.0, 30.0]), np.array([15.0, 3.0])
 
