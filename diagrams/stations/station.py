@@ -118,15 +118,15 @@ def max_wrench(force: float, torque: float = np.inf) -> np.ndarray:
     return numbers
 
 
-def whole_multiple(period: float, unit: float, name: str = "control_period") -> float:
-    """Return a period [s] as an exact multiple of `unit` [s]; `name` is its name in error messages.
+def whole_multiple(control_period: float, unit: float) -> float:
+    """Return a control period [s] as an exact multiple of `unit` [s].
 
     Raises:
         InputError: If the period is not a whole multiple of `unit`.
     """
-    number = round(period / unit)
-    if number < 1 or abs(number * unit - period) > 1e-6:
-        raise InputError(f"{name} must be a whole multiple of {unit:g} s, not {period:g} s")
+    number = round(control_period / unit)
+    if number < 1 or abs(number * unit - control_period) > 1e-6:
+        raise InputError(f"control_period must be a whole multiple of {unit:g} s, not {control_period:g} s")
     return number * unit
 
 

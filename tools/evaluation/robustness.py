@@ -60,9 +60,9 @@ def _scalar(option: str, unit: float = 1.0, kind: type = float) -> Callable[[Env
     return lambda environment, value: {option: kind(value * unit)}
 
 
-def _force_and_torque(option: str, lever: float = 0.02) -> Callable[[Environment, float], dict[str, Any]]:
-    """Change a force [N] and the torque that it has at a lever arm [m]."""
-    return lambda environment, value: {option: (value, lever * value)}
+def _force_and_torque(option: str) -> Callable[[Environment, float], dict[str, Any]]:
+    """Change a force [N] and the torque that it has at a lever arm of 0.02 m."""
+    return lambda environment, value: {option: (value, 0.02 * value)}
 
 
 def _clearance(environment: Environment, value: float) -> dict[str, Any]:
@@ -398,10 +398,10 @@ def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def values_below(rows: Sequence[Mapping[str, Any]], policy: str, rate: float = 0.9) -> dict[str, list[float]]:
-    """Return the values of each axis at which a policy's success rate is below `rate`."""
+def values_below(rows: Sequence[Mapping[str, Any]], policy: str) -> dict[str, list[float]]:
+    """Return the values of each axis at which a policy's success rate is below 90 %."""
     result: dict[str, list[float]] = {}
     for row in rows:
         if row["policy"] == policy:
-            result.setdefault(row["axis"], []).extend([row["value"]] if row["success_rate"] < rate else [])
+            result.setdefault(row["axis"], []).extend([row["value"]] if row["success_rate"] < 0.9 else [])
     return result

@@ -107,11 +107,11 @@ def write_step_log(path: Path, rows: pa.Table) -> None:
     write_atomically(path, file.getvalue())
 
 
-def read_step_log(folder: Path, columns: list[str] | None = None) -> pd.DataFrame:
-    """Return the control steps of all episodes in a run's `steps/`, in order, by default with all columns.
+def read_step_log(folder: Path) -> pd.DataFrame:
+    """Return the control steps of all episodes in a run's `steps/`, in order.
 
     Raises:
-        InputError: If there is no step log, it has more than `MAX_ROWS` rows, or a file is damaged or lacks a column.
+        InputError: If there is no step log, it has more than `MAX_ROWS` rows, or a file is damaged.
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:
@@ -120,7 +120,7 @@ def read_step_log(folder: Path, columns: list[str] | None = None) -> pd.DataFram
     tables = []
     for file in files:
         try:
-            tables.append(pq.read_table(file, columns=columns, partitioning=None))
+            tables.append(pq.read_table(file, partitioning=None))
         except (pa.ArrowException, OSError, KeyError) as error:
             raise InputError(f"{file} is damaged: restore it, or train again") from error
     try:

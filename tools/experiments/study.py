@@ -15,7 +15,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.registry import did_you_mean
@@ -38,14 +37,13 @@ NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
 DescribeDifferences: TypeAlias = Callable[..., list[str]]
 
 
-def run_study(study: Study, out: Path, engine: Engine | None = None, console: Console | None = None) -> pd.DataFrame:
+def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataFrame:
     """Run the jobs of a study that are not done.
 
     Args:
         study: Study.
         out: Folder of the study; runs in it are used again, and interrupted ones resume.
         engine: Engine that runs the jobs; two processes by default.
-        console: Console of the progress; standard error by default.
 
     Returns:
         A row for each method, seed, number of training episodes and evaluation set, in this order.
@@ -65,7 +63,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
     for job in jobs:
         check_job(job)
     _refuse_shared_folders(jobs)
-    outcomes = _run_jobs(jobs, engine or make_engine(), console)
+    outcomes = _run_jobs(jobs, engine or make_engine())
     pairs = [(job, outcomes[index]) for index, job in enumerate(jobs)]
     rows = pd.DataFrame([row for _, outcome in pairs for row in outcome.rows], dtype=object)
     failed = [f"{job.method}, seed {job.seed}, failed: {one.failure}" for job, one in pairs if one.failure]
@@ -151,12 +149,12 @@ def _check_ratios(study: Study) -> None:
             raise InputError(f"the study {study.name} has no column {one.of!r}: {did_you_mean(one.of, known)}")
 
 
-def _run_jobs(jobs: list[Job], engine: Engine, console: Console | None) -> dict[int, Outcome]:
+def _run_jobs(jobs: list[Job], engine: Engine) -> dict[int, Outcome]:
     """Return the outcome of each job; the rows of finished jobs are read in this process."""
     done = {index: job for index, job in enumerate(jobs) if is_done(job)}
     to_run = {index: job for index, job in enumerate(jobs) if index not in done}
     outcomes: dict[int, Outcome] = {}
-    with StudyProgress(to_run, len(jobs), console) as progress:
+    with StudyProgress(to_run, len(jobs)) as progress:
         for index, job in done.items():
             try:
                 outcomes[index] = Outcome(tuple(run_job(job)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,26 +97,24 @@ class Score:
         )
 
 
-def choose_setting(
-    score: Callable[[Setting], Score], settings: Sequence[Setting] = SETTINGS, first: int = FIRST
-) -> tuple[Setting, Score, bool]:
-    """Return a setting with its score, and whether it has the required success rates.
+def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, bool]:
+    """Return one of `SETTINGS` with its score, and whether it has the required success rates.
 
-    Starting at the index `first`, settings are tried in the direction of the required success rates until one has them,
+    Starting at the index `FIRST`, settings are tried in the direction of the required success rates until one has them,
     the direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned,
-    and the easiest of several. The settings begin with the easiest.
+    and the easiest of several.
     """
     tried: dict[int, Score] = {}
-    number = first
-    while 0 <= number < len(settings) and number not in tried:
-        result = tried[number] = score(settings[number])
+    number = FIRST
+    while 0 <= number < len(SETTINGS) and number not in tried:
+        result = tried[number] = score(SETTINGS[number])
         if result.is_too_easy == result.is_too_hard:
             break
         number += 1 if result.is_too_easy else -1
     best = max(
         sorted(tried), key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin)
     )
-    return settings[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
+    return SETTINGS[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
 
 
 def count_successes(

@@ -121,21 +121,17 @@ def insert(
     file: PartTaskFile,
     *,
     offset: tuple[float, float] = (0.0, 0.0),
-    motion: tuple[np.ndarray, np.ndarray] | None = None,
     snapping: frozenset[str] = frozenset(),
-    measure_depth: bool = True,
 ) -> Trial:
-    """Move the plug along a scripted motion on a gantry, and return the result.
+    """Insert the plug straight on a gantry, and return the result.
 
     Args:
         folder: Folder with the meshes.
         file: Task file, which need not be written yet.
         offset: Offset (x, y) of the socket [m].
-        motion: Times (N,) [s] and poses (N, 6); a straight insertion by default.
         snapping: Names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
-        measure_depth: True to measure the penetration, which takes longer than the simulation.
     """
-    times, poses = file.motion.plan_straight_insertion() if motion is None else motion
+    times, poses = file.motion.plan_straight_insertion()
     workcell = write_workcell(folder, file)
     station = GantryStation(workcell, time_step=file.time_step)
     driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
@@ -154,8 +150,7 @@ def insert(
         steps += 1
         if steps % _INTERVAL:
             return EventStatus.DidNothing()
-        if measure_depth:
-            depths.monitor(root_context)
+        depths.monitor(root_context)
         now = root_context.get_time()
         # A plug that stays far above its command is blocked. Stop then, because the rest would simulate slowly.
         height = _plug_pose(driven)[2]

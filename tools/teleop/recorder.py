@@ -384,12 +384,7 @@ def _to_demonstrations(recorded: list[tuple[np.ndarray, np.ndarray]]) -> Demonst
 
 
 def record_demonstrations(
-    task: str,
-    environment: Mapping[str, Any],
-    out: Path,
-    log: Callable[[str], None],
-    *,
-    wait: bool = True,
+    task: str, environment: Mapping[str, Any], out: Path, log: Callable[[str], None]
 ) -> dict[str, Any]:
     """Open the page, wait for a browser, and record demonstrations until the operator ends it.
 
@@ -406,7 +401,7 @@ def record_demonstrations(
     )
     log(f"Keys: {keys}; Enter keeps, Backspace discards, U undoes, M is slow motion, Escape ends.")
     log(f"Sliders and buttons: Open Controls, upper right. The arrow is the force; at {limit:g} N the bar is full.")
-    while wait and meshcat.GetNumActiveConnections() == 0:
+    while meshcat.GetNumActiveConnections() == 0:
         time.sleep(0.1)
     try:
         recorder.run(log)

@@ -45,12 +45,12 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
     return figure, axes
 
 
-def save_figure(figure: Figure, path: Path, dpi: int = 130) -> Path:
+def save_figure(figure: Figure, path: Path) -> Path:
     """Write a picture in the format of its file ending; the SVG file of the same figure is always the same."""
     check_picture(path)
     content, kind = io.BytesIO(), path.suffix[1:].lower()
     with matplotlib.rc_context({"svg.hashsalt": "guiderail", "svg.fonttype": "none"}):
-        figure.savefig(content, format=kind, dpi=dpi, metadata={"Date": None} if kind == "svg" else None)
+        figure.savefig(content, format=kind, dpi=130, metadata={"Date": None} if kind == "svg" else None)
     write_atomically(path, content.getvalue())
     return path
 

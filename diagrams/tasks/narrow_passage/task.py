@@ -37,12 +37,12 @@ if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
 
-def avoids_obstacle_from(rows: Any, cost: float = 1.0, streak: int = 5) -> int | None:
-    """Return the number, from 1, of the first episode that begins a streak of obstacle costs below `cost`, or None.
+def avoids_obstacle_from(rows: Any) -> int | None:
+    """Return the number, from 1, of the first of five consecutive episodes with obstacle costs below 1, or None.
 
     A path through the obstacle's middle costs about 100; an exploring policy sometimes touches the obstacle's margin.
     """
-    index = find_streak(rows["reward_obstacle_cost"] > -cost, streak)
+    index = find_streak(rows["reward_obstacle_cost"] > -1.0, 5)
     return None if index is None else index + 1
 
 
