@@ -88,9 +88,7 @@ class EnergyTank(LeafSystem):
         self._admitted_wrench_port = self.DeclareVectorOutputPort(
             "admitted_wrench", MAX_WRENCH_SIZE, self._calc_admitted_wrench, prerequisites_of_calc=admitted
         )
-        self._energy_port = self.DeclareVectorOutputPort(
-            "energy", 1, self._calc_energy, prerequisites_of_calc={self.discrete_state_ticket(self._content)}
-        )
+        self._energy_port = self.DeclareStateOutputPort("energy", self._content)
         self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -141,9 +139,6 @@ class EnergyTank(LeafSystem):
         numbers[:POSE_SIZE] = self._admitted.Eval(context).limits[POSE_ORDER]
         numbers[POSE_SIZE:] = bound.force, bound.torque
         output.SetFromVector(numbers)
-
-    def _calc_energy(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._content).value())
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)
