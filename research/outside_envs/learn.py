@@ -29,8 +29,9 @@ HELD_OUT_SEED = 10_000
 SELECTION_SEED = 5_000  # seed of the episodes that select the best constant action
 NUM_DEMONSTRATIONS = 10
 LEARNING_STARTS = 120  # transitions with random actions
-# Gradient steps per transition, with guidance and without. A bare environment has four times as many transitions.
-GRADIENT_STEPS, BARE_GRADIENT_STEPS = 8, 2
+GRADIENT_STEPS = 2  # per transition
+NUM_RETURN_STEPS = 5  # transitions of a return: the reward of a success comes after some forty decisions
+TARGET_ENTROPY_PER_ACTION = -2.0  # Stable-Baselines3's default is −1; less noise spoils fewer attempts
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
@@ -116,13 +117,19 @@ def train(
 
     model = FastTqc(
         "MlpPolicy", env, seed=seed, learning_rate=1e-3, gamma=0.98, batch_size=64, learning_starts=LEARNING_STARTS,
-        train_freq=1, gradient_steps=GRADIENT_STEPS if hasattr(env, "guide") else BARE_GRADIENT_STEPS,
+        train_freq=1, gradient_steps=GRADIENT_STEPS, n_steps=NUM_RETURN_STEPS,
+        target_entropy=TARGET_ENTROPY_PER_ACTION * env.action_space.shape[0],
         top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
         policy_kwargs={"net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15},
     )  # fmt: skip
     if demonstrated:
         model.replay_buffer = buffer = DemonstrationReplayBuffer(
-            model.buffer_size, model.observation_space, model.action_space, device="cpu", gamma=model.gamma
+            model.buffer_size,
+            model.observation_space,
+            model.action_space,
+            device="cpu",
+            gamma=model.gamma,
+            n_steps=NUM_RETURN_STEPS,
         )
         for transition in demonstrated:
             buffer.add(*transition)

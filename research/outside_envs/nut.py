@@ -276,7 +276,6 @@ TASK = OutsideTask(
     pose=pose,
     to_action=to_action,
     scripted=Script(),
-    action_repeat=10,
     schedule={name: np.array([0.0, -0.6, 0.0, 0.0]) for name in ("reach", "grasp", "lift", "carry", "insert")}
     | {name: np.array([0.0, 0.6, 0.0, 0.0]) for name in ("retract", "insert again")},
 )

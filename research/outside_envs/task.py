@@ -11,8 +11,9 @@ from guiderail import Demonstrations, Frame, GuidedEnv, LinearConstraints, Segme
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.tools.guided.guide import Guide
 
-BARE_REPEAT = 5  # steps of the bare environment for which an action is applied
-SUCCESS_REWARD, REWARD_SCALE = 5.0, 0.05  # reward of a success, and factor of the package's own reward before it
+ACTION_REPEAT = 5  # steps of the environment for which an action is applied, with and without guidance
+# A larger share of the package's reward pays for pressing the part in front of its goal.
+SUCCESS_REWARD, REWARD_SCALE = 10.0, 0.01  # reward of a success, and factor of the package's own reward before it
 BOX_MARGIN, MIN_BOX_MARGIN = 0.15, 0.01  # margin of a segment's box, as a fraction of the demonstrated range and [m]
 FLOOR = 2e-3  # standard deviation added to every covariance [unit of the output]
 
@@ -71,7 +72,6 @@ class OutsideTask:
         to_action: (env, observation, command, extra) → the environment's own action.
         scripted: (env) → the scripted policy's own action, which observes what is hidden.
         schedule: Fixed action by the name of the segment; together they are a search without observations.
-        action_repeat: Steps of the guided environment for which an action is applied.
     """
 
     parts: Mapping[str, Part]
@@ -83,7 +83,6 @@ class OutsideTask:
     to_action: Callable[[Any, Any, np.ndarray, Any], np.ndarray]
     scripted: Callable[[Any], np.ndarray]
     schedule: Mapping[str, np.ndarray] = field(default_factory=dict)
-    action_repeat: int = 20
 
     def make_segments(self, count: int = 10, seed: int = 1000) -> list[Segment]:
         """Return the segments, from `count` demonstrations recorded with a seed."""
@@ -119,7 +118,7 @@ class OutsideTask:
             return RepeatedAction(env, segments, self.pose)
         return GuidedEnv(
             env, demonstrations=segments, pose=self.pose, to_action=self.to_action, guidance=guidance,
-            period=self.period, action_repeat=self.action_repeat,
+            period=self.period, action_repeat=ACTION_REPEAT,
         )  # fmt: skip
 
 
@@ -149,7 +148,7 @@ class RepeatedAction(gymnasium.Wrapper):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Apply an action (A,) for several steps."""
         total, worst = 0.0, -np.inf
-        for _ in range(BARE_REPEAT):
+        for _ in range(ACTION_REPEAT):
             observation, reward, terminated, truncated, info = self.env.step(action)
             total += reward
             pose = self._pose(self.env, observation)
