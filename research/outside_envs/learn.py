@@ -32,6 +32,8 @@ LEARNING_STARTS = 120  # transitions with random actions
 GRADIENT_STEPS = 2  # per transition
 NUM_RETURN_STEPS = 5  # transitions of a return: the reward of a success comes after some forty decisions
 TARGET_ENTROPY_PER_ACTION = -2.0  # Stable-Baselines3's default is −1; less noise spoils fewer attempts
+LEARNING_RATE, LAST_LEARNING_RATE = 1e-3, 1e-4  # falls in the second half of the training
+AVERAGE_DECAY = 0.999  # per transition, of the running average of the actor's weights that is evaluated
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
@@ -84,7 +86,7 @@ def summarize(rows: list[Row]) -> dict[str, Any]:
 def train(
     env: Any, episodes: int, seed: int, demonstrated: list[tuple[Any, ...]] | None = None
 ) -> tuple[Any, list[Row]]:
-    """Train TQC; return the model and the row of every episode.
+    """Train TQC; return the model, with the averaged actor, and the row of every episode.
 
     Args:
         env: Environment.
@@ -94,30 +96,38 @@ def train(
     """
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import configure
+    from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
     from guiderail.tools.learning.fast_sb3 import FastTqc
     from guiderail.tools.learning.sb3_state import DemonstrationReplayBuffer
 
-    class Rows(BaseCallback):
-        rows: list[Row]
+    rows: list[Row] = []
+
+    class Recorder(BaseCallback):
         row: Row
+        average: AveragedModel
 
         def _on_training_start(self) -> None:
-            self.rows, self.row = [], {}
+            self.row = {}
+            self.average = AveragedModel(self.model.actor, multi_avg_fn=get_ema_multi_avg_fn(AVERAGE_DECAY))
 
         def _on_step(self) -> bool:
+            self.average.update_parameters(self.model.actor)
             self.row = add_step(self.row, self.locals["infos"][0])
             if self.locals["dones"][0]:
-                self.rows.append(self.row)
+                rows.append(self.row)
                 self.row = {}
-                if len(self.rows) % 20 == 0:
-                    successes = sum(row["success"] for row in self.rows[-20:])
-                    print(f"episode {len(self.rows)}: {successes} of 20", flush=True)
-            return len(self.rows) < episodes
+                if len(rows) % 20 == 0:
+                    print(f"episode {len(rows)}: {sum(row['success'] for row in rows[-20:])} of 20", flush=True)
+            return len(rows) < episodes
+
+    def learning_rate(_: float) -> float:
+        remaining = 1.0 - len(rows) / episodes
+        return max(LEARNING_RATE * min(1.0, 2.0 * remaining), LAST_LEARNING_RATE)
 
     model = FastTqc(
-        "MlpPolicy", env, seed=seed, learning_rate=1e-3, gamma=0.98, batch_size=64, learning_starts=LEARNING_STARTS,
-        train_freq=1, gradient_steps=GRADIENT_STEPS, n_steps=NUM_RETURN_STEPS,
+        "MlpPolicy", env, seed=seed, learning_rate=learning_rate, gamma=0.98, batch_size=64,
+        learning_starts=LEARNING_STARTS, train_freq=1, gradient_steps=GRADIENT_STEPS, n_steps=NUM_RETURN_STEPS,
         target_entropy=TARGET_ENTROPY_PER_ACTION * env.action_space.shape[0],
         top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
         policy_kwargs={"net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15},
@@ -135,9 +145,10 @@ def train(
             buffer.add(*transition)
         buffer.num_demonstrated = len(demonstrated)
     model.set_logger(configure(None, []))
-    callback = Rows()
+    callback = Recorder()
     model.learn(10**9, callback=callback)
-    return model, callback.rows
+    model.actor.load_state_dict(callback.average.module.state_dict())
+    return model, rows
 
 
 def demonstrate_transitions(task: OutsideTask, env: Any, count: int, seed: int = 1000) -> list[tuple[Any, ...]]:
