@@ -105,6 +105,8 @@ def train(
         robot_url=robot_url,
         driver=driver,
     )
+    if resume and out is not None:
+        environment = _with_stored_robot(out, environment)
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     if num_envs is not None:
         settings["num_envs"] = str(num_envs)
@@ -135,10 +137,10 @@ def train(
         if (warning := warn_of_deviation(task, environment)) is not None:
             print_message(warning)
     if cli.is_hardware(environment.get("station")):
-        if task is None or out is None or resume or human_in_the_loop:
-            raise InputError(
-                "training on hardware needs a task and a new folder: leave --resume and --human-in-the-loop out"
-            )
+        if out is None:
+            raise InputError("the run needs a folder: name one with --out RUN")
+        if human_in_the_loop:
+            raise InputError("training on hardware has no human in the loop: leave --human-in-the-loop out")
         if settings.get("num_envs", "0") != "0":
             raise InputError("there is one robot: leave --num-envs out")
         from guiderail.tools.hardware.train import train_on_robot
@@ -152,6 +154,7 @@ def train(
             environment=environment,
             given={name: value for name, value in given.items() if value is not None},
             settings=settings,
+            resume=resume,
             assume_yes=yes,
             log=print_message,
         )
@@ -178,6 +181,17 @@ def train(
         find_demonstrator=_scripted_policy,
     )
     print_result(run.summary, as_json)
+
+
+def _with_stored_robot(out: Path, environment: dict[str, Any]) -> dict[str, Any]:
+    """Return options with the station, the robot and the driver of a run, if it was trained on a robot."""
+    from guiderail.tools.learning.run_folder import RunFolder
+
+    stored = RunFolder(out).config().environment
+    if not cli.is_hardware(stored.get("station")):
+        return environment
+    names = ("station", "robot", "driver")
+    return {name: stored[name] for name in names if stored.get(name) is not None} | environment
 
 
 def _wait_for_supervisor() -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,32 +25,38 @@ from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.learner import LEARNERS, described_observation, learner_arguments
 from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.learning.train import SUMMARY, configure, with_defaults
+from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, with_defaults
+from guiderail.tools.learning.trainer import restore_checkpoint, write_checkpoint
 
 EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are not used for training
 NICENESS = 5  # niceness of the training process, so that the control loop meets its deadlines
 
 
 def train_on_robot(
-    task: str,
+    task: str | None,
     out: Path,
     connection: RobotConnection,
     *,
     environment: Mapping[str, Any],
     given: Mapping[str, Any],
     settings: Mapping[str, Any] | None = None,
+    resume: bool = False,
     assume_yes: bool = False,
     log: Log = print,
 ) -> dict[str, Any]:
     """Train a policy on a robot, write a run folder, and return statistics of the training.
 
+    Every episode ends with a checkpoint, so that a killed run can be resumed.
+
     Args:
-        task: Name of an insertion task that defines `observable_success`, success estimated from the measured pose.
-        out: Run folder.
+        task: Name of an insertion task that defines `observable_success`, success estimated from the measured pose;
+            None with `resume`.
+        out: Run folder; with `resume`, that of the run to continue.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
         given: Arguments of `configure`: algorithm, preset, episodes, seed.
         settings: Settings of the learner.
+        resume: Continue a run from its last episode. The address of the robot may be another one.
         assume_yes: Skip the confirmation of the checks and, with a simulated driver, of resuming after a stop.
         log: Function that shows a message.
 
@@ -57,16 +64,26 @@ def train_on_robot(
         InputError: If the task cannot be trained on hardware, or a check fails or is not confirmed.
     """
     folder = RunFolder(out)
-    folder.refuse_existing()
-    environment = {**environment, **connection.environment_options(str(environment["station"]))}
-    config = configure(task, environment, **with_defaults(task, {**given, "settings": settings}))
+    options = connection.environment_options(str(environment["station"]))
+    if resume:
+        kept = {name: value for name, value in environment.items() if name != "robot_url"}
+        choices = {name: value for name, value in given.items() if name != "imports"}
+        config = resumed_config(folder, task, kept, choices, settings)
+        config = replace(config, environment={**config.environment, **options})
+    elif task is None:
+        raise InputError("training needs a task: name a task, such as guiderail train BncConnector --out RUN")
+    else:
+        folder.refuse_existing()
+        config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
     if config.learner.demonstration_episodes:
         raise InputError("there are no demonstration episodes on a robot: leave the setting demonstration_episodes out")
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
         folder.write_config(config)
         try:
             with garbage_collection_disabled(), EpisodeProgress(config.episodes, name=config.task) as progress:
-                rows = _train(folder, config, session.env, waits=connection.synchronous, report=progress.update)
+                rows = _train(
+                    folder, config, session.env, waits=connection.synchronous, resume=resume, report=progress.update
+                )
         finally:
             timing = pd.Series(dict(session.timing()), dtype=object)
             write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
@@ -83,6 +100,7 @@ def _train(
     env: RobotEnv,
     *,
     waits: bool,
+    resume: bool = False,
     report: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
     """Run all episodes; after any exception bring the arm to rest, and save what was recorded and learned."""
@@ -98,6 +116,11 @@ def _train(
     )
     rows: list[dict[str, Any]] = []
     due: list[Callable[[], None]] = []  # remaining work of the last episode
+    learned_before = 0  # episodes that were learned from before the run was resumed
+
+    def wait_until_learned() -> None:
+        while not learner.receive_learned():
+            env.idle()
 
     def write_step_log() -> None:
         if config.step_log:
@@ -113,14 +136,23 @@ def _train(
     try:
         learner.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
+        if resume:
+            rows += restore_checkpoint(folder, learner, env)[0]
+            learned_before = sum(row["learned_from"] for row in rows[:-1])
         while len(rows) < config.episodes:
             started = time.perf_counter()
             row = rollout(env, learner.act, learner, index=len(rows))
             row |= {"learned_from": int(row["termination"] not in EXCLUDED_TERMINATIONS)}
-            row |= {"episodes_known": learner.known, "late": learner.late}
+            row |= {"episodes_known": learned_before + learner.known, "late": learner.late}
             row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
             rows.append(row)
-            due = [learner.submit_episode, write_step_log, partial(folder.write_episodes, rows)]
+            due = [
+                wait_until_learned,
+                partial(write_checkpoint, folder, rows, learner, env),
+                learner.submit_episode,
+                write_step_log,
+                partial(folder.write_episodes, rows),
+            ]
             while due:
                 due[0]()
                 due.pop(0)

@@ -128,6 +128,12 @@ class PipelinedLearner(Learner):
             self._pending = None
             self.submitted += 1
 
+    def receive_learned(self) -> bool:
+        """Receive the weights learned so far without waiting; return True if all submitted episodes are learned."""
+        while self.known < self.submitted and self._pipe.poll():
+            self._receive_weights()
+        return self.known == self.submitted
+
     def write(self, path: Path, table: pa.Table) -> None:
         """Write a step log in the training process; a later call raises the error if that fails."""
         self._send(("write", path, table))

@@ -168,7 +168,7 @@ def start_or_resume(
     choices["human_in_the_loop"] = None if make_supervisor is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
-        config = _resumed_config(folder, task, environment, given, settings)
+        config = resumed_config(folder, task, environment, given, settings)
     elif task is None:
         raise InputError("training needs a task: name a task, such as guiderail train NarrowPassage --out RUN")
     else:
@@ -251,7 +251,7 @@ def draw_pictures(out: Path) -> dict[str, str]:
         return {"curve": curve, "replay": f"none: {error}"}
 
 
-def _resumed_config(
+def resumed_config(
     folder: RunFolder,
     task: str | None,
     environment: Mapping[str, Any],

@@ -170,7 +170,7 @@ def _train(
 ) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     if resume:
-        rows, num_written = _resume(folder, learner, env)
+        rows, num_written = restore_checkpoint(folder, learner, env)
         if num_written < len(rows):
             folder.write_episodes(rows)  # a complete run does not write the table again
         if len(rows) < config.episodes:
@@ -235,16 +235,22 @@ def _save(
     folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, supervised: SupervisedTraining | None
 ) -> None:
     """Write the checkpoint, which holds the table too, and then the table: a kill between the two loses nothing."""
-    arrays, values = learner.state()
-    random_state = env.unwrapped.np_random.bit_generator.state
-    stored = {"rows": rows, "learner": values, "environment": random_state}
-    save_checkpoint(folder.checkpoint, arrays, stored | ({} if supervised is None else supervised.state()))
+    write_checkpoint(folder, rows, learner, env, {} if supervised is None else supervised.state())
     if supervised is not None:
         folder.write_config(supervised.config)
     folder.write_episodes(rows)
 
 
-def _resume(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[str, Any]], int]:
+def write_checkpoint(
+    folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, more: Mapping[str, Any] | None = None
+) -> None:
+    """Write the checkpoint: the episodes' rows, the states of learner and environment, and `more`."""
+    arrays, values = learner.state()
+    stored = {"rows": rows, "learner": values, "environment": env.unwrapped.np_random.bit_generator.state}
+    save_checkpoint(folder.checkpoint, arrays, stored | dict(more or {}))
+
+
+def restore_checkpoint(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[str, Any]], int]:
     """Restore learner and environment from the checkpoint.
 
     Returns:

@@ -25,7 +25,7 @@ from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure
-from guiderail.tools.learning.trainer import _resume
+from guiderail.tools.learning.trainer import restore_checkpoint
 from guiderail.tools.tables import table_text
 
 
@@ -253,7 +253,7 @@ def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable
     tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
     save_checkpoint(folder.checkpoint, changed, tree)
     folder.write_episodes(ROWS[: data.draw(st.sampled_from([3, len(ROWS)]))])
-    resumed = attempt("checkpoint, other content", InputError, lambda: _resume(folder, learner, env))
+    resumed = attempt("checkpoint, other content", InputError, lambda: restore_checkpoint(folder, learner, env))
     if resumed is not None:
         rows, _ = resumed
         assert rows == tree["rows"]

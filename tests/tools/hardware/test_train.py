@@ -135,7 +135,7 @@ def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path,
     def refuse():
         before.append([file.name for file in tmp_path.rglob("*") if file.is_file()])
         idle()
-        if len(before) == 4:  # the first call of the second episode
+        if len(before) == 6:  # the first call of the second episode
             raise InputError("not confirmed: nothing moves")
 
     monkeypatch.setattr(env, "idle", refuse)
@@ -146,6 +146,15 @@ def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path,
     assert len(read_step_log(folder.steps)) == 20
     assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
     assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP  # at rest
+
+    monkeypatch.undo()
+    first = folder.episodes()
+    rows = _train(folder, config, env, waits=True, resume=True, report=lambda row: None)
+    table = folder.episodes()
+    pd.testing.assert_frame_equal(table[:2], first)
+    assert table["episode"].tolist() == [0, 1, 2, 3, 4]
+    assert [row["episodes_known"] for row in rows] == [0, 0, 1, 2, 3]
+    assert len(read_step_log(folder.steps)) == 50
 
 
 def test_operator_stop_truncates_and_reset_resumes(env):
