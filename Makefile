@@ -85,16 +85,16 @@ lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its ow
 	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null \
 	  integrations/lerobot_robot_guiderail/tests
 
-motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, half an hour
+motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, minutes
 	$(BIN)/python tests/harness/motion_limits.py
 
 outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, in an environment of its own, hours (downloads 3 GB)
 	$(OUTSIDE)/bin/python -m pytest -q -c /dev/null --noconftest tests/research/outside_envs
 	for method in kgrl residual clipped_residual tqc rlpd; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 0 1 2 3 4 --out runs/outside; done
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 10 11 12 13 14 --out runs/outside; done
 	for task in peg assembly nut; do \
 	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method baselines --out runs/outside; \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 0 --out runs/outside; done
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 10 --out runs/outside; done
 	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
