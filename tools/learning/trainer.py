@@ -273,7 +273,7 @@ def restore_checkpoint(folder: RunFolder, learner: Learner, env: Any) -> tuple[l
     except InputError:
         raise
     # The digest matches, so the content is complete but of another learner.
-    except (LookupError, TypeError, ValueError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InputError(
             f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
         ) from error

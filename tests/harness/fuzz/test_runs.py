@@ -263,3 +263,13 @@ def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable
         for name, array in changed.items():
             np.testing.assert_array_equal(result[name], array, strict=True)
         assert env.np_random.bit_generator.state == tree["environment"]
+
+
+def test_negative_number_in_a_generators_state_is_refused(folder, resumable):
+    env, learner, arrays, values = resumable
+    tree = json.loads(json.dumps(values))
+    tree["learner"]["python"][1][0] = -1
+    save_checkpoint(folder.checkpoint, arrays, tree)
+    folder.write_episodes(ROWS)
+    with pytest.raises(InputError, match="belongs to other settings"):
+        restore_checkpoint(folder, learner, env)
