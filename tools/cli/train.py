@@ -213,7 +213,7 @@ def _scripted_policy(task: str) -> Any:
 @cli.command("demo --out demo")
 def demo(
     out: Annotated[Path, option("Folder of the run; an earlier demo in it is replaced.")] = Path("demo"),
-    episodes: Annotated[int, option("Number of training episodes.")] = 24,
+    episodes: Annotated[int, option("Number of training episodes.")] = 22,
     seed: Annotated[int, option("Seed of all random numbers.")] = 0,
 ) -> None:
     """Train sKGRL to avoid an obstacle, in about a minute, and show the result."""
