@@ -67,6 +67,8 @@ class InsertionTask(Task):
         workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
         fixture: Name of the fixture's body.
         simulated_rewards: Rewards that use components of the workpiece's pose that a robot cannot measure.
+        snaps_in: True if the bounded force cannot pull out an inserted workpiece, so that on hardware the operator
+            releases it after a success.
         offsets: Sampler of the offsets; it stores the hidden values of a run.
     """
 
@@ -75,6 +77,7 @@ class InsertionTask(Task):
     workpiece: ClassVar[str]
     fixture: ClassVar[str]
     simulated_rewards: ClassVar[tuple[str, ...]] = ()
+    snaps_in: ClassVar[bool] = False
 
     offsets: HiddenOffsets
 

@@ -53,6 +53,9 @@ class RobotEnv(DiagramEnv):
     A success by pose is confirmed by a pull on the workpiece; if it gives way, `termination` is "did_not_hold".
     Episodes that end as "stopped" or "did_not_hold" must not be learned from.
 
+    If the way back does not release the workpiece, or the arm is too weak to release it, the arm comes to rest, and
+    `free_workpiece` has the operator release it by hand.
+
     Attributes:
         fault: Fault that ended the last episode, or NONE.
         preflight: Pre-flight checks, to be run before anything moves.
@@ -69,7 +72,9 @@ class RobotEnv(DiagramEnv):
         action_repeat: int,
         keys: OperatorKeys,
         confirm_resume: Callable[[str], None],
+        free_workpiece: Callable[[str], None],
         log: Log,
+        snaps_in: bool = False,
         randomize_parts: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
     ):
         """Connect to the robot.
@@ -83,7 +88,10 @@ class RobotEnv(DiagramEnv):
             action_repeat: Control steps per action.
             keys: The operator's keys.
             confirm_resume: Function called with the reason of a stop; returns when the arm may move again, or raises.
+            free_workpiece: Function called with the reason why a workpiece has to be released by hand; returns when it
+                is released and the arm may move again, or raises.
             log: Function that shows a message.
+            snaps_in: True if the arm cannot pull out a workpiece after a success.
             randomize_parts: Function called at the start pose with a random number generator and the reset's options;
                 moves the parts as a reset in simulation does, and returns what was sampled.
 
@@ -93,12 +101,14 @@ class RobotEnv(DiagramEnv):
         super().__init__(task, action_repeat=action_repeat)
         self._randomize_parts = randomize_parts
         self._task_station, self._transfer_station, self._start, self._clock = station, transfer_station, start, clock
-        self._keys, self._confirm_resume, self._log = keys, confirm_resume, log
+        self._keys, self._confirm_resume, self._free_workpiece, self._log = keys, confirm_resume, free_workpiece, log
+        self._snaps_in = snaps_in
         self._steps = round(task.control_period / station.period)
         self._station, self._is_stepping = transfer_station, False
         self.preflight = PreflightChecks(transfer_station, clock, start, self._steps)
         self._last_transfer: Simulator | None = None
         self._return_path: list[np.ndarray] = []  # poses (6,) of the way back; the last one is next
+        self._must_be_freed = ""  # reason why the workpiece has to be released by hand before the arm resumes
         self.fault = Fault.NONE
 
     # The two stations.
@@ -190,6 +200,8 @@ class RobotEnv(DiagramEnv):
             self._extend_return_path()
             if info["is_success"] and not self._resists_pull():
                 info |= {"is_success": False, "termination": "did_not_hold"}
+            if info["is_success"] and self._snaps_in:
+                self._must_be_freed = "the workpiece has snapped in"
         return observation, reward, terminated, truncated, info
 
     def _extend_return_path(self) -> None:
@@ -268,8 +280,11 @@ class RobotEnv(DiagramEnv):
         """Move back along the return path, and slowly to the start.
 
         Friction can leave a bayonet locked by the first return; then the path is followed once more, there and back.
+        If that fails as well, the operator releases the workpiece.
         """
         self._switch_to_transfer()
+        if self._must_be_freed:
+            self.rest()
         self._retry_until_ok(self._take_control)
         path = self._return_path.copy()
         self._follow_return_path()
@@ -277,13 +292,19 @@ class RobotEnv(DiagramEnv):
             self._log("the arm did not reach the start; it repeats its path once")
             self._return_path = path + path[::-1]
             self._follow_return_path()
+        if path and not self._is_at_start():
+            self._must_be_freed = self._describe_distance()
+            self.rest()
+            self._return_path = path
+            self._follow_return_path()
         if not self._is_at_start():
-            distance, angle = pose_distance(self.pose, self._start)
-            raise InputError(
-                f"the arm did not reach the start: {distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are "
-                "left; is something in its way?"
-            )
+            raise InputError(f"{self._describe_distance()}; is something in its way?")
         gc.collect()
+
+    def _describe_distance(self) -> str:
+        distance, angle = pose_distance(self.pose, self._start)
+        left = f"{distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left"
+        return f"the arm did not reach the start: {left}"
 
     def _is_at_start(self) -> bool:
         return is_near(self.pose, self._start)
@@ -349,7 +370,11 @@ class RobotEnv(DiagramEnv):
         """If the arm is at rest after a stop, have the operator confirm, and resume."""
         if self._arm_state != ArmState.OFF:
             return
-        self._confirm_resume(self._active_fault.description)
+        if self._must_be_freed:
+            self._free_workpiece(self._must_be_freed)
+            self._must_be_freed = ""
+        else:
+            self._confirm_resume(self._active_fault.description)
         self._station.driver.recover()
         # No status was received while the operator was asked. If the arm was moved in the meantime, its statuses are
         # accepted only after the settling time.

@@ -78,6 +78,14 @@ def robot_session(
             randomize_parts = PartRandomizer(task, clock.move_parts, config.seed)
         elif connection.sim and isinstance(station.driver, LcmDriver):
             randomize_parts = PartRandomizer(task, partial(publish_part_offsets, station.driver), config.seed)
+
+        def free_workpiece(reason: str) -> None:
+            log(f"the arm is at rest: {reason}")
+            if not (assume_yes and connection.sim):
+                confirm("Release the workpiece by hand, put the parts back, and keep clear. May the arm move?")
+            if randomize_parts is not None:
+                randomize_parts.remove_fixture()
+
         env = RobotEnv(
             diagram,
             station,
@@ -87,7 +95,9 @@ def robot_session(
             action_repeat=config.action_repeat,
             keys=keys,
             confirm_resume=confirm_resume,
+            free_workpiece=free_workpiece,
             log=log,
+            snaps_in=task.snaps_in,
             randomize_parts=randomize_parts,
         )
         confirm_checks(env.preflight, log, assume_yes=assume_yes)

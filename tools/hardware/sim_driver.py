@@ -27,6 +27,7 @@ from guiderail.tools.hardware.scenario import load_scenario
 
 DEFAULT_TASK = "BncConnector"
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # initial pose of the default task: the plug above the jack
+REMOVED = (1.0, 0.0)  # offset of a fixture that is out of the arm's way [m]
 START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # initial pose relative to another task's start pose
 PLANT_STEPS_PER_STATUS = 5  # if not in lockstep; a real arm's own control loop has 1 kHz
 PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
@@ -165,6 +166,10 @@ class PartRandomizer:
         fixture, workpiece = self._task.offsets.draw(rng, reset)
         self._move_parts([fixture.tolist(), workpiece.tolist()])
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
+
+    def remove_fixture(self) -> None:
+        """Take the fixture off a held workpiece, as an operator does; the next call puts it back."""
+        self._move_parts([list(REMOVED), [0.0, 0.0]])
 
 
 def publish_part_offsets(driver: LcmDriver, offsets: list[list[float]]) -> None:
