@@ -15,7 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
-from guiderail.models.control.joint_status import Heartbeat, JointStatus, StatusLimits
+from guiderail.models.control.joint_status import Fault, Heartbeat, JointStatus, StatusLimits
 from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.robot import Robot
 from guiderail.systems.torque_safety_limiter import SafetyLimits
@@ -88,6 +88,11 @@ class Driver(ABC):
             InputError: If the driver cannot; see `can_hold`.
         """
         raise InputError(f"the driver {self.name} can't hold the arm by itself")
+
+    @property
+    def error(self) -> str:
+        """Reason for which the robot stopped by itself; empty if there is none or it is unknown."""
+        return ""
 
     def receive(self, timeout: float = 0.0) -> None:
         """Receive the messages that have arrived; if no new status has, wait for one at most `timeout` [s]."""
@@ -188,6 +193,11 @@ DRIVERS: Registry[type[Driver]] = Registry(
 """Driver classes by the name of their robot."""
 
 register_driver = DRIVERS.register
+
+
+def describe_stop(fault: Fault, driver: Driver) -> str:
+    """Return the reason of a stop in words, with the robot's own error if there is one."""
+    return f"{fault.description} ({driver.error})" if driver.error else fault.description
 
 
 def find_driver(robot: Robot | str) -> type[Driver]:

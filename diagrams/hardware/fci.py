@@ -31,7 +31,9 @@ MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interf
 POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
-FORCE_THRESHOLD_SHARE = 1.5  # the robot's collision threshold relative to the largest wrench of the impedance
+# The robot's collision thresholds: relative to the largest wrench of the impedance, and at least those of libfranka's
+# examples [N, Nm], because its estimate is off by some newtons, and an insertion that snaps in ends with an impact.
+FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD, MIN_TORQUE_THRESHOLD = 1.5, 20.0, 5.0
 MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
 REALTIME_FILE = Path("/sys/kernel/realtime")  # contains 1 on a kernel with real-time priorities
@@ -85,8 +87,7 @@ class FciDriver(PoseDriver):
         if self._is_lost:
             return
         robot, franky = self._robot, self._franky
-        force = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3]))
-        torque = FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[3:]))
+        force, torque = _collision_thresholds(impedance)
         try:
             X_NP = RigidTransform(robot.state.F_T_NE.matrix).InvertAndCompose(impedance.X_FlangeTool)
             robot.set_ee(_flat(X_NP))
@@ -119,7 +120,9 @@ class FciDriver(PoseDriver):
 
     @property
     def error(self) -> str:
-        """Reason of a reflex of the robot, empty if there is none."""
+        """Reason of a reflex of the robot; empty if there is none, or the connection is lost."""
+        if self._robot is None or self._is_lost:
+            return ""
         errors = str(self._robot.state.current_errors)
         return "" if errors == NO_ERRORS else errors
 
@@ -144,7 +147,7 @@ class FciDriver(PoseDriver):
             ),
             Check(
                 "reflex",
-                f"at {FORCE_THRESHOLD_SHARE * float(np.max(impedance.max_wrench[:3])):.0f} N of external force, and "
+                f"at {_collision_thresholds(impedance)[0]:.0f} N of external force, and "
                 f"{list(TORQUE_THRESHOLD)} Nm of external torques",
             ),
             Check(
@@ -232,6 +235,12 @@ class FciDriver(PoseDriver):
             time.sleep(0.1)
         if self._impedance is not None:
             self.configure(self._impedance)
+
+
+def _collision_thresholds(impedance: RobotImpedance) -> tuple[float, float]:
+    """Return the external force [N] and torque [Nm] along an axis at which the robot stops by a reflex."""
+    force, torque = (FORCE_THRESHOLD_SHARE * float(np.max(part)) for part in np.split(impedance.max_wrench, 2))
+    return max(force, MIN_FORCE_THRESHOLD), max(torque, MIN_TORQUE_THRESHOLD)
 
 
 def _flat(X: RigidTransform) -> list[float]:

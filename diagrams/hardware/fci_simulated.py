@@ -1,8 +1,7 @@
 """Simulated robot for the driver fci: the simulator franky-sim with a task's tool, workpiece and fixture in its world.
 
-franky-sim simulates an FR3 in MuJoCo and answers libfranka's network protocol. It estimates no external wrench and does
-not check commands for discontinuities or collisions. The external torques are added here from the simulated contact.
-The tests of `PoseMotionLimiter`, which computes the commands, check that these are continuous.
+franky-sim simulates an FR3 in MuJoCo and answers libfranka's network protocol. It estimates no external wrench and has
+no reflexes. Both are added here: the external torques from the simulated contact, the reflexes by `ReflexDetector`.
 """
 
 from __future__ import annotations
@@ -15,13 +14,23 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from typing import Any
 
+import mujoco
 import numpy as np
-from franky_sim.franka_robot_protocol import UDPCommand
+from franky_sim.franka_robot_protocol import (
+    AutomaticErrorRecoveryCommand,
+    MoveStatus,
+    RobotCommand,
+    RobotMode,
+    SetCollisionBehaviorCommand,
+    UDPCommand,
+)
 from franky_sim.franka_robot_server import FrankaRobotServer
+from franky_sim.franka_server import BaseCommand
 from franky_sim.mujoco_simulator import FrankaMujocoRobot, MujocoSimulator
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.hardware.fci_lockstep import LockstepServer
+from guiderail.diagrams.hardware.fci_reflexes import Reflex, ReflexDetector
 from guiderail.diagrams.hardware.station import payload_on_flange
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.mujoco import FIXTURE, WORKPIECE, MujocoContact, constraint_torques, mujoco_parts
@@ -31,6 +40,9 @@ from guiderail.models.common.errors import InputError
 
 ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # prefix of names in the simulator; from seventh link to flange [m]
 STEP = 0.001  # period of the protocol [s]
+# Steps of the engine in a period. With one step a contact of 2 ms lasts a single step: the tool bounces from it every
+# 5 ms, and joint velocities jump by 0.07 rad/s.
+SUBSTEPS = 4
 IDLE_RATE = 0.1  # rate of the clock of a robot without motion while its station computes
 REPEAT_INTERVAL = 0.2  # wall clock time after which the state of a waiting robot is sent again [s]
 RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "without gravity and friction"
@@ -39,6 +51,7 @@ RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "wi
 HOLDING_STIFFNESS = (450.0, 450.0, 350.0, 350.0, 200.0, 200.0, 200.0)
 HOLDING_DAMPING = (45.0, 45.0, 35.0, 35.0, 20.0, 20.0, 20.0)
 FILTER_TIME = 0.02  # time constant of the external torque's low-pass filter [s]
+NUM_ERRORS = 41  # length of libfranka's list of errors
 
 
 class SimulatedFranka(FrankaMujocoRobot):
@@ -46,17 +59,36 @@ class SimulatedFranka(FrankaMujocoRobot):
 
     Args:
         positions: Initial joint positions (7,) [rad].
+        p_LinkTool: Position of the tool center in the seventh link (3,) [m].
     """
 
-    def __init__(self, positions: np.ndarray):
+    def __init__(self, positions: np.ndarray, p_LinkTool: np.ndarray):
         super().__init__(initial_q=tuple(positions), kp=HOLDING_STIFFNESS, kv=HOLDING_DAMPING)
-        self._external = np.zeros(7)
+        self._p_LinkTool = p_LinkTool
+        self._external, self._contact = np.zeros(7), np.zeros(7)
+
+    def add_contact(self) -> None:
+        """Add the contact of one of the engine's steps to the mean of the period."""
+        # As libfranka's estimate, without the joint friction; with the forces of joint limits, which no task reaches.
+        self._contact += constraint_torques(self._model, self._data)[self._dof_addrs] / SUBSTEPS
 
     def _post_step(self) -> None:
-        # As libfranka's estimate, without the joint friction; with the forces of joint limits, which no task reaches.
-        contact = constraint_torques(self._model, self._data)[self._dof_addrs]
-        self._external += STEP / FILTER_TIME * (contact - self._external)
+        self._external += STEP / FILTER_TIME * (self._contact - self._external)
+        self._contact = np.zeros(7)
         super()._post_step()
+
+    def detect_reflex(self, detector: ReflexDetector, command: np.ndarray) -> Reflex | None:
+        """Return the reason of a reflex for a commanded torque (7,) [Nm], or None."""
+        model, data = self._model, self._data
+        assert model is not None
+        assert data is not None
+        link = model.body(ROBOT + "fr3_link7").id
+        R_WorldLink = data.xmat[link].reshape(3, 3)
+        jacobian = np.zeros((6, model.nv))
+        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], data.xpos[link] + R_WorldLink @ self._p_LinkTool, link)
+        wrench = np.linalg.lstsq(jacobian[:, self._dof_addrs].T, self._external)[0]
+        wrench = (wrench.reshape(2, 3) @ R_WorldLink).ravel()
+        return detector.detect(command, data.qpos[self._qpos_addrs], data.qvel[self._dof_addrs], self._external, wrench)
 
     @property
     def state(self) -> Any:
@@ -69,8 +101,8 @@ class SimulatedFranka(FrankaMujocoRobot):
 class WorkcellSimulator(MujocoSimulator):
     """Simulated FR3 with a task's parts: the workpiece on the flange, and the fixture in the world."""
 
-    def __init__(self, workcell: Any):
-        """Construct the simulator of a task's workcell, a `ConvexWorkcell`.
+    def __init__(self, workcell: Any, joint_friction: float = RESIDUAL_FRICTION):
+        """Construct the simulator of a task's workcell, a `ConvexWorkcell`, with a friction of each joint [Nm].
 
         Raises:
             InputError: If the workcell has no convex solids.
@@ -87,20 +119,20 @@ class WorkcellSimulator(MujocoSimulator):
             workcell.fixture_surfaces(), workcell.workpiece_surfaces(), MujocoContact()
         )
         self._workcell: Any = workcell
-        self._parts, self._assets = (fixture, workpiece), assets
+        self._parts, self._assets, self._joint_friction = (fixture, workpiece), assets, joint_friction
         self._arm: SimulatedFranka | None = None
 
     def add_arm(self, pose: np.ndarray) -> SimulatedFranka:
         """Add the robot with its tool center at a pose (6,) in the target frame, and the task's parts."""
         positions = self.model_of_arm.solve(pose, self.model_of_arm.posture)
         self.add_robot(initial_q=tuple(positions))
-        self._arm = self._robots[0] = SimulatedFranka(positions)
+        self._arm = self._robots[0] = SimulatedFranka(positions, self._X_LinkTool.translation())
         root = self.scene
         option = root.find("option")
         assert option is not None
         option.attrib.update(cone="elliptic", impratio="10", ccd_tolerance="1e-9", ccd_iterations="100")
-        for joint in root.iterfind("default//joint[@frictionloss]"):
-            joint.set("frictionloss", str(RESIDUAL_FRICTION))
+        for joint in root.iterfind(".//joint[@frictionloss]"):  # the class's, and those of the wrist's joints
+            joint.set("frictionloss", str(self._joint_friction))
         asset = root.find("asset")
         assert asset is not None
         asset.extend(self._assets)
@@ -121,6 +153,16 @@ class WorkcellSimulator(MujocoSimulator):
                     geometry.attrib.update(contype="0", conaffinity="0")
         return self._arm
 
+    def _start(self) -> None:
+        super()._start()
+        self.model.opt.timestep = STEP / SUBSTEPS
+
+    def _step(self) -> None:
+        assert self._arm is not None
+        for _ in range(SUBSTEPS):
+            super()._step()
+            self._arm.add_contact()
+
     def move_parts(self, X_TTactual: RigidTransform, X_PWorkpiece: RigidTransform) -> None:
         """Place the actual target frame in the nominal one, and the workpiece relative to the tool center."""
         workcell = self._workcell
@@ -130,12 +172,30 @@ class WorkcellSimulator(MujocoSimulator):
             body.pos, body.quat = X.translation(), X.rotation().ToQuaternion().wxyz()
 
 
-class _RobotServer(FrankaRobotServer):
-    """Server of libfranka's protocol that can wait for the client's answer to a state."""
+class _CollisionBehaviorCommand(SetCollisionBehaviorCommand):
+    def handle(self, server: _RobotServer) -> None:
+        server.detector.set_thresholds(self.upper_torque_thresholds_nominal, self.upper_force_thresholds_nominal)
+        super().handle(server)
 
-    def __init__(self, robot: SimulatedFranka, host: str):
+
+class _ErrorRecoveryCommand(AutomaticErrorRecoveryCommand):
+    def handle(self, server: _RobotServer) -> None:
+        server.reflex = None
+        super().handle(server)
+
+
+class _RobotServer(FrankaRobotServer):
+    """Server of libfranka's protocol that can wait for the client's answer to a state, and has reflexes."""
+
+    def __init__(self, robot: SimulatedFranka, host: str, detector: ReflexDetector):
         super().__init__(robot, [host])
         self._answered, self._answered_motion = -1, 0
+        self.detector, self.reflex = detector, None
+        self._command = np.zeros(7)
+        self._FrankaServer__command_class_map |= {
+            RobotCommand.kSetCollisionBehavior: _CollisionBehaviorCommand,
+            RobotCommand.kAutomaticErrorRecovery: _ErrorRecoveryCommand,
+        }
 
     @property
     def is_controlled(self) -> bool:
@@ -146,6 +206,35 @@ class _RobotServer(FrankaRobotServer):
     def is_waiting(self) -> bool:
         """True if the client has not answered the last state yet."""
         return self.is_controlled and self._answered < self._FrankaServer__message_id - 1
+
+    @property
+    def robot_state(self) -> Any:
+        """State message, with the error of a reflex."""
+        state = super().robot_state
+        if self.reflex is None:
+            return state
+        errors = tuple(number == self.reflex for number in range(NUM_ERRORS))
+        return state.replace(errors=errors, reflex_reason=errors, robot_mode=RobotMode.kReflex)
+
+    def start_motion(self, controller_mode: Any, motion_generator_mode: Any, motion_id: int) -> None:
+        """Start a motion, unless a reflex has not been cleared."""
+        if self.reflex is not None:
+            raise RuntimeError(f"a motion is requested after {self.reflex.name.lower()}")
+        self._command = np.zeros(7)
+        self.detector.begin()
+        super().start_motion(controller_mode, motion_generator_mode, motion_id)
+
+    def check_reflexes(self) -> Reflex | None:
+        """Abort the motion and return the reason if there is one for a reflex."""
+        if not self.is_controlled:
+            return None
+        reflex, motion = self.robot.detect_reflex(self.detector, self._command), self.current_motion_id
+        if reflex is not None:
+            self.reflex = reflex
+            self.stop_motion(send_preemption_signal=False)
+            self.reset_current_motion_id()
+            BaseCommand.send_response(self._tcp_socket, RobotCommand.kMove, motion, MoveStatus.kReflexAborted)
+        return reflex
 
     def repeat_state(self) -> None:
         """Send the last state again, because the client ends its motion after a second without one."""
@@ -158,7 +247,9 @@ class _RobotServer(FrankaRobotServer):
         select.select([one for one in sockets if one is not None], [], [], timeout)
 
     def _handle_udp_command(self, command_data: bytes) -> None:
-        self._answered, self._answered_motion = UDPCommand.from_bytes(command_data).message_id, self.current_motion_id
+        command = UDPCommand.from_bytes(command_data)
+        self._answered, self._answered_motion = command.message_id, self.current_motion_id
+        self._command = np.array(command.tau_J_d)
         super()._handle_udp_command(command_data)
 
     def _reset_state(self) -> None:
@@ -173,7 +264,7 @@ def serve(
     seconds: float,
     rate: float = 1.0,
     host: str = "127.0.0.1",
-    on_ready: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> None:
     """Simulate the robot and answer libfranka's protocol, in lockstep with a `FciLockstepClock` if one is connected.
 
@@ -188,17 +279,21 @@ def serve(
         seconds: Simulated time to run [s].
         rate: Rate of the robot's clock relative to the wall clock.
         host: Address of this machine to listen on.
-        on_ready: Function that is called with the address when clients can connect.
+        log: Function that shows the address when clients can connect, and the reason of each reflex.
     """
     with ExitStack() as stack:
         stack.enter_context(simulator)
-        server = _RobotServer(simulator.add_arm(pose), host)
+        plant = simulator.model_of_arm.plant
+        detector = ReflexDetector(
+            plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()
+        )
+        server = _RobotServer(simulator.add_arm(pose), host, detector)
         server.init()
         stack.callback(server.cleanup)
         lockstep = stack.enter_context(closing(LockstepServer(host)))
         simulator.start()
         simulator.move_parts(*parts)
-        on_ready(host)
+        log(host)
         step, until, is_asked, sent = 0, 0, False, time.monotonic()
         while step * STEP < seconds:
             server.process_commands()
@@ -225,4 +320,6 @@ def serve(
                 continue
             step, sent = step + 1, time.monotonic()
             simulator.step()
+            if (reflex := server.check_reflexes()) is not None:
+                log(f"{reflex.name.lower()} after {step * STEP:.3f} s")
             server.send_state()

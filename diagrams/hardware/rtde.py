@@ -152,7 +152,9 @@ class RtdeDriver(PoseDriver):
 
     @property
     def error(self) -> str:
-        """Reason why the robot accepts no commands, empty if there is none."""
+        """Reason why the robot accepts no commands; empty if there is none, or the connection is lost."""
+        if self._receiver is None or self._is_lost:
+            return ""
         if self._receiver.isEmergencyStopped():
             return "emergency stop"
         if self._receiver.isProtectiveStopped():

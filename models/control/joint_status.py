@@ -51,7 +51,7 @@ class Fault(IntEnum):
     STALE = 2, "the newest status message is too old: the robot, the network or this machine is late"
     OUT_OF_ORDER = 3, "a status message is older than its predecessor: the robot's clock was set back"
     FUTURE = 4, "a status message is in the future: the robot's clock has jumped"
-    MALFORMED = 5, "a status message cannot be decoded"
+    MALFORMED = 5, "the robot reports an error, or a status message cannot be decoded"
     WRONG_SIZE = 6, "a status message has the wrong number of joints"
     NOT_FINITE = 7, "a status message contains NaN or infinity"
     CONFLICT = 8, "status messages contradict each other: a second robot on the channel, or a frozen clock"

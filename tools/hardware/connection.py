@@ -78,6 +78,7 @@ class RobotConnection:
     synchronous: bool = False
     rate: float = DEFAULT_RATE  # rate of a simulated robot's clock relative to the wall clock
     scenario: Path | None = None  # scenario file with robot, address and surroundings
+    joint_friction: float | None = None  # friction of each joint of a simulated Franka [Nm], for experiments
 
     @classmethod
     def from_scenario(cls, file: Path | None, **options: Any) -> RobotConnection:
@@ -159,7 +160,8 @@ class RobotConnection:
             "from guiderail.tools.hardware import sim_driver\n"
             f"import_modules({list(imports)!r})\n"
             f"sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "
-            f"scenario={scenario!r} and Path({scenario!r}), driver={self.driver!r})"
+            f"scenario={scenario!r} and Path({scenario!r}), driver={self.driver!r}, "
+            f"joint_friction={self.joint_friction!r})"
         )
         with subprocess_tied_to_parent(code) as process:
             yield process

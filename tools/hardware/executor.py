@@ -20,6 +20,7 @@ from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.envs.options import Options
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.diagrams.hardware.clock import Clock, garbage_collection_disabled, set_realtime_priority
+from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -161,7 +162,7 @@ class SkillExecutor:
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
         steps = len(self.trace)
         if arm_state in (ArmState.DAMPING, ArmState.OFF):
-            return Outcome(Fault(fault), Fault(fault).description, steps)
+            return Outcome(Fault(fault), describe_stop(Fault(fault), station.driver), steps)
         if self._is_stop_requested():
             return Outcome(Fault.USER_STOP, Fault.USER_STOP.description, steps)
         if force > limit:

@@ -15,6 +15,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.hardware.clock import Clock
+from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
@@ -374,7 +375,7 @@ class RobotEnv(DiagramEnv):
             self._free_workpiece(self._must_be_freed)
             self._must_be_freed = ""
         else:
-            self._confirm_resume(self._active_fault.description)
+            self._confirm_resume(describe_stop(self._active_fault, self._station.driver))
         self._station.driver.recover()
         # No status was received while the operator was asked. If the arm was moved in the meantime, its statuses are
         # accepted only after the settling time.

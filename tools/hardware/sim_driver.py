@@ -43,6 +43,7 @@ def run_sim_driver(
     offset: Sequence[float] | None = None,
     scenario: Path | None = None,
     driver: str = "",
+    joint_friction: float | None = None,
     log: Callable[[str], None] = print,
 ) -> bool:
     """Simulate a robot and its driver in front of a task's fixture: by default an iiwa with a safety monitor on LCM.
@@ -58,6 +59,7 @@ def run_sim_driver(
         scenario: Scenario file with the surroundings; see `load_scenario`.
         driver: "fci" for a Franka on its own protocol, at the address `url`: in lockstep with a `FciLockstepClock`,
             without one by the wall clock.
+        joint_friction: Friction of each joint of the Franka [Nm]; by default what its compensation may leave.
         log: Function that shows a message.
 
     Returns:
@@ -81,10 +83,17 @@ def run_sim_driver(
     if driver == "fci":
         if scenario is not None:
             raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
-        from guiderail.diagrams.hardware.fci_simulated import WorkcellSimulator, serve  # needs franky-sim
+        from guiderail.diagrams.hardware.fci_simulated import (  # needs franky-sim
+            RESIDUAL_FRICTION,
+            WorkcellSimulator,
+            serve,
+        )
 
         parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)
-        serve(WorkcellSimulator(insertion.workcell()), start, part_poses(*parts), seconds, rate or 1.0, url, log)
+        friction = RESIDUAL_FRICTION if joint_friction is None else joint_friction
+        serve(
+            WorkcellSimulator(insertion.workcell(), friction), start, part_poses(*parts), seconds, rate or 1.0, url, log
+        )
         return True
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm = open_bus(url)

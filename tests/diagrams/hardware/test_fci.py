@@ -9,7 +9,14 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware import fci as fci
-from guiderail.diagrams.hardware.fci import FORCE_THRESHOLD_SHARE, NO_ERRORS, FciDriver
+from guiderail.diagrams.hardware.driver import describe_stop
+from guiderail.diagrams.hardware.fci import (
+    FORCE_THRESHOLD_SHARE,
+    MIN_FORCE_THRESHOLD,
+    MIN_TORQUE_THRESHOLD,
+    NO_ERRORS,
+    FciDriver,
+)
 from guiderail.diagrams.hardware.station import HardwareStation, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
@@ -200,6 +207,8 @@ def test_status_is_malformed_after_a_failure(driver, robot, failure):
     else:
         robot.is_connected = False
     assert not driver.read().is_readable
+    reason = " (cartesian_reflex)" if failure == "reflex" else ""
+    assert describe_stop(Fault.MALFORMED, driver) == Fault.MALFORMED.description + reason
 
 
 def test_recover_clears_the_error_or_raises(driver, robot):
@@ -251,9 +260,17 @@ def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
     expected = RigidTransform([0.0, 0.0, -0.1]) @ impedance.X_FlangeTool
     np.testing.assert_allclose(calls["set_ee"][0], expected.GetAsMatrix4().ravel("F"), atol=1e-12)
     assert calls["set_load"][0] == pytest.approx(impedance.mass)
-    assert calls["set_collision_behavior"][1][0] == pytest.approx(
-        FORCE_THRESHOLD_SHARE * impedance.max_wrench[:3].max()
-    )
+    force, torque = (FORCE_THRESHOLD_SHARE * part.max() for part in np.split(impedance.max_wrench, 2))
+    assert force > MIN_FORCE_THRESHOLD
+    assert calls["set_collision_behavior"][1] == pytest.approx([force] * 3 + [max(torque, MIN_TORQUE_THRESHOLD)] * 3)
+
+
+def test_collision_thresholds_of_a_small_force_are_above_the_robot_s_error(robot, model):
+    driver = FciDriver("192.0.2.1", client=client(robot))
+    assert driver.read() is not None
+    driver.configure(make_robot_impedance(model, Impedance().with_max_force(10.0)))
+    calls = {name: args for name, args, _ in robot.calls}
+    assert calls["set_collision_behavior"][1] == [MIN_FORCE_THRESHOLD] * 3 + [MIN_TORQUE_THRESHOLD] * 3
 
 
 def test_robot_is_not_configured_during_a_motion(driver, robot, model):

@@ -95,11 +95,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=30, help="of the training")
     parser.add_argument("--kill-after", type=float, nargs="*", default=(), help="kill the robot after so many seconds")
     parser.add_argument("--jitter", type=float, default=None, help="longest delay of a reference [s]")
+    parser.add_argument("--joint-friction", type=float, help="friction of each joint of the robot [Nm]")
     parser.add_argument("--out", type=Path, help="folder of the evaluation")
     arguments = parser.parse_args()
     if arguments.jitter is not None:
         delay_references(arguments.jitter)
-    connection = KilledRobot(robot="panda", driver="fci", sim=True, kill_after=tuple(arguments.kill_after))
+    connection = KilledRobot(
+        robot="panda",
+        driver="fci",
+        sim=True,
+        joint_friction=arguments.joint_friction,
+        kill_after=tuple(arguments.kill_after),
+    )
     result: Any
     if arguments.command == "train":
         environment: dict[str, Any] = {

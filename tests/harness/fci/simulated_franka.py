@@ -1,4 +1,4 @@
-"""Run of a simulated Franka through its own protocol: insert, lock, stop, the loss of the robot, and another robot.
+"""Run of a simulated Franka through its own protocol: insert, lock, stop, the loss of the robot, and a reflex.
 
 Run by `make fci`, in an environment with franky and franky-sim. The robot is a process of its own that answers
 libfranka's network protocol. It runs in lockstep with the station, so that the speed of the machine does not count.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from unittest.mock import patch
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -26,6 +27,7 @@ FORCE_LIMIT = 18.0  # bound of the impedance's force [N]
 CONTROL_STEPS = 4  # status periods of a control step
 DOWN, TURN = 0.01, 0.25  # speed of the insertion [m/s] and of the turn [rad/s], below those of `motion_limits`
 PRESSED = -0.006  # commanded height while the plug is turned [m]
+LOW_THRESHOLDS = (6.0, 5.0)  # collision thresholds that the insertion exceeds [N, Nm]
 
 
 class SimulatedRun:
@@ -113,10 +115,18 @@ def run_checks() -> list[str]:
             "loss", Fault(int(run["fault"][0])) in STATUS_FAULTS and run["arm_state"][0] == ArmState.OFF, run.describe()
         )
     with subprocess_tied_to_parent(code):
-        run.station.driver.recover()
+        with patch("guiderail.diagrams.hardware.fci._collision_thresholds", lambda impedance: LOW_THRESHOLDS):
+            run.station.driver.recover()
         run.clock.begin()
         run.resume()
         check("recovery", run["arm_state"][0] == ArmState.RUNNING, run.describe())
+        run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))
+        check("reflex", run["arm_state"][0] == ArmState.OFF, f"{run.station.driver.error}; {run.describe()}")
+        run.station.driver.recover()
+        run.clock.begin()
+        run.pose = run["pose"].copy()
+        run.resume()
+        check("cleared", run["arm_state"][0] == ArmState.RUNNING, run.describe())
     return failures
 
 

@@ -11,6 +11,7 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.models.common.errors import InputError
@@ -53,6 +54,7 @@ def make(patch, start, **options):
         action_repeat=5,
         keys=keys,
         confirm_resume=requests.append,
+        free_workpiece=requests.append,
         log=lambda text: None,
     )
     env.clock, env.keys, env.asked, env.begin = clock, keys, requests, begin
@@ -349,8 +351,8 @@ def test_reset_repeats_its_path_once_if_the_start_is_not_reached(env, monkeypatc
         command(pose)
 
     monkeypatch.setattr(env, "_command", record)
-    at_start = iter([False, True])
-    monkeypatch.setattr(env, "_is_at_start", lambda: next(at_start))
+    at_start = iter([False])
+    monkeypatch.setattr(env, "_is_at_start", lambda: next(at_start, True))
     env.reset()
     back = [tuple(pose) for pose in path[::-1]]
     commanded = [tuple(pose) for pose in commanded]
@@ -359,7 +361,18 @@ def test_reset_repeats_its_path_once_if_the_start_is_not_reached(env, monkeypatc
     assert commanded[second : second + len(there_and_back)] == there_and_back
 
 
-def test_reset_raises_if_the_start_is_not_reached_twice(env, monkeypatch):
+def test_reset_has_the_workpiece_released_by_hand_if_the_start_is_not_reached(env, monkeypatch):
+    env.reset()
+    env.step(np.zeros(2))
+    env._extend_return_path()
+    at_start = iter([False, False])
+    monkeypatch.setattr(env, "_is_at_start", lambda: next(at_start, True))
+    env.reset()
+    assert len(env.asked) == 1
+    assert env.asked[0].startswith("the arm did not reach the start")
+
+
+def test_reset_raises_if_the_start_is_not_reached_after_the_release(env, monkeypatch):
     env.reset()
     env.step(np.zeros(2))
     env._extend_return_path()
@@ -367,6 +380,27 @@ def test_reset_raises_if_the_start_is_not_reached_twice(env, monkeypatch):
         patch.setattr(env, "_is_at_start", lambda: False)
         with pytest.raises(InputError, match="did not reach the start"):
             env.reset()
+    assert len(env.asked) == 1
+
+
+@pytest.mark.parametrize("snaps_in", [False, True])
+def test_workpiece_that_snapped_in_is_released_by_hand(env, monkeypatch, snaps_in):
+    monkeypatch.setattr(env, "_snaps_in", snaps_in)
+    monkeypatch.setattr(env, "_resists_pull", lambda: True)
+    env.reset()
+    with monkeypatch.context() as patch:
+        step = DiagramEnv.step
+
+        def succeed(env, action):
+            observation, reward, _, truncated, info = step(env, action)
+            return observation, reward, True, truncated, info | {"is_success": True}
+
+        patch.setattr(DiagramEnv, "step", succeed)
+        env.step(np.zeros(2))
+    env.reset()
+    assert env.asked == ["the workpiece has snapped in"] * snaps_in
+    env.reset()
+    assert len(env.asked) == snaps_in
 
 
 def test_reset_completes_after_a_stop(env):
@@ -385,7 +419,7 @@ def test_pull_tells_a_locked_workpiece_from_a_loose_one(env, monkeypatch):
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("GridClamp", {}, "has no success that a robot can observe"),
+        ("GridClamp", {"reward": "aligned"}, "needs simulation state"),
         ("BncConnector", {"reward": "aligned"}, "needs simulation state"),
     ],
 )
