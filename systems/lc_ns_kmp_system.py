@@ -8,6 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Inpu
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
+from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
 
 
@@ -43,9 +44,9 @@ class LcNsKmpSystem(LeafSystem):
     length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
     starts at the end of the previous one. If ``reference_window`` ((H+1)(O + O²),) is connected, its means and
     covariances, the current step first, replace those of the reference (`ChunkReference`). ``command`` is (O,).
-    ``constraint_violation`` (1,) is max(c − G y) of the command: negative if all constraints are slack, `UNCONSTRAINED`
-    if there is none. ``fallback`` (1,) is 1 if no window within the constraints was found; the command is then the
-    point nearest to the last command within the constraints of the current step.
+    ``constraint_violation`` (1,) is max(c − G y) of the command: negative if all constraints are slack,
+    `ConstraintViolation.UNCONSTRAINED` if there is none. ``fallback`` (1,) is 1 if no window within the constraints
+    was found; the command is then the point nearest to the last command within the constraints of the current step.
 
     The step is discrete state that counts control periods since time zero. If ``motion_time`` (1,) [s] is connected
     (`ProgressClock`), it determines the step instead. The command is a pure function of step, action and history,
@@ -64,9 +65,6 @@ class LcNsKmpSystem(LeafSystem):
         InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
             `shorter` has no shorter history, the history length of another one, or other constraints than `primitive`.
     """
-
-    #: ``constraint_violation`` if there is no constraint; finite, so that logs and statistics accept it.
-    UNCONSTRAINED = -1e30
 
     def __init__(
         self,
@@ -216,7 +214,7 @@ class LcNsKmpSystem(LeafSystem):
     def _calc_constraint_violation(self, context: Context, output: BasicVector) -> None:
         prediction = self._prediction.Eval(context)
         violation = self._primitive.constraints.violation(prediction.output, prediction.step)
-        output.SetAtIndex(0, max(violation, self.UNCONSTRAINED))
+        output.SetAtIndex(0, max(violation, ConstraintViolation.UNCONSTRAINED))
 
     def _calc_fallback(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._prediction.Eval(context).fallback)

@@ -7,11 +7,12 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import in_order
 from guiderail.models.common.files import write_atomically as write_atomically
 from guiderail.models.primitives import Demonstrations
 
@@ -127,15 +128,6 @@ def path_exists(path: Path) -> bool:
         return path.exists()
     except OSError as error:
         raise InputError(f"the path {brief(str(path))} cannot be read ({error.strerror}): check it") from error
-
-
-def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Return paths sorted by name, numbers in names by value: recording_2 precedes recording_10."""
-
-    def key(path: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-    return sorted(paths, key=key)
 
 
 def check_new(out: Path, what: str) -> None:

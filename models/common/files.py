@@ -2,7 +2,8 @@
 
 import hashlib
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -56,3 +57,12 @@ def read_bytes(path: Path, what: str, max_size: int) -> bytes:
     if len(data) > max_size:
         raise InputError(f"the {what} '{path}' is larger than {max_size} bytes: leave out what is not needed")
     return data
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return paths sorted by name, numbers in names by value: `demo_9` precedes `demo_10`."""
+
+    def key(path: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+    return sorted(paths, key=key)

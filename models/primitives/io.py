@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.files import read_bytes, write_atomically
+from guiderail.models.common.files import in_order, read_bytes, write_atomically
 
 MAX_NUMBERS = 2_000_000  # times and outputs together: five minutes of six outputs at a kilohertz
 MAX_DEMONSTRATIONS = 1_000
@@ -346,10 +346,4 @@ def _list_csv_files(folder: Path) -> list[Path]:
                 raise InputError(f"the folder '{folder}' holds more than {MAX_DEMONSTRATIONS} files: a few are enough")
     if not files:
         raise InputError(f"there is no .csv file in the folder '{folder}': put one there for each demonstration")
-    return sorted(files, key=_natural_order)
-
-
-def _natural_order(path: Path) -> list[tuple[int, int | str]]:
-    """Return a sort key that puts `demo_10` after `demo_9`."""
-    parts = re.split(r"([0-9]+)", path.stem)
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts]
+    return in_order(files)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief, import_extra
+from guiderail.models.common.files import in_order
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.datasets.formats.recorded import (
@@ -20,7 +21,7 @@ from guiderail.tools.datasets.formats.recorded import (
     poses_in_target,
     rotations_of,
 )
-from guiderail.tools.files import atomic_folder, in_order
+from guiderail.tools.files import atomic_folder
 
 # Attributes that lead to the pose in a message, by message type.
 POSES = {
