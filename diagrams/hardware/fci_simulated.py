@@ -139,6 +139,8 @@ class WorkcellSimulator(MujocoSimulator):
         last = next(body for body in self.worldbody.iter("body") if body.get("name") == ROBOT + "fr3_link7")
         for element, parent in zip(self._parts, (self.worldbody, last), strict=True):
             parent.append(element)
+            for body in element.iter("body"):
+                body.set("gravcomp", "1")  # the payload below has the weight of the workpiece
         # The robot compensates the weight of the load that the client sets.
         payload = payload_on_flange(self.model_of_arm)
         moments = payload.Shift(payload.get_com()).CalcRotationalInertia()
