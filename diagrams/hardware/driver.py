@@ -33,11 +33,17 @@ CommandCallback = Callable[[np.ndarray, float], None]
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one pre-flight check."""
+    """Result of one pre-flight check.
+
+    Attributes:
+        name: Name of the check.
+        description: Measured values, or an assumption that the operator has to check.
+        passed: False if the arm must not move; None if nothing is checked.
+    """
 
     name: str
     description: str
-    passed: bool = True
+    passed: bool | None = None
 
 
 class Driver(ABC):

@@ -142,13 +142,14 @@ class FciDriver(PoseDriver):
             Check("tool center", f"as configured, within {error:.1e} m", error <= MAX_TOOL_ERROR),
             Check(
                 "mass",
-                f"the robot carries {mass:.2f} kg, the model {impedance.mass:.2f} kg; in Desk the end effector is none",
+                f"the robot reports {mass:.2f} kg, this program has set {impedance.mass:.2f} kg; if they differ, "
+                "choose the end effector 'none' in Desk",
                 abs(mass - impedance.mass) <= MAX_MASS_ERROR,
             ),
             Check(
                 "reflex",
                 f"at {_collision_thresholds(impedance)[0]:.0f} N of external force, and "
-                f"{list(TORQUE_THRESHOLD)} Nm of external torques",
+                f"{TORQUE_THRESHOLD} Nm of external torques",
             ),
             Check(
                 "motion",
@@ -160,6 +161,7 @@ class FciDriver(PoseDriver):
                 "with real-time priorities"
                 if is_realtime
                 else "without real-time priorities: late packets are likely, and the robot stops after 20 of them",
+                True if is_realtime else None,
             ),
         ]
 

@@ -295,7 +295,7 @@ def serve(
         lockstep = stack.enter_context(closing(LockstepServer(host)))
         simulator.start()
         simulator.move_parts(*parts)
-        log(host)
+        log(f"the simulated Franka listens at {host}")
         step, until, is_asked, sent = 0, 0, False, time.monotonic()
         while step * STEP < seconds:
             server.process_commands()

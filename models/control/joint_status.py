@@ -48,7 +48,7 @@ class Fault(IntEnum):
 
     NONE = 0, "no fault"
     NO_STATUS = 1, "no status message received, or too few"
-    STALE = 2, "the newest status message is too old: the robot, the network or this machine is late"
+    STALE = 2, "the newest status message is too old: the robot, the network or this machine is late or has stopped"
     OUT_OF_ORDER = 3, "a status message is older than its predecessor: the robot's clock was set back"
     FUTURE = 4, "a status message is in the future: the robot's clock has jumped"
     MALFORMED = 5, "the robot reports an error, or a status message cannot be decoded"

@@ -246,7 +246,9 @@ Offsets = Annotated[bool, option("Resample the fixture offset of the run in ever
 
 RobotUrl = Annotated[str | None, option("Hardware: LCM URL of the driver's bus, or host.  [default: LCM's default]")]
 Driver = Annotated[str | None, option("Hardware: driver: fci (Franka) or rtde (UR).  [default: the robot's on LCM]")]
-Robot = Annotated[str | None, option("Hardware: robot arm.  [default: the scenario's, or iiwa14]", choices="robots")]
+Robot = Annotated[
+    str | None, option("Hardware: robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
+]
 Sim = Annotated[bool, option("Hardware: use a simulated driver in a subprocess instead of a robot.", "--sim")]
 Synchronous = Annotated[
     bool,

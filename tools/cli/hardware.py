@@ -23,6 +23,9 @@ def deploy(
     synchronous: cli.Synchronous = False,
     rate: cli.Rate = None,
     scenario: cli.Scenario = None,
+    force_limit: Annotated[
+        float | None, option("Lower force limit for a first motion [N].  [default: that of the training]")
+    ] = None,
     yes: cli.Yes = False,
     out: Annotated[
         Path | None, option("Folder of the recording.  [default: hardware in the run; NAME/hardware]")
@@ -39,7 +42,10 @@ def deploy(
 
     environment = cli.parse_environment(None, robot_url=robot_url, robot=robot, driver=driver)
     connection = cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
-    raise typer.Exit(deploy_policy(run, connection, station=station, assume_yes=yes, out=out, log=print_progress))
+    code = deploy_policy(
+        run, connection, station=station, force_limit=force_limit, assume_yes=yes, out=out, log=print_progress
+    )
+    raise typer.Exit(code)
 
 
 @cli.command("teleoperate ./peg --record demonstrations.npz")
@@ -75,7 +81,9 @@ def teleoperate(
 
 @cli.command("sim-driver --seconds 60", "sim-driver")
 def sim_driver(
-    url: Url = "",
+    url: Annotated[
+        str, option("LCM URL of the driver's bus; with --driver fci an address.  [default: LCM's default; 127.0.0.1]")
+    ] = "",
     driver: cli.Driver = None,
     seconds: Annotated[float, option("Duration in simulated time [s].")] = 3600.0,
     command_timeout: Annotated[float, option("Longest wait for a command [s].")] = 5.0,

@@ -201,7 +201,13 @@ class EpisodeProgress:
     """
 
     def __init__(
-        self, episodes: int, *, name: str = "training", window: int | None = WINDOW, console: Console | None = None
+        self,
+        episodes: int,
+        *,
+        name: str = "training",
+        window: int | None = WINDOW,
+        console: Console | None = None,
+        asks: bool = False,
     ):
         """Construct the progress.
 
@@ -210,6 +216,7 @@ class EpisodeProgress:
             name: Name of the bar.
             window: Number of last episodes over which success and return are averaged; None for all episodes.
             console: Console; standard error by default, so that results can be piped.
+            asks: True if questions are asked meanwhile; the bar is then drawn after episodes only, not over a question.
         """
         from rich.console import Console  # slow to import
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -227,6 +234,7 @@ class EpisodeProgress:
             TextColumn("{task.fields[status]}"),
             TimeRemainingColumn(compact=True, elapsed_when_finished=True),
             console=self._console,
+            auto_refresh=not asks,
             disable=not self._console.is_terminal,
         )
         self._task = self._bar.add_task(name, total=episodes, status="")
@@ -245,7 +253,7 @@ class EpisodeProgress:
         if self._window is not None:
             self._recent = self._recent[-self._window :]
         self._max_violation = max(self._max_violation, float(row.get("max_commanded_violation", -math.inf)))
-        self._bar.update(self._task, completed=self._done, status=self.status())
+        self._bar.update(self._task, completed=self._done, status=self.status(), refresh=True)
         now = time.monotonic()
         is_due = self._count == 1 or self._done == self._episodes or now - self._printed > INTERVAL
         if self._bar.disable and is_due:

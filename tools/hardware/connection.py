@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.hardware.clock import Clock, WallClock, check_rate
+from guiderail.diagrams.hardware.driver import find_driver
 from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.lcm_simulated import LockstepClock
@@ -70,7 +71,7 @@ class RobotConnection:
     """
 
     robot_url: str = ""  # address of the driver, LCM's default if empty; a simulated driver has a bus of its own
-    robot: str = DEFAULT_ROBOT  # name of the arm
+    robot: str = ""  # name of the arm; by default the driver's, or `DEFAULT_ROBOT`
     driver: str = ""  # name of the driver; empty for the one with the robot's name
     sim: bool = False  # use a simulated driver, in a process of its own
     # Run station and simulated driver in lockstep instead of by the wall clock; always so for the driver fci, whose
@@ -99,6 +100,8 @@ class RobotConnection:
         return cls(**options | {"robot_url": url, "robot": scenario.robot, "scenario": file, "sim": sim})
 
     def __post_init__(self) -> None:
+        if not self.robot:
+            object.__setattr__(self, "robot", find_driver(self.driver).name if self.driver else DEFAULT_ROBOT)
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and (driver := self.driver or self.robot) not in SIMULATED:

@@ -63,7 +63,7 @@ def evaluate_on_robot(
         log: Function that shows a message.
 
     Returns:
-        Path of the rows, and statistics of the episodes.
+        Path of the rows, and statistics of the episodes; a stopped episode counts as a failure.
 
     Raises:
         InputError: If the policy cannot be executed, no robot answers, a check fails or is not confirmed, or the rows
@@ -96,7 +96,7 @@ def evaluate_on_robot(
             assert act is not None
             with (
                 garbage_collection_disabled(),
-                EpisodeProgress(episodes, name=policy or config.task, window=None) as progress,
+                EpisodeProgress(episodes, name=policy or config.task, window=None, asks=True) as progress,
             ):
                 try:
                     for index in range(episodes):
@@ -112,4 +112,5 @@ def evaluate_on_robot(
                         env.rest()
                     finally:
                         write(rows)  # includes the last episode, even if resuming after it was not confirmed
-    return {"rows": str(path), **summary(pd.DataFrame(rows), STATISTICS)}
+    stopped = sum(row["termination"] == "stopped" for row in rows)
+    return {"rows": str(path), **summary(pd.DataFrame(rows), STATISTICS), "stopped": stopped}

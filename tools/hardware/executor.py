@@ -58,7 +58,7 @@ SIGNALS = {
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
 MAX_WARM_UP_TIME = 0.1  # longest duration of the warm-up [s]
 BLEND_TIMEOUT = 5.0  # longest time until the controller has full authority [s]
-COMPLETED = "done"
+COMPLETED = "executed to its end"
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class SkillExecutor:
                 return outcome
             if elapsed > BLEND_TIMEOUT:
                 fault = Fault(int(station.get_fault_output_port().Eval(context)[0]))
-                return Outcome(fault, f"could not take over: {fault.description}", 0)
+                return Outcome(fault, f"could not take over: {describe_stop(fault, station.driver)}", 0)
         for command in slow_approach(pose, self._start, self._skill.control_period):
             desired_pose.FixValue(context, command)
             if (outcome := self._step()) is not None:
@@ -271,6 +271,7 @@ def deploy(
     connection: RobotConnection,
     *,
     station: str = "hardware",
+    force_limit: float | None = None,
     assume_yes: bool = False,
     out: Path | None = None,
     log: Log = print,
@@ -278,7 +279,8 @@ def deploy(
     """Execute the policy of a run on a robot.
 
     The run is a folder or `pretrained:NAME`. The recording is written to `out`, by default `recordings_folder`. With
-    `assume_yes` the pre-flight checks need no confirmation.
+    `assume_yes` the pre-flight checks need no confirmation. A `force_limit` [N] below that of the training bounds the
+    forces of a first motion.
 
     Returns:
         The exit code: 0 if the skill was executed to its end, 1 if it was stopped.
@@ -295,6 +297,15 @@ def deploy(
     task = EnvConfig.resolve(config.task, environment).make_task()
     if not isinstance(task, InsertionTask):
         raise InputError(f"{config.task} has no pose that an arm could approach to begin: run an insertion")
+    if force_limit is not None:
+        if not force_limit <= task.collision.above:
+            raise InputError(
+                f"the policy was learned with a force limit of {task.collision.above:g} N: give a lower one"
+            )
+        name = "force_limit" if environment.get("force_limit_range") is None else "force_limit_range"
+        environment[name] = force_limit if name == "force_limit" else (force_limit, force_limit)
+        task = EnvConfig.resolve(config.task, environment).make_task()
+        assert isinstance(task, InsertionTask)
     skill = make_skill(config.task, policy, **environment)
     skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
     with (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import signal
 import sys
+import termios
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -66,16 +67,20 @@ def operator_keys() -> Iterator[OperatorKeys]:
 
 
 def confirm(question: str) -> None:
-    """Ask the operator at the terminal to confirm.
+    """Ask the operator at the terminal to confirm; what was typed before the question is no answer to it.
 
     Raises:
-        InputError: If the answer is not yes, or there is no terminal.
+        InputError: If the answer is not yes, Ctrl-C is pressed, or there is no terminal.
     """
     if not sys.stdin.isatty():
-        raise InputError("this has to be confirmed at a terminal: read it, and give --yes")
+        raise InputError("this has to be confirmed at a terminal, or by --yes of a caller who has checked it")
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # nothing moves that Ctrl-C would have to stop
     try:
         answer = input(f"{question} Type yes: ")
-    except EOFError:
+    except (EOFError, KeyboardInterrupt):
         answer = ""
+    finally:
+        signal.signal(signal.SIGINT, before)
     if answer.strip().lower() != "yes":
         raise InputError("not confirmed: nothing moves")

@@ -65,6 +65,9 @@ MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
 NUM_STATUSES = 20  # statuses that are received before the checks
 
 
+MARKS = {True: "ok  ", False: "NOT ", None: "read"}  # marks of the printed lines; `read` is for the operator to check
+
+
 class PreflightChecks:
     """Pre-flight checks of a station that receives statuses and sends nothing.
 
@@ -135,10 +138,12 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     if isinstance(driver, PoseDriver):
         # Nothing clips the torques of the robot's own impedance: the limits of the external torques stop the arm.
         torque_share = (torque_shares * np.divide(limits.torque, limits.external_torque)).max()
-        torques = f"stopped at external torques of {list(limits.external_torque)} Nm"
-        hint = "; above 100% choose a smaller force_limit"
+        torques = f"stopped at external torques of {_numbers(limits.external_torque, 1)} Nm"
+        hint = "; above 100% a firm push stops the arm: choose a smaller force_limit"
+        payload_set_by = "this program configures"
     else:
-        torque_share, torques, hint = torque_shares.max(), f"at most {list(limits.torque)} Nm sent", ""
+        torque_share, torques, hint = torque_shares.max(), f"at most {_numbers(limits.torque, 1)} Nm sent", ""
+        payload_set_by = "must be configured on the robot"
     has_monitor = station.has_safety_monitor(context)
     if driver.has_command_timeout:
         monitor = "not needed: this driver stops the arm when commands stop"
@@ -147,7 +152,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     else:
         monitor = "no heartbeat: start guiderail safety-monitor on the driver's machine"
     return [
-        Check("robot", f"{driver.name}, {len(positions)} joints, {driver}"),
+        Check("robot", f"{driver.name}, {len(positions)} joints, {driver}", True),
         Check("monitor", monitor, driver.has_command_timeout or has_monitor),
         Check(
             "joints",
@@ -162,10 +167,14 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
             not num_commands,
         ),
         Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < MAX_JOINT_SPEED),
-        Check("payload", f"{payload:.2f} kg on the flange, which must be configured on the robot"),
+        Check("payload", f"{payload:.2f} kg on the flange, which {payload_set_by}"),
         Check("load", f"{force:.1f} N of external force at rest", force < MAX_FORCE),
-        Check("target", f"at {p_WT} m of the base"),
-        Check("tool", f"at {pose[:3].round(4)} m and {np.rad2deg(pose[3:]).round(1)} degrees of the target"),
+        Check("target", f"at {_numbers(p_WT)} m of the base"),
+        Check(
+            "tool",
+            f"at {_numbers(pose[:3] / MM, 1)} mm from the target, turned about z, y, x by "
+            f"{_numbers(np.rad2deg(pose[3:]), 1)} degrees",
+        ),
         Check(
             "start",
             f"{distance / MM:.0f} mm and {np.rad2deg(angle):.0f} degrees away",
@@ -180,7 +189,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
             "torques",
             f"{torques}; the full force takes {torque_share:.0%} of the nearest limit{hint}",
         ),
-        Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
+        Check("workspace", f"from {_numbers(limits.lower)} to {_numbers(limits.upper)} m around the target"),
         *driver.check_setup(),
     ]
 
@@ -195,7 +204,7 @@ def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assum
     """
     results = checks.run()
     for check in results:
-        log(f"{'ok ' if check.passed else 'NOT'}  {check.name:<12}{check.description}")
+        log(f"{MARKS[check.passed]}  {check.name:<12}{check.description}")
     _refuse_failed(results)
     if not assume_yes:
         confirm("Is all of this so, and is the workspace clear?")
@@ -203,7 +212,11 @@ def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assum
     return results
 
 
+def _numbers(values: Sequence[float] | np.ndarray, digits: int = 3) -> str:
+    return f"({', '.join(f'{round(float(value), digits) + 0.0:.{digits}f}' for value in values)})"
+
+
 def _refuse_failed(checks: Sequence[Check]) -> None:
-    failed = [check for check in checks if not check.passed]
+    failed = [check for check in checks if check.passed is not None and not check.passed]
     if failed:
         raise InputError(f"the arm stays where it is: {failed[0].name}: {failed[0].description}")

@@ -350,7 +350,8 @@ class RobotEnv(DiagramEnv):
             self._command(pose)
             elapsed += self.task.control_period
             if elapsed > RESUME_TIMEOUT:
-                raise InputError(f"the arm can't be taken over: {self._active_fault.description}")
+                reason = describe_stop(self._active_fault, self._station.driver)
+                raise InputError(f"the arm can't be taken over: {reason}")
 
     def _retry_until_ok(self, motion: Callable[[], Any]) -> None:
         """Retry `motion` until it completes without a stop."""

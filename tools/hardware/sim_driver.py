@@ -91,9 +91,8 @@ def run_sim_driver(
 
         parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)
         friction = RESIDUAL_FRICTION if joint_friction is None else joint_friction
-        serve(
-            WorkcellSimulator(insertion.workcell(), friction), start, part_poses(*parts), seconds, rate or 1.0, url, log
-        )
+        robot = WorkcellSimulator(insertion.workcell(), friction)
+        serve(robot, start, part_poses(*parts), seconds, rate or 1.0, url or "127.0.0.1", log)
         return True
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm = open_bus(url)

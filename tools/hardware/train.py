@@ -80,7 +80,10 @@ def train_on_robot(
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
         folder.write_config(config)
         try:
-            with garbage_collection_disabled(), EpisodeProgress(config.episodes, name=config.task) as progress:
+            with (
+                garbage_collection_disabled(),
+                EpisodeProgress(config.episodes, name=config.task, asks=True) as progress,
+            ):
                 rows = _train(
                     folder, config, session.env, waits=connection.synchronous, resume=resume, report=progress.update
                 )

@@ -95,7 +95,7 @@ def run_checks() -> list[str]:
     with subprocess_tied_to_parent(code) as robot:
         run.start()
         for one in run.station.driver.check_setup():
-            check(one.name, one.passed, one.description)
+            check(one.name, one.passed in (True, None), one.description)
         run.advance(1.2)
         check("take over", run["arm_state"][0] == ArmState.RUNNING, run.describe())
         run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))

