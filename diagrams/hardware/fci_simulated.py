@@ -65,7 +65,7 @@ class SimulatedFranka(FrankaMujocoRobot):
     def __init__(self, positions: np.ndarray, p_LinkTool: np.ndarray):
         super().__init__(initial_q=tuple(positions), kp=HOLDING_STIFFNESS, kv=HOLDING_DAMPING)
         self._p_LinkTool = p_LinkTool
-        self._external, self._contact = np.zeros(7), np.zeros(7)
+        self._external, self._contact, self.external_wrench = np.zeros(7), np.zeros(7), np.zeros(6)
 
     def add_contact(self) -> None:
         """Add the contact of one of the engine's steps to the mean of the period."""
@@ -87,7 +87,7 @@ class SimulatedFranka(FrankaMujocoRobot):
         jacobian = np.zeros((6, model.nv))
         mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], data.xpos[link] + R_WorldLink @ self._p_LinkTool, link)
         wrench = np.linalg.lstsq(jacobian[:, self._dof_addrs].T, self._external)[0]
-        wrench = (wrench.reshape(2, 3) @ R_WorldLink).ravel()
+        self.external_wrench = wrench = (wrench.reshape(2, 3) @ R_WorldLink).ravel()
         return detector.detect(command, data.qpos[self._qpos_addrs], data.qvel[self._dof_addrs], self._external, wrench)
 
     @property
@@ -323,5 +323,6 @@ def serve(
             step, sent = step + 1, time.monotonic()
             simulator.step()
             if (reflex := server.check_reflexes()) is not None:
-                log(f"{reflex.name.lower()} after {step * STEP:.3f} s")
+                wrench = np.round(server.robot.external_wrench, 1).tolist()
+                log(f"{reflex.name.lower()} after {step * STEP:.3f} s, with an external wrench of {wrench} N, Nm")
             server.send_state()

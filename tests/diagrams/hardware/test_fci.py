@@ -268,7 +268,7 @@ def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
 def test_collision_thresholds_of_a_small_force_are_above_the_robot_s_error(robot, model):
     driver = FciDriver("192.0.2.1", client=client(robot))
     assert driver.read() is not None
-    driver.configure(make_robot_impedance(model, Impedance().with_max_force(10.0)))
+    driver.configure(make_robot_impedance(model, Impedance().with_max_force(5.0)))
     calls = {name: args for name, args, _ in robot.calls}
     assert calls["set_collision_behavior"][1] == [MIN_FORCE_THRESHOLD] * 3 + [MIN_TORQUE_THRESHOLD] * 3
 
