@@ -31,10 +31,10 @@ MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interf
 POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
-# The robot's collision thresholds: relative to the largest wrench of the impedance along an axis, and at least those of
-# libfranka's examples [N, Nm], because the robot's estimate is off by some newtons. In simulation a plug that drops from
-# a rim into its hole ends with an impact of 1.9 times this wrench.
-FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD, MIN_TORQUE_THRESHOLD = 3.0, 20.0, 5.0
+# The robot's collision thresholds: relative to the largest wrench of the impedance along an axis, and the force at least
+# that of libfranka's examples [N], because the robot's estimate is off by some newtons. In simulation a plug that drops
+# from a rim into its hole ends with an impact of 1.9 times this wrench.
+FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 3.0, 20.0
 MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
 REALTIME_FILE = Path("/sys/kernel/realtime")  # contains 1 on a kernel with real-time priorities
@@ -243,7 +243,7 @@ class FciDriver(PoseDriver):
 def _collision_thresholds(impedance: RobotImpedance) -> tuple[float, float]:
     """Return the external force [N] and torque [Nm] along an axis at which the robot stops by a reflex."""
     force, torque = (FORCE_THRESHOLD_SHARE * float(np.max(part)) for part in np.split(impedance.max_wrench, 2))
-    return max(force, MIN_FORCE_THRESHOLD), max(torque, MIN_TORQUE_THRESHOLD)
+    return max(force, MIN_FORCE_THRESHOLD), torque
 
 
 def _flat(X: RigidTransform) -> list[float]:

@@ -13,7 +13,6 @@ from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.fci import (
     FORCE_THRESHOLD_SHARE,
     MIN_FORCE_THRESHOLD,
-    MIN_TORQUE_THRESHOLD,
     NO_ERRORS,
     FciDriver,
 )
@@ -262,7 +261,7 @@ def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
     assert calls["set_load"][0] == pytest.approx(impedance.mass)
     force, torque = (FORCE_THRESHOLD_SHARE * part.max() for part in np.split(impedance.max_wrench, 2))
     assert force > MIN_FORCE_THRESHOLD
-    assert calls["set_collision_behavior"][1] == pytest.approx([force] * 3 + [max(torque, MIN_TORQUE_THRESHOLD)] * 3)
+    assert calls["set_collision_behavior"][1] == pytest.approx([force] * 3 + [torque] * 3)
 
 
 def test_collision_thresholds_of_a_small_force_are_above_the_robot_s_error(robot, model):
@@ -270,7 +269,7 @@ def test_collision_thresholds_of_a_small_force_are_above_the_robot_s_error(robot
     assert driver.read() is not None
     driver.configure(make_robot_impedance(model, Impedance().with_max_force(5.0)))
     calls = {name: args for name, args, _ in robot.calls}
-    assert calls["set_collision_behavior"][1] == [MIN_FORCE_THRESHOLD] * 3 + [MIN_TORQUE_THRESHOLD] * 3
+    assert calls["set_collision_behavior"][1][:3] == [MIN_FORCE_THRESHOLD] * 3
 
 
 def test_robot_is_not_configured_during_a_motion(driver, robot, model):
