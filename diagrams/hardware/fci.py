@@ -31,7 +31,7 @@ MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interf
 POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
-# The robot's collision thresholds: relative to the largest wrench of the impedance along an axis, and the force at least
+# The robot's collision thresholds: relative to the largest wrench of the impedance along an axis, the force at least
 # that of libfranka's examples [N], because the robot's estimate is off by some newtons. In simulation a plug that drops
 # from a rim into its hole ends with an impact of 1.9 times this wrench.
 FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 3.0, 20.0
