@@ -87,6 +87,20 @@ class PreflightChecks:
         # Nothing is sent yet, and a safety monitor's first heartbeat may take a status or two.
         clock.advance(self.simulator, station, NUM_STATUSES)
 
+    @property
+    def error(self) -> str:
+        """Reason for which the robot stopped by itself before, empty if there is none."""
+        return self._station.driver.error
+
+    def clear_error(self) -> None:
+        """Clear the robot's error and receive new statuses; the arm does not move.
+
+        Raises:
+            InputError: If the error persists.
+        """
+        self._station.driver.recover()
+        self.repeat()
+
     def run(self) -> list[Check]:
         """Return the checks on the newest status."""
         num_commands = self._station.driver.num_foreign_commands - self._commands_before
@@ -197,11 +211,20 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
 def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
     """Show the checks and have the operator confirm them; then repeat them, because the robot may have changed.
 
-    With `assume_yes` nothing is asked. Returns the checks that were shown.
+    An error of the robot, such as a reflex, is cleared before if the operator agrees. With `assume_yes` nothing is asked.
+    Returns the checks that were shown.
 
     Raises:
-        InputError: If a check fails, before or after the question, or the operator does not confirm.
+        InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an
+            error that nobody was asked about.
     """
+    if checks.error:
+        if assume_yes:
+            raise InputError(
+                f"the robot reports {checks.error}: look at it, and start again at a terminal without --yes"
+            )
+        confirm(f"The robot reports {checks.error}. Clear the error? The arm does not move.")
+        checks.clear_error()
     results = checks.run()
     for check in results:
         log(f"{MARKS[check.passed]}  {check.name:<12}{check.description}")

@@ -24,7 +24,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.preflight import check_robot
+from guiderail.tools.hardware.preflight import PreflightChecks, check_robot, confirm_checks
 from guiderail.tools.hardware.sim_driver import START
 
 WORKCELL = BncWorkcell()
@@ -403,6 +403,32 @@ def test_station_stops_the_robot_after_a_reflex(robot):
     assert loop.arm_state == ArmState.DAMPING
     assert motions(robot)[-1][0] == "stop"
     assert Fault(int(loop.station.get_fault_output_port().Eval(loop.context)[0])) == Fault.MALFORMED
+
+
+class LoopClock:
+    """Clock that advances a station by its own period."""
+
+    def begin(self):
+        pass
+
+    def advance(self, simulator, station, steps):
+        for _ in range(steps):
+            station.receive(simulator.get_mutable_context())
+            simulator.AdvanceTo(simulator.get_context().get_time() + station.period)
+
+
+def test_error_from_before_is_cleared_only_if_the_operator_agrees(robot, monkeypatch):
+    station = Loop(robot).station
+    robot.errors = "cartesian_reflex"
+    checks, questions, lines = PreflightChecks(station, LoopClock(), START, 4), [], []
+    with pytest.raises(InputError, match="reports cartesian_reflex: look at it"):
+        confirm_checks(checks, lines.append, assume_yes=True)
+    assert (robot.errors, lines) == ("cartesian_reflex", [])
+    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", questions.append)
+    confirm_checks(checks, lines.append, assume_yes=False)
+    assert questions[0].startswith("The robot reports cartesian_reflex")
+    assert robot.errors == NO_ERRORS
+    assert not any(line.startswith("NOT") for line in lines)
 
 
 def test_check_compares_the_full_force_with_the_limits_that_stop_the_arm(robot):
