@@ -211,18 +211,16 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
 def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
     """Show the checks and have the operator confirm them; then repeat them, because the robot may have changed.
 
-    An error of the robot, such as a reflex, is cleared before if the operator agrees. With `assume_yes` nothing is asked.
-    Returns the checks that were shown.
+    An error of the robot, such as a reflex, is cleared before if the operator agrees. With `assume_yes` nothing is
+    asked. Returns the checks that were shown.
 
     Raises:
         InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an
-            error that nobody was asked about.
+            error and nothing is asked.
     """
     if checks.error:
         if assume_yes:
-            raise InputError(
-                f"the robot reports {checks.error}: look at it, and start again at a terminal without --yes"
-            )
+            raise InputError(f"the robot reports {checks.error}: look at it, and start again without --yes")
         confirm(f"The robot reports {checks.error}. Clear the error? The arm does not move.")
         checks.clear_error()
     results = checks.run()
