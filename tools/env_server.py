@@ -49,7 +49,13 @@ class EnvServer:
         self._env = env
         self._station = env.task.diagram.GetSubsystemByName("station")
         self._is_done, self._info = False, {"is_success": False, "termination": ""}
-        self._observation = env.reset()[0]
+        # A reset with a seed begins a new run, so that the seed determines the values that are hidden for a whole run.
+        self._seeded: dict[str, Any] = {"new_run": True}
+        try:
+            self._observation = env.reset(seed=0, options=self._seeded)[0]
+        except InputError:  # a task without such values
+            self._seeded = {}
+            self._observation = env.reset(seed=0)[0]
 
     def describe(self) -> dict[str, Any]:
         """Return the content of the first line."""
@@ -72,7 +78,7 @@ class EnvServer:
     def _reset(self, seed: Any) -> None:
         if seed is not None and (type(seed) is not int or not 0 <= seed < 2**31):
             raise InputError("a seed is a whole number from 0 to 2147483647, or null")
-        self._observation, info = self._env.reset(seed=seed)
+        self._observation, info = self._env.reset(seed=seed, options={} if seed is None else self._seeded)
         self._info, self._is_done = info, False
 
     def _step(self, action: Any) -> None:

@@ -31,6 +31,20 @@ def test_answers_are_those_of_the_environment(server):
     assert not answer["is_done"]
 
 
+def test_seed_determines_the_values_that_are_hidden_for_a_run():
+    options = {"guidance": "kgrl", "station": "gantry", "action_repeat": 10}
+    env = gymnasium.make("guiderail/BncConnector-v0", **options)
+    offsets = [env.reset(seed=3)[1]["jack_offset"]]
+    server = EnvServer(open_environment("BncConnector", options))
+    for seed in (4, 3):
+        server.answer({"reset": seed})
+        offsets.append(server._info["jack_offset"])
+    server.answer({"reset": None})
+    np.testing.assert_array_equal(offsets[0], offsets[2])
+    assert (offsets[1] != offsets[2]).any()
+    np.testing.assert_array_equal(server._info["jack_offset"], offsets[2])
+
+
 def test_end_of_the_episode_is_reported(server):
     answer = server.answer({"reset": 0})
     while not answer["is_done"]:

@@ -7,7 +7,7 @@ import logging
 import math
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -28,13 +28,13 @@ class GuiderailRobotConfig(RobotConfig):
 
     Attributes:
         environment: Name of a task, or folder of a run, whose environment is used.
-        options: Environment options as a JSON object.
+        options: Environment options by name; a JSON object on the command line.
         python: Interpreter with guiderail; this one by default.
         seed: Seed of the first episode.
     """
 
     environment: str = "BncConnector"
-    options: str = "{}"
+    options: dict[str, Any] = field(default_factory=dict)
     python: str = sys.executable
     seed: int = 0
 
@@ -154,11 +154,12 @@ class GuiderailRobot(Robot):
             raise ConnectionError(f"{self} is not connected: call connect() first")
 
     def _start(self) -> None:
-        command = [self.config.python, "-m", "guiderail.tools.env_server", self.config.environment, self.config.options]
+        config = self.config
+        command = [config.python, "-m", "guiderail.tools.env_server", config.environment, json.dumps(config.options)]
         try:
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         except OSError as error:
-            raise ConnectionError(f"{self.config.python} does not start: {error.strerror}") from None
+            raise ConnectionError(f"{config.python} does not start: {error.strerror}") from None
 
     def _stop(self) -> None:
         process, self._process = self._process, None

@@ -19,8 +19,8 @@ from lerobot_robot_guiderail.export import FORMAT, export
 from safetensors.numpy import save_file
 
 PYTHON = os.environ["GUIDERAIL_PYTHON"]
-ENVIRONMENT, OPTIONS = "NarrowPassage", '{"guidance": "kgrl", "action_repeat": 20}'
-CONNECTOR = '{"guidance": "kgrl", "station": "gantry", "action_repeat": 10}'
+ENVIRONMENT, OPTIONS = "NarrowPassage", {"guidance": "kgrl", "action_repeat": 20}
+CONNECTOR = {"guidance": "kgrl", "station": "gantry", "action_repeat": 10}
 
 
 @pytest.fixture(autouse=True)
@@ -107,8 +107,8 @@ def test_episode_restarts_after_its_end(robot):
     ("values", "message"),
     [
         ({"environment": "Nowhere"}, "Nowhere"),
-        ({"options": "[]"}, "JSON object"),
-        ({"environment": "BncConnector", "options": '{"station": "hardware"}'}, "real robot"),
+        ({"options": {"guidance": "none of these"}}, "guidance"),
+        ({"environment": "BncConnector", "options": {"station": "hardware"}}, "real robot"),
     ],
 )
 def test_wrong_configuration_is_refused_with_guiderails_message(tmp_path, values, message):
@@ -203,7 +203,7 @@ def test_rollout_of_lerobot_executes_an_exported_policy(tmp_path):
         f"--policy.path={tmp_path / 'out'}",
         "--robot.type=guiderail",
         f"--robot.environment={ENVIRONMENT}",
-        f"--robot.options={OPTIONS}",
+        f"--robot.options={json.dumps(OPTIONS)}",
         f"--robot.python={PYTHON}",
         "--fps=10",
         "--duration=3",
