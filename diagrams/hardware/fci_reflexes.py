@@ -57,7 +57,7 @@ class ReflexDetector:
             position: Joint positions (7,) [rad].
             velocity: Joint velocities (7,) [rad/s].
             external_torque: External joint torques (7,) [Nm].
-            external_wrench: External wrench at the tool center, in its frame (6,): force [N], torque [Nm].
+            external_wrench: External wrench at the tool center (6,): force [N], torque [Nm].
         """
         step = np.abs(command - self._last_command)
         self._last_command = np.array(command)

@@ -87,6 +87,7 @@ class SimulatedFranka(FrankaMujocoRobot):
         jacobian = np.zeros((6, model.nv))
         mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], data.xpos[link] + R_WorldLink @ self._p_LinkTool, link)
         wrench = np.linalg.lstsq(jacobian[:, self._dof_addrs].T, self._external)[0]
+        # In the axes of the seventh link: the thresholds are equal along all axes.
         self.external_wrench = wrench = (wrench.reshape(2, 3) @ R_WorldLink).ravel()
         return detector.detect(command, data.qpos[self._qpos_addrs], data.qvel[self._dof_addrs], self._external, wrench)
 
