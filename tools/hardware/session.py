@@ -68,21 +68,16 @@ def robot_session(
         clock, wall_clock = connection.clocks(station)
         log(f"waiting for {connection.robot} on {station.driver}")
 
-        def confirm_resume(reason: str) -> None:
-            log(f"the arm is at rest: {reason}")
-            if not (assume_yes and connection.sim):
-                confirm("Resume from where it is?")
-
         randomize_parts = None
         if isinstance(clock, FciLockstepClock):
             randomize_parts = PartRandomizer(task, clock.move_parts, config.seed)
         elif connection.sim and isinstance(station.driver, LcmDriver):
             randomize_parts = PartRandomizer(task, partial(publish_part_offsets, station.driver), config.seed)
 
+        ask = partial(_ask, log, is_asked=not (assume_yes and connection.sim))
+
         def free_workpiece(reason: str) -> None:
-            log(f"the arm is at rest: {reason}")
-            if not (assume_yes and connection.sim):
-                confirm("Release the workpiece by hand, put the parts back, and keep clear. May the arm move?")
+            ask(reason, "Release the workpiece by hand, put the parts back, and keep clear. May the arm move?")
             if randomize_parts is not None:
                 randomize_parts.remove_fixture()
 
@@ -94,7 +89,7 @@ def robot_session(
             clock,
             action_repeat=config.action_repeat,
             keys=keys,
-            confirm_resume=confirm_resume,
+            confirm_resume=lambda reason: ask(reason, "Resume from where it is?"),
             free_workpiece=free_workpiece,
             log=log,
             snaps_in=task.snaps_in,
@@ -105,3 +100,10 @@ def robot_session(
             log(NO_REALTIME_PRIORITY)
         log(keys.describe(has_pauses=True))
         yield RobotSession(env, lambda: connection.timing(station, wall_clock))
+
+
+def _ask(log: Log, reason: str, question: str, *, is_asked: bool) -> None:
+    """Show why the arm is at rest, and have the operator confirm that it may move."""
+    log(f"the arm is at rest: {reason}")
+    if is_asked:
+        confirm(question)

@@ -218,7 +218,11 @@ def ready(monkeypatch):
     monkeypatch.setattr("guiderail.tools.hardware.session.set_realtime_priority", lambda: True)
     monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", requests.append)
     config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
-    return clock, requests, lambda: robot_session(config, RobotConnection(), assume_yes=False, log=lambda text: None)
+
+    def begin(*, sim=False, assume_yes=False):
+        return robot_session(config, RobotConnection(sim=sim), assume_yes=assume_yes, log=lambda text: None)
+
+    return clock, requests, begin
 
 
 @pytest.mark.parametrize("name", ["start", "monitor", "commands"])
@@ -251,6 +255,21 @@ def test_clock_begins_again_before_control_is_taken(ready, monkeypatch):
         monkeypatch.setattr(clock, "begin", lambda: begun.append(clock.step))
         robot.env._take_control()
         assert begun == [step]
+
+
+@pytest.mark.parametrize(("sim", "assume_yes"), [(False, False), (False, True), (True, False), (True, True)])
+def test_resuming_and_releasing_are_confirmed_unless_simulated(ready, monkeypatch, sim, assume_yes):
+    _, _, begin = ready
+    questions, offsets = [], []
+    monkeypatch.setattr("guiderail.tools.hardware.session.confirm", questions.append)
+    monkeypatch.setattr(
+        "guiderail.tools.hardware.session.publish_part_offsets", lambda driver, parts: offsets.append(parts)
+    )
+    with begin(sim=sim, assume_yes=assume_yes) as robot:
+        robot.env._confirm_resume("stopped")
+        robot.env._free_workpiece("stuck")
+    assert [question.split()[0] for question in questions] == ["Resume", "Release"] * (not (sim and assume_yes))
+    assert offsets == [[[1.0, 0.0], [0.0, 0.0]]] * sim
 
 
 def test_commands_check_fails_when_another_program_commands(monkeypatch):
