@@ -16,6 +16,7 @@ TURN_SPEED = 45.0 * DEGREE  # [rad/s]
 SEARCH = 1.8  # time on the rim [s]
 PAUSE = 0.3  # time after each part of the motion [s]
 NUM_DEMONSTRATIONS = 5
+SPREAD = 1.5 * MM  # distance from the nominal place at which the sockets of the demonstrations are, on a circle [m]
 
 # Standard deviations of the hand [m, rad]: wide on the rim, narrow where the parts guide the motion.
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
@@ -77,7 +78,9 @@ def demonstrator_motions(
 ) -> np.ndarray:
     """Return five different searches (5, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
-    The random deviations are wide while the command is above the height `press_from` [m].
+    The random deviations are wide while the command is above the height `press_from` [m]. Below it, each search ends at
+    a socket of its own (`socket_offsets`), so that the variance of the demonstrations is that of the socket's place,
+    and actions can follow a displaced socket down to the target.
     """
     rng = np.random.default_rng(seed)
     script_times, poses = script
@@ -88,7 +91,15 @@ def demonstrator_motions(
     curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
     wander = curves - _CENTERING * curves.mean(axis=0)
     nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
-    return nominal + scale * wander
+    motions = nominal + scale * wander
+    motions[:, :, :2] += (1.0 - wide) * socket_offsets()[:, None, :]
+    return motions
+
+
+def socket_offsets() -> np.ndarray:
+    """Return the offsets (x, y) of the sockets of the demonstrations, (5, 2) [m]; their mean is zero."""
+    angles = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS
+    return SPREAD * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.objects.sdf import TriangleMesh
-from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS, demonstrator_motions
+from guiderail.models.parts.demonstrator import demonstrator_motions, socket_offsets
 from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
 from guiderail.models.parts.solids import SurfaceLocator
@@ -235,29 +235,35 @@ def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
 
 
 DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are no longer checked [s]
-MAX_SESSIONS = 3  # largest number of sessions of five attempts; they end once five have seated the plug
+MAX_SESSIONS = 3  # largest number of attempts of each demonstration; they end once one has seated the plug
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
     """Write the demonstrations; return how many of them seat the plug."""
     numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
+    press_from = numbers.rim - numbers.press - 1e-3
+    sessions = [demonstrator_motions(seed, script, press_from, times) for seed in range(MAX_SESSIONS)]
     start = time.process_time()
-    seated: list[np.ndarray] = []
-    others: list[np.ndarray] = []
-    for seed in range(MAX_SESSIONS):
-        for motion in demonstrator_motions(seed, script, numbers.rim - numbers.press - 1e-3, times):
-            if len(seated) >= NUM_DEMONSTRATIONS:
-                break
+    chosen: list[np.ndarray] = []
+    seated = 0
+    for attempts, offset in zip(zip(*sessions, strict=True), socket_offsets(), strict=True):
+        for motion in attempts:
             in_time = time.process_time() - start < DEMONSTRATION_SECONDS
-            (seated if in_time and _seats(folder, file, times, motion) else others).append(motion)
-    chosen = (seated + others)[:NUM_DEMONSTRATIONS]
+            if in_time and _seats(folder, file, times, motion, offset):
+                chosen.append(motion)
+                seated += 1
+                break
+        else:
+            chosen.append(attempts[0])
     Demonstrations([times] * len(chosen), chosen, NAMES).save(folder / file.demonstrations.file)
-    return len(seated)
+    return seated
 
 
-def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
-    driven, _ = drive_along(GantryStation(write_workcell(folder, file), time_step=file.time_step), times, motion)
+def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, offset: np.ndarray) -> bool:
+    """Return whether a motion seats the plug in a socket that is displaced by `offset` (x, y) [m]."""
+    in_socket = motion - np.pad(offset, (0, motion.shape[1] - 2))  # on a gantry the same as displacing the socket
+    driven, _ = drive_along(GantryStation(write_workcell(folder, file), time_step=file.time_step), times, in_socket)
     return file.tolerance.accepts(_plug_pose(driven))
 
 

@@ -118,8 +118,10 @@ class PartWorkcell(MovableWorkcell):
 COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
-TIME, Z, CENTER_OF_PRESSURE, COMMAND = 0, 3, slice(13, 15), slice(15, 17)
+TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
 IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
+BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
+FOLLOWING = 3.0  # rate at which the command follows a plug in the socket, per 2 mm of distance [1/s]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
@@ -161,16 +163,19 @@ class PartUncertainty(BncUncertainty):
 
 
 class ScriptedSearch:
-    """Search by the center of pressure: on the rim, the action moves steadily towards the socket's axis.
+    """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
 
-    Before the plug touches the rim and after it has dropped in, the action does not change. An episode starts where the
-    observed time does not increase; the action is then zero. The search integrates the action and not the displacement,
-    because the displacement per action depends on the guidance and changes during the motion.
+    Below the rim, while it is not blocked, the command follows the plug sideways, so that it does not push it against a
+    wall. An episode starts where the observed time does not increase; the action is then zero. The search integrates
+    the action and not the displacement, because the displacement per action depends on the guidance and changes during
+    the motion.
     """
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
         """Construct the policy; `duration` returns the duration of the reference trajectory [s] at each observation."""
         self._file, self._duration = file, duration
+        self._times, poses = file.motion.plan_search()
+        self._heights = poses[:, 2]
         self._time, self._action = np.inf, np.zeros(2)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -188,10 +193,13 @@ class ScriptedSearch:
         self._time = time
         lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
         height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
-        if height > self._file.motion.rim - IN_SOCKET and length > 0.0:
-            search = self._file.search
-            change = search.lever_sign * search.speed * passed * lever / max(length, MM)
-            self._action = np.clip(self._action + change, -1.0, 1.0)
+        on_rim, search = height > self._file.motion.rim - IN_SOCKET, self._file.search
+        change = np.zeros(2)
+        if length > 0.0 and (on_rim or height - np.interp(time, self._times, self._heights) > BLOCKED):
+            change = search.lever_sign * search.speed * lever / max(length, MM)
+        elif not on_rim:
+            change = FOLLOWING * (observation[POSITION] - observation[COMMAND])
+        self._action = np.clip(self._action + passed * change, -1.0, 1.0)
         return self._action.copy()
 
 
