@@ -15,14 +15,14 @@ TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # height above and below the rim [m], a
 TURN_SPEED = 45.0 * DEGREE  # [rad/s]
 SEARCH = 1.8  # time on the rim [s]
 PAUSE = 0.3  # time after each part of the motion [s]
-NUM_DEMONSTRATIONS = 5
-SPREAD = 1.5 * MM  # distance from the nominal place at which the sockets of the demonstrations are, on a circle [m]
+NUM_DEMONSTRATIONS = 10  # with five, the variance changes by a factor of four along the search
+SPREAD = 1.7 * MM  # distance from the nominal place at which the sockets of the demonstrations are, on a circle [m]
 
 # Standard deviations of the hand [m, rad]: wide on the rim, narrow where the parts guide the motion.
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
 _NARROW = np.array([0.12 * MM, 0.12 * MM, 0.4 * MM, 0.5 * DEGREE, 0.15 * DEGREE, 0.15 * DEGREE])
 _CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # correlation times of the deviations [s]
-_CENTERING = 0.9  # part of the mean of the five random curves that is removed
+_CENTERING = 0.9  # part of the mean of the random curves that is removed
 
 
 def plan_straight_insertion(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +76,7 @@ def plan_search(travel: float, rim: float, turn: float, push: float, press: floa
 def demonstrator_motions(
     seed: int, script: tuple[np.ndarray, np.ndarray], press_from: float, times: np.ndarray
 ) -> np.ndarray:
-    """Return five different searches (5, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
+    """Return different searches (D, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
     The random deviations are wide while the command is above the height `press_from` [m]. Below it, each search ends at
     a socket of its own (`socket_offsets`), so that the variance of the demonstrations is that of the socket's place,
@@ -90,6 +90,7 @@ def demonstrator_motions(
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
     curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
     wander = curves - _CENTERING * curves.mean(axis=0)
+    wander /= wander.std(axis=0)  # where the curves happened to be close, an action would move little
     nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
     motions = nominal + scale * wander
     motions[:, :, :2] += (1.0 - wide) * socket_offsets()[:, None, :]
@@ -97,7 +98,7 @@ def demonstrator_motions(
 
 
 def socket_offsets() -> np.ndarray:
-    """Return the offsets (x, y) of the sockets of the demonstrations, (5, 2) [m]; their mean is zero."""
+    """Return the offsets (x, y) of the sockets of the demonstrations, (D, 2) [m]; their mean is zero."""
     angles = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS
     return SPREAD * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 

@@ -25,6 +25,7 @@ from guiderail.models.parts.assembly_check import (
     plan_motion,
 )
 from guiderail.models.parts.assembly_check import shrink as shrink_part
+from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
 from guiderail.models.parts.preparation import ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.models.parts.symmetry import find_symmetries
@@ -337,14 +338,14 @@ def _write_task(
     from guiderail.tools.parts.trial import demonstrate, write_preview
 
     duration = float(file.motion.plan_search()[0][-1])
-    log(f"recording demonstrations: about {5.0 * duration / measured['real_time_factor']:.0f} s")
+    log(f"recording demonstrations: about {NUM_DEMONSTRATIONS * duration / measured['real_time_factor']:.0f} s")
     succeeded = demonstrate(folder, file)
     if not succeeded:
         raise InputError(
-            "none of the 5 scripted demonstrations seats the plug: check --plug-pose, --axis, --center and --turn, or "
-            "give a larger --force-limit"
+            f"none of the {NUM_DEMONSTRATIONS} scripted demonstrations seats the plug: check --plug-pose, --axis, "
+            "--center and --turn, or give a larger --force-limit"
         )
-    measured["demonstrations_seated"] = f"{succeeded} of 5"
+    measured["demonstrations_seated"] = f"{succeeded} of {NUM_DEMONSTRATIONS}"
     measured["total_s"] = clock.read()
     file = file.model_copy(update={"measured": measured})
     write_task_file(folder, file)

@@ -24,7 +24,7 @@ from guiderail.tools.evaluation.rollout import rollout
 
 MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates of random actions and of the search in a hard setting
 SEED = 3_000_000  # seed of the first episode, with conditions of training
-REACH = 2.3 * MM  # displacement of the command by an action of 1 at action_scale 1, late in the search [m]
+REACH = 1.9 * MM  # displacement of the command by an action of 1 at action_scale 1 [m]
 MARGIN = 0.75 * MM  # distance from the offset to the bound of commands [m]
 MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # least force limit [N]; force limit over the peak force of an aligned insertion
 MAX_TURN = 3.0  # largest turn of the socket [degrees]

@@ -49,7 +49,7 @@ def test_measured_properties_are_those_of_the_drawing(folder):
     assert measured["inserted"] is True
     assert measured["inserted_1.5_mm_off"] == [False, False]
     assert max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"]) <= 0.05
-    assert measured["demonstrations_seated"] == "5 of 5"
+    assert measured["demonstrations_seated"] == "10 of 10"
     page = (folder / "preview.html").read_text()
     assert "plug" in page
     assert len(page) > 100_000
