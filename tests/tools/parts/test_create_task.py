@@ -235,6 +235,39 @@ def test_scripted_search_integrates_the_center_of_pressure(folder):
         search(observation[:13])
 
 
+def test_scripted_search_below_the_rim(folder):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.diagrams.tasks.part.task import (
+        BLOCKED,
+        CENTER_OF_PRESSURE,
+        COMMAND,
+        FOLLOWING,
+        TIME,
+        ScriptedSearch,
+        Z,
+    )
+
+    file = read_task_file(folder)
+    times, poses = file.motion.plan_search()
+    inserted, duration = 0.5 * file.motion.rim, times[-1]
+    grid = np.arange(0.0, duration, 0.01)
+    time = grid[np.argmax(np.interp(grid, times, poses[:, 2]) < inserted)]  # the demonstrated command is there then
+    search, observation = ScriptedSearch(file, lambda: duration), np.zeros(17)
+    observation[CENTER_OF_PRESSURE] = 1.0, 0.0
+
+    def act(time, height):
+        observation[TIME], observation[Z] = 2.0 * time / duration - 1.0, height / (0.5 * file.motion.travel) - 1.0
+        return search(observation)[0]
+
+    act(0.0, file.motion.travel)
+    act(time - 0.1, inserted)
+    start = act(time - 0.05, inserted)
+    observation[COMMAND] = 0.5, 0.0  # the command is to the right of the plug
+    assert act(time, inserted) - start == pytest.approx(-0.05 * FOLLOWING * 0.5)  # back to the plug
+    start = act(time, inserted)
+    assert act(time + 0.05, inserted + BLOCKED + 1e-3) - start == pytest.approx(-0.05 * file.search.speed)  # blocked
+
+
 def test_options_of_a_created_task_are_listed(folder, capsys):
     call("list", folder)
     assert "offset_range" in capsys.readouterr().out

@@ -1,0 +1,36 @@
+import numpy as np
+
+from guiderail.models.common.transforms import MM
+from guiderail.models.parts.demonstrator import (
+    NUM_DEMONSTRATIONS,
+    SPREAD,
+    demonstrator_motions,
+    plan_search,
+    socket_offsets,
+)
+
+RIM, PRESS = 20.0 * MM, 2.5 * MM
+
+
+def test_the_variance_is_that_of_the_sockets_from_the_rim_down_to_the_target():
+    script = plan_search(30.0 * MM, RIM, 0.0, 4.0 * MM, PRESS)
+    times = np.arange(0.0, script[0][-1], 0.02)
+    press_from = RIM - PRESS - 1.0 * MM
+    motions = demonstrator_motions(0, script, press_from, times)
+    assert motions.shape == (NUM_DEMONSTRATIONS, len(times), 6)
+    heights = np.interp(times, script[0], script[1][:, 2])
+    inserted = heights < press_from - 3.0 * MM
+    assert inserted.sum() > 20
+    np.testing.assert_allclose(motions[:, inserted, :2].mean(axis=1), socket_offsets(), atol=0.3 * MM)
+    deviations = motions[:, :, :2].std(axis=0)
+    assert deviations.min() > 0.5 * SPREAD / np.sqrt(2.0)  # an action reaches far at every time
+    assert deviations.max() < 1.6 * SPREAD / np.sqrt(2.0)
+    np.testing.assert_allclose(socket_offsets().mean(axis=0), 0.0, atol=1e-12)
+
+
+def test_motions_depend_on_the_seed_alone():
+    script = plan_search(30.0 * MM, RIM, 0.5, 4.0 * MM, PRESS)
+    times = np.arange(0.0, script[0][-1], 0.02)
+    first, again, other = (demonstrator_motions(seed, script, RIM, times) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0.1 * MM
