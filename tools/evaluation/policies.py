@@ -11,7 +11,6 @@ import json
 import sys
 import zipfile
 from collections.abc import Callable, Mapping
-from functools import partial
 from importlib import import_module
 from itertools import product
 from pathlib import Path
@@ -366,8 +365,3 @@ def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapp
         return is_compatible(lambda env: policy, env)
     finally:
         env.close()
-
-
-def learned_policy(folder: Path, learned_in: Mapping[str, Any]) -> Callable[[gymnasium.Env], PolicyFn]:
-    """Return a function from an environment, not necessarily the run's own, to the run's policy."""
-    return partial(check_compatible, Policy.load(folder), learned_in=learned_in)

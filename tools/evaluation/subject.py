@@ -16,15 +16,10 @@ import gymnasium
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
 from guiderail.tools.evaluation.cache import policy_digest
-from guiderail.tools.evaluation.policies import (
-    as_policy,
-    check_compatible,
-    is_policy_file,
-    learned_policy,
-    load_policy,
-)
+from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
 from guiderail.tools.evaluation.rollout import PolicyFn, is_compatible
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
@@ -126,7 +121,8 @@ def find_subject(
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
         run_config = folder.config()
-        make_policy = learned_policy(folder.path, run_config.environment)
+        # The environment is not necessarily the run's own.
+        make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder))
     from guiderail.tools.learning.train import configure

@@ -18,6 +18,15 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 
 
+class SpacesOnlyEnv(gymnasium.Env):
+    """Environment with the spaces of another one and nothing else, to send to another process."""
+
+    def __init__(self, env: gymnasium.Env, observation_space: spaces.Box | None = None):
+        """Copy the spaces of `env`, with another observation space if one is given."""
+        self.observation_space, self.action_space = observation_space or env.observation_space, env.action_space
+        self.privileged_space = getattr(env.unwrapped, "privileged_space", None)
+
+
 class FirstEntries(BaseFeaturesExtractor):
     """Feature extractor of an actor: the first entries of the critics' larger observation."""
 
@@ -72,10 +81,8 @@ def observe_privileged(
     if not hasattr(policy, "make_actor"):
         raise InputError(f"{algorithm.__name__} has no critic apart from its actor: leave privileged_critic out")
     base.observes_privileged = True
-    critic = gymnasium.Env()
-    critic.action_space = env.action_space
     infinite = np.full(observed.shape[0] + hidden.shape[0], np.inf, np.float32)
-    critic.observation_space = spaces.Box(-infinite, infinite)
+    critic = SpacesOnlyEnv(env, spaces.Box(-infinite, infinite))
     return critic, asymmetric_policy(policy, observed.shape[0]), hidden.shape[0]
 
 
