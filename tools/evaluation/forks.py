@@ -76,7 +76,7 @@ class Forks:
         try:
             connection.send(argument)
         except (BrokenPipeError, ConnectionError):
-            raise _killed_error() from None
+            raise KilledError from None
         self._busy.append(connection)
 
     def collect(self, timeout: float | None = None) -> list[Any]:
@@ -91,7 +91,7 @@ class Forks:
             try:
                 result, error, text = pickle.loads(connection.recv_bytes())
             except (EOFError, ConnectionError):
-                raise _killed_error() from None
+                raise KilledError from None
             if error is not None:
                 error.add_note(text)
                 raise error
@@ -142,9 +142,8 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
 class KilledError(RuntimeError):
     """Error for a fork that was killed."""
 
-
-def _killed_error() -> KilledError:
-    return KilledError("a process that simulated episodes was killed: give fewer processes, or more memory")
+    def __init__(self) -> None:
+        super().__init__("a process that simulated episodes was killed: give fewer processes, or more memory")
 
 
 def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequence[Connection], parent: int) -> None:

@@ -34,11 +34,7 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Refuse another guidance than a policy was trained with, because it defines what actions mean.
-
-    Raises:
-        InputError: If the guidance differs between the options of the training and those of the environment.
-    """
+    """Raise an InputError if an environment has another guidance than the training, which defines what actions mean."""
     trained, used = own.get("guidance"), other.get("guidance")
     if trained != used:
         raise InputError(

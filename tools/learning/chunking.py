@@ -1,7 +1,7 @@
 """Chunk cloning: an ensemble that is regressed on the commanded poses that follow an observation (ACT's objective)."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -39,7 +39,7 @@ class ChunkLearner(BcLearner):
         super().__init__(config, env, **arguments)
         if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
             raise InputError("chunk reads the commands of its own environment: leave pipelined and num_envs out")
-        self._env: Any = env.unwrapped
+        self._env = cast(Any, env.unwrapped)
         dims = self._env.task.declaration.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)
         self._seen: list[np.ndarray] = []  # observations of the episode

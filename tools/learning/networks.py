@@ -197,16 +197,6 @@ class DetachedFeatures(BaseFeaturesExtractor):
         super().__init__(observation_space, features.features_dim)
         self.features: Any = features
 
-    @property
-    def pool(self) -> int:
-        """Side of the averaged squares of the shared extractor [pixels]."""
-        return int(self.features.pool)
-
-    @property
-    def convolutions(self) -> Any:
-        """Convolutions of the shared extractor."""
-        return self.features.convolutions
-
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Map observations to features."""
         with torch.no_grad():
@@ -273,6 +263,7 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
     features = actor.features_extractor
+    features = features.features if isinstance(features, DetachedFeatures) else features
     encoder = [_arrays(one) for one in getattr(features, "convolutions", ())]
     pool = {"pool": getattr(features, "pool", 1)}
     return export_layers(layers, actor.action_space, {**pool, "squash": "tanh", **description}, encoder)

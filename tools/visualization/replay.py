@@ -112,7 +112,9 @@ class Motion(EnvCallback):
         # The tolerance is far below a step of the simulation, and far above rounding errors.
         if time > len(self._poses) * self._period - 1e-6:
             query = self._eval_query(root)
-            self._poses.append(np.array([_pose(query.GetPoseInWorld(frame)) for frame in self._frames.values()]))
+            poses = [query.GetPoseInWorld(frame) for frame in self._frames.values()]
+            numbers = [[*X.translation(), *X.rotation().ToQuaternion().wxyz()] for X in poses]
+            self._poses.append(np.array(numbers))
         return EventStatus.DidNothing()
 
 
@@ -125,10 +127,6 @@ def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple
 def state_names(task: Any) -> Sequence[str]:
     """Return the names of the states of a task's template, in order; empty without a template."""
     return [state.name for state in task.template().template.states] if "template" in type(task).provides() else []
-
-
-def _pose(X_WF: Any) -> list[float]:
-    return [*X_WF.translation(), *X_WF.rotation().ToQuaternion().wxyz()]
 
 
 def _encode(poses: np.ndarray) -> str:
