@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.environments import changed_environment, make_environment
+from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import (
     BASELINES_FOLDER,
@@ -41,7 +41,6 @@ from guiderail.tools.evaluation.subject import (
     evaluation_scope,
     find_subject,
     make_baselines,
-    refuse_guidance_change,
 )
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
@@ -140,14 +139,11 @@ def evaluate_run(
     observation or action shape does not match the environment has no rows. Further arguments are those of
     `evaluate_policy`.
     """
-    env = make_environment(config.task, config.environment if environment is None else environment)
-    try:
+    with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
         if skips_incompatible and not is_compatible(make_policy, env):
             return pd.DataFrame()
         return evaluate_policy(env, make_policy(env), **how)
-    finally:
-        env.close()
 
 
 def evaluate_once(
@@ -243,10 +239,8 @@ def evaluate(
             )
         where, scope = {}, "seeds of the environment as it was given"
     else:
-        where = changed_environment(config.task, config.environment, environment or {})
+        where = subject.changed_environment(environment or {})
         scope = evaluation_scope(config.task, where, resample_offsets)
-        if folder is not None:
-            refuse_guidance_change(config.environment, where)
     if resample_offsets and config is not None:
         how["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed
@@ -256,8 +250,10 @@ def evaluate(
             )
     others = {"demonstration": zero_policy} if is_demonstrated(where.get("guidance")) else {}
     others |= make_baselines(config, where, baselines)
-    evaluation_env = make_environment(config.task, where) if config is not None else cast(gymnasium.Env, env)
-    try:
+    opened: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
+    if config is not None:
+        opened = closing(make_environment(config.task, where))
+    with opened as evaluation_env:
         if config is not None:
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         files = {name: _episodes_file(subject, name, where, how) for name in (POLICY, *others)}
@@ -282,9 +278,6 @@ def evaluate(
                 motions = kept
             if (file := files[name]) is not None:
                 write_atomically(file, table_text(rows).encode())
-    finally:
-        if config is not None:
-            evaluation_env.close()
     rows_of = {name: evaluated[name] for name in (POLICY, *others) if name in evaluated}
     counts = config is None or counts_collisions(config.task)
     result = {"evaluation_scope": scope, **_statistics(rows_of, counts), "baselines": [*rows_of][1:]}

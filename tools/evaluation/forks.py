@@ -12,6 +12,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -123,10 +124,9 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
     if processes < 2 or not can_fork():
         yield from map(compute, range(count))
         return
-    forks = Forks(lambda index: (index, compute(index)), processes)
     results: dict[int, Result] = {}
     assigned, given = 0, 0
-    try:
+    with closing(Forks(lambda index: (index, compute(index)), processes)) as forks:
         while given < count:
             while forks.has_idle and assigned < count:
                 forks.submit(assigned)
@@ -135,8 +135,6 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
             while given in results:
                 yield results.pop(given)
                 given += 1
-    finally:
-        forks.close()
 
 
 class KilledError(RuntimeError):

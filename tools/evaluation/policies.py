@@ -12,7 +12,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -348,11 +348,9 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
         {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
         for combination in product(*values.values())
     ]
-    result: list[str] = []
-    for changes in sorted(candidates, key=len):
-        if changes and len(result) < _MAX_FITTING and _fits(policy, task, options, changes):
-            result.append(" --env ".join(f"{name}={value}" for name, value in changes.items()))
-    return result
+    fitting = (one for one in sorted(candidates, key=len) if one and _fits(policy, task, options, one))
+    texts = (" --env ".join(f"{name}={value}" for name, value in changes.items()) for changes in fitting)
+    return list(islice(texts, _MAX_FITTING))
 
 
 def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:

@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import MM
-from guiderail.tools.environments import changed_environment, check_environment
+from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import POLICY
 from guiderail.tools.evaluation.evaluate import evaluate_once
@@ -29,7 +29,6 @@ from guiderail.tools.evaluation.subject import (
     find_subject,
     hides,
     make_baselines,
-    refuse_guidance_change,
 )
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import write_table
@@ -286,10 +285,9 @@ def robustness(
     first, folder = compared[0].config, subjects[0].folder if subjects[0].is_stored else None
     if out is None and (len(policies) > 1 or folder is None):
         raise InputError("give the folder of the table and the picture of several runs, or of no run, with --out")
-    if not isinstance(baselines, Mapping):
-        if baselines is None:
-            baselines = [name for name in default_baselines(first.task, first.environment) if name != "constant"]
-        baselines = make_baselines(first, first.environment, baselines)
+    if baselines is None:
+        baselines = [name for name in default_baselines(first.task, first.environment) if name != "constant"]
+    baselines = make_baselines(first, first.environment, baselines)
     actors = list(compared)
     if is_demonstrated(first.environment.get("guidance")):
         actors.append(_Actor(DEMONSTRATION, zero_policy, first))
@@ -335,10 +333,7 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
         names = [subject.name for subject in subjects]
     if len(set(names)) < len(names):
         raise InputError("runs that are compared are different ones, in folders of different names")
-    changed = [changed_environment(config.task, config.environment, environment) for config in configs]
-    for subject, config, options in zip(subjects, configs, changed, strict=True):
-        if subject.folder is not None:
-            refuse_guidance_change(config.environment, options)
+    changed = [subject.changed_environment(environment) for subject in subjects]
     settings: list[dict[str, Any]] = [
         {"seed": config.seed, **options} for config, options in zip(configs, changed, strict=True)
     ]

@@ -17,6 +17,7 @@ from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import Policy
+from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
 from guiderail.tools.evaluation.cache import policy_digest
 from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
@@ -91,6 +92,14 @@ class Subject:
     folder: RunFolder | None = None  # folder of its run, or None
     is_stored: bool = False  # True if evaluated episodes are stored in the run's folder
     digest: str | None = None  # digest of the policy, for the names of stored files; None for a baseline policy
+
+    def changed_environment(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the environment's options with changes; raise an InputError for another guidance than its run's."""
+        assert self.config is not None
+        changed = changed_environment(self.config.task, self.config.environment, changes)
+        if self.folder is not None:
+            refuse_guidance_change(self.config.environment, changed)
+        return changed
 
 
 def find_subject(

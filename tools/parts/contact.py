@@ -139,7 +139,7 @@ def choose_contact(
                 report(f"{name}: Drake refuses its contact geometry ({refusal})")
             else:
                 choices += _adapt_settings(folder, contact, make_file, allowed, log)
-                if all(rank(max(choices, key=lambda one: rank(one, allowed)), allowed)[:3]):
+                if all(max(rank(choice, allowed) for choice in choices)[:3]):
                     break
             start = cpu_time()
         if any(choice.aligned.success for choice in choices):

@@ -147,12 +147,8 @@ TEMPLATE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=T
 TRANSPARENCY = 0.35  # opacity of bodies when the page shows them transparent
 EPISODES = 4  # number of held-out episodes
 
-GREY, BLACK, GREEN, RED = (
-    (0.55, 0.55, 0.6, 0.8),
-    (0.1, 0.1, 0.1, 1.0),
-    (0.1, 0.65, 0.25, 1.0),
-    (0.85, 0.1, 0.1, 1.0),
-)
+GREY, BLACK = (0.55, 0.55, 0.6, 0.8), (0.1, 0.1, 0.1, 1.0)
+GREEN, RED = (0.1, 0.65, 0.25, 1.0), (0.85, 0.1, 0.1, 1.0)
 PALE = 0.3  # opacity of the paths of episodes that are not selected
 
 
