@@ -77,7 +77,6 @@ class EnvCallback(Callback):
     """
 
     def __init__(self, env: gymnasium.Env):
-        """Construct the callback of episodes in `env`."""
         self.env: Any = env
         self.base: Any = env.unwrapped
 

@@ -193,7 +193,6 @@ class DetachedFeatures(BaseFeaturesExtractor):
     """Features of another extractor, without gradients: the actor uses the critic's encoder but does not train it."""
 
     def __init__(self, observation_space: spaces.Box, features: ImageFeatures):
-        """Construct the extractor on `features`."""
         super().__init__(observation_space, features.features_dim)
         self.features: Any = features
 
@@ -236,7 +235,6 @@ class DroppedNormalizedReLU(NormalizedReLU):
     """Dropout, followed by layer normalization and a rectifier (DroQ; Hiraoka et al., 2022)."""
 
     def __init__(self, probability: float):
-        """Construct the module, which drops each feature with a probability in training mode."""
         super().__init__()
         self.dropout = torch.nn.Dropout(probability)
 
