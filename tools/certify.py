@@ -162,11 +162,7 @@ class _Skill:
 
 
 def _find_skill(subject: str, environment: Mapping[str, Any], start_within: float | None) -> _Skill:
-    """Return the skill of a run or a task.
-
-    Raises:
-        InputError: If there is no such run or task, or its guidance cannot be certified.
-    """
+    """Return the skill of a run or a task; raise an InputError if its guidance cannot be certified."""
     task, arguments, about = _find_subject(subject, environment)
     options = check_environment(task, arguments)
     config, guidance = EnvConfig.resolve(task, options), str(options["guidance"])
@@ -199,11 +195,7 @@ def _run_checker(folder: Path, key: Path | None) -> str:
 
 
 def _read_key(key: Path | None) -> bytes | None:
-    """Return the content of a key file.
-
-    Raises:
-        InputError: If the file cannot be read or is too short.
-    """
+    """Return the content of a key file; raise an InputError if it cannot be read or is too short."""
     if key is None:
         return None
     try:
@@ -216,11 +208,7 @@ def _read_key(key: Path | None) -> bytes | None:
 
 
 def _make_loop(config: EnvConfig, start_within: float | None) -> CertifiedLoop:
-    """Build the feedback loop of an environment's primitive.
-
-    Raises:
-        InputError: If an option cannot be certified, or the start offset is negative or not finite.
-    """
+    """Build the feedback loop of an environment's primitive; raise an InputError if an option cannot be certified."""
     demonstrated = make_prior_knowledge(config).demonstrations
     assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
     if demonstrated.motion is not None or demonstrated.progress is not None:

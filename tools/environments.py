@@ -109,11 +109,7 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def check_reset(task: str, options: Mapping[str, Any]) -> None:
-    """Check the reset options of a guiderail task; other environments check theirs in `reset`.
-
-    Raises:
-        InputError: If an option is unknown, or a value has the wrong type or is out of range.
-    """
+    """Raise an InputError if a reset option of a guiderail task is invalid; other environments check their own."""
     if task in TASKS.names():
         validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 

@@ -74,11 +74,9 @@ def _check_ending(path: Path, kind: str, endings: tuple[str, ...]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file, or a new folder, can be written.
+    """Raise an InputError if a file, or a new folder, cannot be written.
 
-    Raises:
-        InputError: If the path is an existing folder, is below a file or a folder without write permission, or is too
-            long.
+    The path may be an existing folder, below a file or a folder without write permission, or too long.
     """
     try:
         if path.is_dir():
@@ -131,11 +129,7 @@ def path_exists(path: Path) -> bool:
 
 
 def check_new(out: Path, what: str) -> None:
-    """Check that a path is new and can be written, before its content is computed; `what` is a noun for the message.
-
-    Raises:
-        InputError: If the path exists, or its folder cannot be written to.
-    """
+    """Raise an InputError if a path exists or cannot be written; `what` is a noun for the message."""
     if path_exists(out):
         raise InputError(f"{out} already exists: name another {what}")
     check_writable(out)

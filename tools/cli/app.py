@@ -31,15 +31,8 @@ def print_progress(text: str) -> None:
 
 def to_json(result: Mapping[str, Any]) -> str:
     """Return a result as JSON, with null for NaN and infinite numbers, which JSON does not have."""
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: convert(item) for key, item in value.items()}
-        if isinstance(value, list | tuple):
-            return [convert(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(convert(result), allow_nan=False, default=str)
+    text = json.dumps(dict(result), default=lambda value: dict(value) if isinstance(value, Mapping) else str(value))
+    return json.dumps(json.loads(text, parse_constant=lambda name: None))
 
 
 def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

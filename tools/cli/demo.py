@@ -10,13 +10,13 @@ import pandas as pd
 from rich.console import Console
 
 from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
-from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Paths, check_seed, rollout
 from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.config import check_episodes
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume
 from guiderail.tools.visualization.curves import draw_passage
@@ -35,8 +35,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     Raises:
         InputError: If the folder contains something else than a demo, or a number is out of range.
     """
-    if episodes < 1:
-        raise InputError(f"a run needs at least one episode, not {episodes}")
+    check_episodes(episodes)
     check_seed(seed)
     _clear(out)
     started = time.perf_counter()

@@ -92,7 +92,6 @@ class _MessageHandler(logging.Handler):
     """Handler that prints messages of the library on standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print the message of a record."""
         print_message(record.getMessage())
 
 

@@ -110,9 +110,9 @@ def train(
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     if num_envs is not None:
         settings["num_envs"] = str(num_envs)
+    if out is None:
+        raise InputError("the run needs a folder: name one with --out RUN")
     if task is not None and not modules and not resume:
-        if out is None:
-            raise InputError("the run needs a folder: name one with --out RUN")
         from guiderail.diagrams.envs.declared import check_declared_options
         from guiderail.tools.files import refuse_existing_run
         from guiderail.tools.learning.config import check_choices
@@ -137,8 +137,6 @@ def train(
         if (warning := warn_of_deviation(task, environment)) is not None:
             print_message(warning)
     if cli.is_hardware(environment.get("station")):
-        if out is None:
-            raise InputError("the run needs a folder: name one with --out RUN")
         if human_in_the_loop:
             raise InputError("training on hardware has no human in the loop: leave --human-in-the-loop out")
         if settings.get("num_envs", "0") != "0":
@@ -178,7 +176,6 @@ def train(
         log=log or (),
         pictures=pictures is not False,
         make_supervisor=_wait_for_supervisor if human_in_the_loop else None,
-        find_demonstrator=_scripted_policy,
     )
     print_result(run.summary, as_json)
 
@@ -201,13 +198,6 @@ def _wait_for_supervisor() -> Any:
     supervisor = MeshcatSupervisor(print_progress)
     supervisor.wait()
     return supervisor
-
-
-def _scripted_policy(task: str) -> Any:
-    """Return the scripted policy of a task, which demonstrates it to a learner."""
-    from guiderail.tools.evaluation.baselines import make_baseline
-
-    return make_baseline(task, "scripted")
 
 
 @cli.command("demo --out demo")

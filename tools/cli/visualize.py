@@ -1,8 +1,7 @@
 """`guiderail visualize` and `guiderail report`."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -38,10 +37,16 @@ def visualize(
     from guiderail.tools.files import check_picture, check_video
     from guiderail.tools.visualization.camera import write_image, write_video
     from guiderail.tools.visualization.curves import plot_run
+    from guiderail.tools.visualization.episode_spec import EpisodeSpec
     from guiderail.tools.visualization.replay import default_page, write_page
 
     environment = cli.parse_environment(env, station=station)
-    episode = _episode(subject, policy, environment, seed, imports, task, trust_policy)
+    name = cli.find_task(subject, imports)[0]
+    if task is not None:
+        task = cli.find_task(task)[0]
+    elif not Path(name).is_dir() and name in cli.CHOICES["tasks"]():
+        name, task = policy, name
+    episode = EpisodeSpec.of_policy(name, environment, seed, task=task, trust_policy=trust_policy)
     if image is not None:
         check_picture(image)
     if video is not None:
@@ -57,26 +62,6 @@ def visualize(
         if path is not None:
             write(path, episode)
             typer.echo(path)
-
-
-def _episode(
-    subject: str,
-    policy: str,
-    environment: Mapping[str, Any],
-    seed: int,
-    imports: Sequence[str] | None,
-    task: str | None,
-    trust_policy: bool,
-) -> Any:
-    """Return the specification of an episode: of a run or another policy, or of a task with a baseline policy."""
-    from guiderail.tools.visualization.episode_spec import EpisodeSpec
-
-    name = cli.find_task(subject, imports)[0]
-    if task is None and not Path(name).is_dir() and name in cli.CHOICES["tasks"]():
-        name, task = policy, name
-    elif task is not None:
-        task = cli.find_task(task)[0]
-    return EpisodeSpec.of_policy(name, environment, seed, task=task, trust_policy=trust_policy)
 
 
 @cli.command("report studies --out report.html")

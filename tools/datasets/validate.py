@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.tasks.part.file import Bounds, PartTaskFile, read_task_file, write_task_file
+from guiderail.diagrams.tasks.part.file import Bounds, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, compute_bounds
@@ -19,7 +19,6 @@ from guiderail.tools.files import (
     ENDINGS,
     check_new,
     check_picture,
-    check_writable,
     load_demonstrations,
     path_exists,
     write_atomically,
@@ -60,12 +59,14 @@ def fit_bounds(
         if not path_exists(out) and not out.parent.is_dir():
             raise InputError(f"there is no folder {out.parent}: make it first")
         check_new(out, "file")
-        check_writable(out)
     demonstrations = load_demonstrations(file)
     bounds = compute_bounds(demonstrations, phases, margin, min_margin, outputs)
     values = as_values(bounds)
     # The new task file is validated before anything is written, and written last, after the other files succeeded.
-    task_file = None if task is None else _with_bounds(task, values)
+    task_file = None
+    if task is not None:
+        task_file = read_task_file(task)
+        task_file = task_file.model_copy(update={"bounds": validate_options(Bounds, values, str(task))})
     if draw is not None:
         _draw(bounds, demonstrations, draw)
     if out is not None:
@@ -93,11 +94,6 @@ def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
 
     values: dict[str, Any] = {"lower": plain(bounds.lower), "upper": plain(bounds.upper)}
     return values | ({"phases": bounds.phases.tolist()} if len(bounds.phases) > 1 else {})
-
-
-def _with_bounds(folder: Path, values: dict[str, Any]) -> PartTaskFile:
-    """Return the task file of a folder with its bounds replaced."""
-    return read_task_file(folder).model_copy(update={"bounds": validate_options(Bounds, values, str(folder))})
 
 
 def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> None:
@@ -201,19 +197,18 @@ def _default_deviation(common: Demonstrations) -> dict[str, Any]:
     """Return the deviation of a default primitive from resampled demonstrations, and a remark if it is large."""
     from guiderail.models.primitives.deviation import describe_deviation, measure_deviation
 
-    outputs = np.stack(common.outputs)
     components = min(_MAX_COMPONENTS, len(common.times[0]) // 4)
     if components < 1:
         return {}
-    floor = _variance_floor(outputs.reshape(-1, outputs.shape[-1]))
-    reference = _fit_reference(common, components, floor)
+    reference = _fit_reference(common, components)
     deviation, miss = measure_deviation(reference, SquaredExponential(), lambda_=6.0, beta=6.0, horizon=40)
     remark = {} if deviation <= 1.0 else {"remark": describe_deviation(deviation, miss)}
     return {"default_deviation": float(f"{deviation:.4g}"), **remark}
 
 
-def _fit_reference(common: Demonstrations, components: int | None, floor: np.ndarray) -> ReferenceTrajectory:
-    """Return the reference of demonstrations; for a single one `floor` (O,) is its standard deviation."""
+def _fit_reference(common: Demonstrations, components: int | None) -> ReferenceTrajectory:
+    """Return the reference of demonstrations; a single one has the standard deviation `_variance_floor`."""
+    floor = _variance_floor(common)
     if common.num_demonstrations == 1:
         return ReferenceTrajectory.from_demonstrations(common, components, prior_std=floor)
     return ReferenceTrajectory.from_demonstrations(common, components, floor=floor)
@@ -227,8 +222,7 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
     """
     from guiderail.models.primitives.fit import fit
 
-    floor = _variance_floor(np.concatenate(demonstrations.outputs))
-    chosen = fit(demonstrations, floor=floor)
+    chosen = fit(demonstrations, floor=_variance_floor(demonstrations))
     share = estimated_share(chosen.reference, SquaredExponential(), lambda_=6.0, beta=6.0)
     verdict = "follows the demonstrations" if share >= MIN_SHARE else "LEAVES the demonstrations: use these values"
     return {
@@ -245,9 +239,7 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     """Draw resampled demonstrations, the mean and two standard deviations of the reference, and the range."""
     from guiderail.tools.visualization.style import new_figure, save_figure
 
-    outputs = np.stack(common.outputs)
-    floor = _variance_floor(outputs.reshape(-1, outputs.shape[-1]))
-    reference = _fit_reference(common, None, floor)
+    outputs, reference = np.stack(common.outputs), _fit_reference(common, None)
     figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))
     for o, (axis, name) in enumerate(zip(axes[:, 0], common.names, strict=True)):
         axis.plot(common.times[0], outputs[..., o].T, color="0.6", linewidth=0.8)
@@ -261,9 +253,9 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     save_figure(figure, picture)
 
 
-def _variance_floor(samples: np.ndarray) -> np.ndarray:
+def _variance_floor(demonstrations: Demonstrations) -> np.ndarray:
     """Return a floor (O,) of the standard deviation: demonstrations that agree exactly have a singular covariance."""
-    return 1e-3 * np.maximum(np.ptp(samples, axis=0), 1e-9)
+    return 1e-3 * np.maximum(np.ptp(np.concatenate(demonstrations.outputs), axis=0), 1e-9)
 
 
 TEMPLATE_ENDINGS = (".yaml", ".yml")

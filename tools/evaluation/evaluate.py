@@ -1,8 +1,8 @@
 """Evaluation of a policy on held-out episodes, together with baseline policies."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.environments import changed_environment, make_environment
+from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import (
     BASELINES_FOLDER,
@@ -22,7 +22,6 @@ from guiderail.tools.evaluation.cache import (
     POLICY_FOLDER,
     episodes_file,
     load_or_compute,
-    policy_digest,
 )
 from guiderail.tools.evaluation.evaluation import COLLISIONS, LABELS, Evaluation, compare, statistics
 from guiderail.tools.evaluation.forks import check_processes, forked_map
@@ -42,7 +41,6 @@ from guiderail.tools.evaluation.subject import (
     evaluation_scope,
     find_subject,
     make_baselines,
-    refuse_guidance_change,
 )
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
@@ -131,19 +129,21 @@ def evaluate_run(
     config: RunConfig,
     make_policy: MakePolicy,
     environment: Mapping[str, Any] | None = None,
+    *,
+    skips_incompatible: bool = False,
     **how: Any,
 ) -> pd.DataFrame:
     """Evaluate a policy in a run's environment, or with other environment options; return the episodes' rows.
 
-    Hidden values that are constant in a run are the same as in its training. Further arguments are those of
+    Hidden values that are constant in a run are the same as in its training. With `skips_incompatible`, a policy whose
+    observation or action shape does not match the environment has no rows. Further arguments are those of
     `evaluate_policy`.
     """
-    env = make_environment(config.task, config.environment if environment is None else environment)
-    try:
+    with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
+        if skips_incompatible and not is_compatible(make_policy, env):
+            return pd.DataFrame()
         return evaluate_policy(env, make_policy(env), **how)
-    finally:
-        env.close()
 
 
 def evaluate_once(
@@ -165,23 +165,9 @@ def evaluate_once(
         Rows of the episodes, or None if the policy's observation or action shape does not match the environment.
     """
     file = episodes_file(folder, name, config, environment, about=about, **how)
-    how.setdefault("label", name)
-    try:
-        return load_or_compute(
-            file, partial(evaluate_run, config, partial(_make_compatible, make_policy), environment, **how)
-        )
-    except _IncompatibleError:
-        return None
-
-
-class _IncompatibleError(Exception):
-    """Error for a policy whose observation or action shape does not match the environment."""
-
-
-def _make_compatible(make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:
-    if not is_compatible(make_policy, env):
-        raise _IncompatibleError
-    return make_policy(env)
+    how = {"label": name, "skips_incompatible": True, **how}
+    rows = load_or_compute(file, partial(evaluate_run, config, make_policy, environment, **how))
+    return rows if len(rows) else None
 
 
 def evaluate(
@@ -253,10 +239,8 @@ def evaluate(
             )
         where, scope = {}, "seeds of the environment as it was given"
     else:
-        where = changed_environment(config.task, config.environment, environment or {})
+        where = subject.changed_environment(environment or {})
         scope = evaluation_scope(config.task, where, resample_offsets)
-        if folder is not None:
-            refuse_guidance_change(config.environment, where)
     if resample_offsets and config is not None:
         how["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed
@@ -266,18 +250,18 @@ def evaluate(
             )
     others = {"demonstration": zero_policy} if is_demonstrated(where.get("guidance")) else {}
     others |= make_baselines(config, where, baselines)
-    evaluation_env = make_environment(config.task, where) if config is not None else cast(gymnasium.Env, env)
-    try:
+    opened: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
+    if config is not None:
+        opened = closing(make_environment(config.task, where))
+    with opened as evaluation_env:
         if config is not None:
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
-        stored = _stored_baselines(subject, others, where, how)
-        skipped = [
-            name for name, make in others.items() if name not in stored and not is_compatible(make, evaluation_env)
-        ]
+        files = {name: _episodes_file(subject, name, where, how) for name in (POLICY, *others)}
+        stored = {name: read_table(file) for name in others if (file := files[name]) is not None and file.exists()}
+        missing = {name: make for name, make in others.items() if name not in stored}
+        skipped = [name for name, make in missing.items() if not is_compatible(make, evaluation_env)]
         policies = {POLICY: subject.make_policy(evaluation_env)}
-        policies |= {
-            name: make(evaluation_env) for name, make in others.items() if name not in stored and name not in skipped
-        }
+        policies |= {name: make(evaluation_env) for name, make in missing.items() if name not in skipped}
         labels = {
             name: f"series {number} of {1 + len(others)}: {LABELS.get(name, name)}"
             for number, name in enumerate((POLICY, *others), start=1)
@@ -292,10 +276,8 @@ def evaluate(
             evaluated[name] = rows
             if name == POLICY:
                 motions = kept
-            _store(subject, name, rows, where, how)
-    finally:
-        if config is not None:
-            evaluation_env.close()
+            if (file := files[name]) is not None:
+                write_atomically(file, table_text(rows).encode())
     rows_of = {name: evaluated[name] for name in (POLICY, *others) if name in evaluated}
     counts = config is None or counts_collisions(config.task)
     result = {"evaluation_scope": scope, **_statistics(rows_of, counts), "baselines": [*rows_of][1:]}
@@ -319,33 +301,19 @@ def _check_saved(save: Path | None, signal: str) -> None:
         check_new(save, "file")
 
 
-def _stored_baselines(
-    subject: Subject, names: Iterable[str], environment: Mapping[str, Any], how: Mapping[str, Any]
-) -> dict[str, pd.DataFrame]:
-    """Return the rows of baseline policies that are stored in the run's folder."""
-    files = {name: _baseline_file(subject, name, environment, how) for name in names}
-    return {name: read_table(file) for name, file in files.items() if file is not None and file.exists()}
+def _episodes_file(subject: Subject, name: str, environment: Mapping[str, Any], how: Mapping[str, Any]) -> Path | None:
+    """Return the file in the run's folder that stores a policy's episodes; None if they are not stored.
 
-
-def _baseline_file(subject: Subject, name: str, environment: Mapping[str, Any], how: Mapping[str, Any]) -> Path | None:
-    if subject.folder is None or subject.config is None or not subject.is_stored:
+    Those of the run's own policy are stored only if they are evaluated in the run's own environment.
+    """
+    folder, config = subject.folder, subject.config
+    if folder is None or config is None or not subject.is_stored:
         return None
-    return episodes_file(subject.folder.path / BASELINES_FOLDER, name, subject.config, environment, **how)
-
-
-def _store(
-    subject: Subject, name: str, rows: pd.DataFrame, environment: Mapping[str, Any], how: Mapping[str, Any]
-) -> None:
-    """Store evaluated episodes in the run's folder; those of its policy only if evaluated in the run's environment."""
-    file = _baseline_file(subject, name, environment, how)
-    if file is None or subject.folder is None or subject.config is None:
-        return
-    if name == POLICY:
-        if environment != subject.config.environment or "options" in how:
-            return
-        about, folder = policy_digest(subject.folder), subject.folder.path / POLICY_FOLDER
-        file = episodes_file(folder, POLICY, subject.config, environment, about=about, **how)
-    write_atomically(file, table_text(rows).encode())
+    if name != POLICY:
+        return episodes_file(folder.path / BASELINES_FOLDER, name, config, environment, **how)
+    if environment != config.environment or "options" in how:
+        return None
+    return episodes_file(folder.path / POLICY_FOLDER, POLICY, config, environment, about=subject.digest, **how)
 
 
 def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any]:

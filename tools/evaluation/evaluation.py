@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import pandas as pd
 from scipy import stats
 
 from guiderail.tools.evaluation.cache import POLICY
-from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, summary
+from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE
 
 COMPARED = (
     "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "max_commanded_violation",
@@ -119,13 +120,9 @@ def _mcnemar(won: Any, other: Any) -> float:
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
-    """Return the statistics `COMPARED` of episodes; None for a statistic whose column the rows lack."""
-    if not len(rows):
-        return summary(rows, COMPARED, prefix)
-    result: dict[str, Any] = {}
-    for name in COMPARED:
-        try:
+    """Return the statistics `COMPARED` of episodes; None without rows, and where the rows lack a column."""
+    result: dict[str, Any] = dict.fromkeys(prefix + name for name in COMPARED)
+    for name in COMPARED if len(rows) else ():
+        with suppress(KeyError):
             result[prefix + name] = STATISTICS[name].compute(rows)
-        except KeyError:
-            result[prefix + name] = None
     return result

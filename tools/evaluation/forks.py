@@ -12,6 +12,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -76,7 +77,7 @@ class Forks:
         try:
             connection.send(argument)
         except (BrokenPipeError, ConnectionError):
-            raise _killed_error() from None
+            raise KilledError from None
         self._busy.append(connection)
 
     def collect(self, timeout: float | None = None) -> list[Any]:
@@ -91,7 +92,7 @@ class Forks:
             try:
                 result, error, text = pickle.loads(connection.recv_bytes())
             except (EOFError, ConnectionError):
-                raise _killed_error() from None
+                raise KilledError from None
             if error is not None:
                 error.add_note(text)
                 raise error
@@ -123,10 +124,9 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
     if processes < 2 or not can_fork():
         yield from map(compute, range(count))
         return
-    forks = Forks(lambda index: (index, compute(index)), processes)
     results: dict[int, Result] = {}
     assigned, given = 0, 0
-    try:
+    with closing(Forks(lambda index: (index, compute(index)), processes)) as forks:
         while given < count:
             while forks.has_idle and assigned < count:
                 forks.submit(assigned)
@@ -135,16 +135,13 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
             while given in results:
                 yield results.pop(given)
                 given += 1
-    finally:
-        forks.close()
 
 
 class KilledError(RuntimeError):
     """Error for a fork that was killed."""
 
-
-def _killed_error() -> KilledError:
-    return KilledError("a process that simulated episodes was killed: give fewer processes, or more memory")
+    def __init__(self) -> None:
+        super().__init__("a process that simulated episodes was killed: give fewer processes, or more memory")
 
 
 def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequence[Connection], parent: int) -> None:

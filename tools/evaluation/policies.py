@@ -11,9 +11,8 @@ import json
 import sys
 import zipfile
 from collections.abc import Callable, Mapping
-from functools import partial
 from importlib import import_module
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -349,11 +348,9 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
         {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
         for combination in product(*values.values())
     ]
-    result: list[str] = []
-    for changes in sorted(candidates, key=len):
-        if changes and len(result) < _MAX_FITTING and _fits(policy, task, options, changes):
-            result.append(" --env ".join(f"{name}={value}" for name, value in changes.items()))
-    return result
+    fitting = (one for one in sorted(candidates, key=len) if one and _fits(policy, task, options, one))
+    texts = (" --env ".join(f"{name}={value}" for name, value in changes.items()) for changes in fitting)
+    return list(islice(texts, _MAX_FITTING))
 
 
 def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:
@@ -366,8 +363,3 @@ def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapp
         return is_compatible(lambda env: policy, env)
     finally:
         env.close()
-
-
-def learned_policy(folder: Path, learned_in: Mapping[str, Any]) -> Callable[[gymnasium.Env], PolicyFn]:
-    """Return a function from an environment, not necessarily the run's own, to the run's policy."""
-    return partial(check_compatible, Policy.load(folder), learned_in=learned_in)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import MM
-from guiderail.tools.environments import changed_environment, check_environment
+from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.cache import POLICY
 from guiderail.tools.evaluation.evaluate import evaluate_once
@@ -29,7 +29,6 @@ from guiderail.tools.evaluation.subject import (
     find_subject,
     hides,
     make_baselines,
-    refuse_guidance_change,
 )
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import write_table
@@ -187,11 +186,11 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     columns = min(COLUMNS, len(axes))
     bands = -(-len(axes) // columns)
     size = (max(3.2 * columns, 6.4, 1.6 * table["policy"].nunique()), 3.6 * bands + 0.5)
-    figure, panels = new_figure(2 * bands, columns, size)
+    figure, grid = new_figure(2 * bands, columns, size)
+    panels = grid.reshape(bands, 2, columns).swapaxes(1, 2).reshape(-1, 2)  # success and force of each axis
     colors = dict(zip(dict.fromkeys(table["policy"]), COLORS * 9, strict=False))
     order = {name: position for position, name in enumerate(colors)}
-    for number, name in enumerate(axes):
-        success, force = (panels[2 * (number // columns) + part, number % columns] for part in (0, 1))
+    for number, (name, (success, force)) in enumerate(zip(axes, panels, strict=False)):
         of_axis = table[table["axis"] == name]
         positions = {value: position for position, value in enumerate(dict.fromkeys(of_axis["value"]))}
         for policy, of_policy in of_axis.groupby("policy", sort=False):
@@ -215,9 +214,8 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
         if number % columns == 0:
             success.set_ylabel("success rate")
             force.set_ylabel("peak force [N]")
-    for number in range(len(axes), bands * columns):
-        for part in (0, 1):
-            panels[2 * (number // columns) + part, number % columns].set_axis_off()
+    for panel in panels[len(axes) :].flat:
+        panel.set_axis_off()
     legend(figure, panels[0, 0])
     return save_figure(figure, path)
 
@@ -233,9 +231,8 @@ class _Actor:
 
     name: str  # name in the table
     make_policy: MakePolicy  # function from an environment to the policy
-    config: RunConfig  # configuration of the run
-    # Options of the environment at every point, including the changes given to `robustness`.
-    environment: Mapping[str, Any]
+    # Configuration of the run; its environment has the changes given to `robustness`.
+    config: RunConfig
     about: str | None = None  # digest of a learned policy
 
 
@@ -285,19 +282,18 @@ def robustness(
     check_processes(processes)
     subjects = [find_subject(policy, task, environment, trust_policy=trust_policy) for policy in policies]
     compared = _actors(subjects, dict(environment or {}), log)
-    first, folder = compared[0], subjects[0].folder if subjects[0].is_stored else None
+    first, folder = compared[0].config, subjects[0].folder if subjects[0].is_stored else None
     if out is None and (len(policies) > 1 or folder is None):
         raise InputError("give the folder of the table and the picture of several runs, or of no run, with --out")
-    if not isinstance(baselines, Mapping):
-        if baselines is None:
-            baselines = [name for name in default_baselines(first.config.task, first.environment) if name != "constant"]
-        baselines = make_baselines(first.config, first.environment, baselines)
+    if baselines is None:
+        baselines = [name for name in default_baselines(first.task, first.environment) if name != "constant"]
+    baselines = make_baselines(first, first.environment, baselines)
     actors = list(compared)
     if is_demonstrated(first.environment.get("guidance")):
-        actors.append(_Actor(DEMONSTRATION, zero_policy, first.config, first.environment))
+        actors.append(_Actor(DEMONSTRATION, zero_policy, first))
     for name, make_policy in baselines.items():
         if name != "zero" or len(actors) == len(compared):
-            actors.append(_Actor(name, make_policy, first.config, first.environment))
+            actors.append(_Actor(name, make_policy, first))
     if out is None:
         assert folder is not None
         out = folder.path / "robustness" / str(first.environment.get("station", ""))
@@ -337,10 +333,7 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
         names = [subject.name for subject in subjects]
     if len(set(names)) < len(names):
         raise InputError("runs that are compared are different ones, in folders of different names")
-    changed = [changed_environment(config.task, config.environment, environment) for config in configs]
-    for subject, config, options in zip(subjects, configs, changed, strict=True):
-        if subject.folder is not None:
-            refuse_guidance_change(config.environment, options)
+    changed = [subject.changed_environment(environment) for subject in subjects]
     settings: list[dict[str, Any]] = [
         {"seed": config.seed, **options} for config, options in zip(configs, changed, strict=True)
     ]
@@ -348,7 +341,7 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
     if differing := [key for key in keys if any(one.get(key) != settings[0].get(key) for one in settings)]:
         log(f"the runs differ in {', '.join(differing)}")
     return [
-        _Actor(name, subject.make_policy, config, options, subject.digest)
+        _Actor(name, subject.make_policy, replace(config, environment=options), subject.digest)
         for name, subject, config, options in zip(names, subjects, configs, changed, strict=True)
     ]
 
@@ -358,7 +351,7 @@ def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], log: Callable[[str], N
     sentences: dict[str, None] = {}
     pairs: list[tuple[_Actor, Point]] = []
     for actor in actors:
-        result, left_out = points(actor.config.task, actor.environment, axes)
+        result, left_out = points(actor.config.task, actor.config.environment, axes)
         pairs += [(actor, point) for point in result]
         sentences |= dict.fromkeys(left_out)
     for sentence in sentences:

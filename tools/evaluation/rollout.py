@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -76,17 +77,12 @@ class EnvCallback(Callback):
     """
 
     def __init__(self, env: gymnasium.Env):
-        """Construct the callback of episodes in `env`."""
         self.env: Any = env
         self.base: Any = env.unwrapped
 
 
 def check_seed(seed: int) -> None:
-    """Check that environments accept a seed.
-
-    Raises:
-        InputError: If the seed is negative, or does not fit into 31 bits.
-    """
+    """Raise an InputError if a seed is negative or does not fit into 31 bits."""
     if not 0 <= seed < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
 
@@ -120,11 +116,10 @@ def rollout(
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
-    observation = (
-        reset_held_out(env, seed or 0, **(options or {}))
-        if held_out
-        else env.reset(seed=seed, options=None if options is None else dict(options))[0]
-    )
+    if held_out:
+        observation = reset_held_out(env, seed or 0, **(options or {}))
+    else:
+        observation, _ = env.reset(seed=seed, options=None if options is None else dict(options))
     base: Any = env.unwrapped
     is_own = hasattr(base, "trace")
     if isinstance(act, Callback) and act not in callbacks:
@@ -224,7 +219,7 @@ class EpisodeProgress:
         self._console = console or Console(stderr=True)
         self._episodes, self._name = episodes, name
         self._done, self._count, self._window = 0, 0, window
-        self._recent: list[tuple[float, float]] = []
+        self._recent: deque[tuple[float, float]] = deque(maxlen=window)
         self._max_violation = float("-inf")
         self._started = self._printed = time.monotonic()
         self._bar = Progress(
@@ -249,9 +244,7 @@ class EpisodeProgress:
     def update(self, row: Mapping[str, Any]) -> None:
         """Add a finished episode."""
         self._done, self._count = int(row["episode"]) + 1, self._count + 1
-        self._recent = [*self._recent, (float(row["success"]), float(row["return"]))]
-        if self._window is not None:
-            self._recent = self._recent[-self._window :]
+        self._recent.append((float(row["success"]), float(row["return"])))
         self._max_violation = max(self._max_violation, float(row.get("max_commanded_violation", -math.inf)))
         self._bar.update(self._task, completed=self._done, status=self.status(), refresh=True)
         now = time.monotonic()

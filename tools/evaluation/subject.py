@@ -16,15 +16,11 @@ import gymnasium
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
 from guiderail.tools.evaluation.cache import policy_digest
-from guiderail.tools.evaluation.policies import (
-    as_policy,
-    check_compatible,
-    is_policy_file,
-    learned_policy,
-    load_policy,
-)
+from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
 from guiderail.tools.evaluation.rollout import PolicyFn, is_compatible
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
@@ -39,11 +35,7 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Refuse another guidance than a policy was trained with, because it defines what actions mean.
-
-    Raises:
-        InputError: If the guidance differs between the options of the training and those of the environment.
-    """
+    """Raise an InputError if an environment has another guidance than the training, which defines what actions mean."""
     trained, used = own.get("guidance"), other.get("guidance")
     if trained != used:
         raise InputError(
@@ -101,6 +93,14 @@ class Subject:
     is_stored: bool = False  # True if evaluated episodes are stored in the run's folder
     digest: str | None = None  # digest of the policy, for the names of stored files; None for a baseline policy
 
+    def changed_environment(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the environment's options with changes; raise an InputError for another guidance than its run's."""
+        assert self.config is not None
+        changed = changed_environment(self.config.task, self.config.environment, changes)
+        if self.folder is not None:
+            refuse_guidance_change(self.config.environment, changed)
+        return changed
+
 
 def find_subject(
     policy: Any, env: Any, environment: Mapping[str, Any] | None = None, *, trust_policy: bool = False
@@ -126,7 +126,8 @@ def find_subject(
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
         run_config = folder.config()
-        make_policy = learned_policy(folder.path, run_config.environment)
+        # The environment is not necessarily the run's own.
+        make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder))
     from guiderail.tools.learning.train import configure

@@ -186,12 +186,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise InputError(f"pose must return {self.guide.num_outputs} finite numbers, not {brief(measured)}")
         return measured
 
-    def _extra_spaces(self) -> dict[str, Box]:
-        sizes = {"phase": 1, "command": self.guide.num_outputs}
-        return {name: Box(-np.inf, np.inf, (sizes[name],), np.float32) for name in self._observe}
-
     def _extended_space(self, space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
-        extra = self._extra_spaces()
+        sizes = {"phase": 1, "command": self.guide.num_outputs}
+        extra = {name: Box(-np.inf, np.inf, (sizes[name],), np.float32) for name in self._observe}
         if not extra:
             return space
         if isinstance(space, Box) and len(space.shape) == 1:
@@ -203,10 +200,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return Dict({"observation": space, **extra})
 
     def _extended(self) -> Any:
-        values = {
-            "phase": lambda: [2.0 * self.guide.phase - 1.0],
-            "command": self.guide.scaled_command,
-        }
+        values = {"phase": lambda: [2.0 * self.guide.phase - 1.0], "command": self.guide.scaled_command}
         extra = {name: np.asarray(values[name](), dtype=np.float32) for name in self._observe}
         if not extra:
             return self._observation

@@ -74,7 +74,10 @@ def robot_session(
         elif connection.sim and isinstance(station.driver, LcmDriver):
             randomize_parts = PartRandomizer(task, partial(publish_part_offsets, station.driver), config.seed)
 
-        ask = partial(_ask, log, is_asked=not (assume_yes and connection.sim))
+        def ask(reason: str, question: str) -> None:
+            log(f"the arm is at rest: {reason}")
+            if not (assume_yes and connection.sim):
+                confirm(question)
 
         def free_workpiece(reason: str) -> None:
             ask(reason, "Release the workpiece by hand, put the parts back, and keep clear. May the arm move?")
@@ -100,10 +103,3 @@ def robot_session(
             log(NO_REALTIME_PRIORITY)
         log(keys.describe(has_pauses=True))
         yield RobotSession(env, lambda: connection.timing(station, wall_clock))
-
-
-def _ask(log: Log, reason: str, question: str, *, is_asked: bool) -> None:
-    """Show why the arm is at rest, and have the operator confirm that it may move."""
-    log(f"the arm is at rest: {reason}")
-    if is_asked:
-        confirm(question)

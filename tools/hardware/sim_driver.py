@@ -83,16 +83,12 @@ def run_sim_driver(
     if driver == "fci":
         if scenario is not None:
             raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
-        from guiderail.diagrams.hardware.fci_simulated import (  # needs franky-sim
-            RESIDUAL_FRICTION,
-            WorkcellSimulator,
-            serve,
-        )
+        from guiderail.diagrams.hardware import fci_simulated  # needs franky-sim
 
         parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)
-        friction = RESIDUAL_FRICTION if joint_friction is None else joint_friction
-        robot = WorkcellSimulator(insertion.workcell(), friction)
-        serve(robot, start, part_poses(*parts), seconds, rate or 1.0, url or "127.0.0.1", log)
+        friction = fci_simulated.RESIDUAL_FRICTION if joint_friction is None else joint_friction
+        robot = fci_simulated.WorkcellSimulator(insertion.workcell(), friction)
+        fci_simulated.serve(robot, start, part_poses(*parts), seconds, rate or 1.0, url or "127.0.0.1", log)
         return True
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm = open_bus(url)

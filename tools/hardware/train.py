@@ -90,11 +90,8 @@ def train_on_robot(
         finally:
             timing = pd.Series(dict(session.timing()), dtype=object)
             write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
-    return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": _num_excluded(rows)}
-
-
-def _num_excluded(rows: list[dict[str, Any]]) -> int:
-    return sum(not row["learned_from"] for row in rows)
+    num_excluded = sum(not row["learned_from"] for row in rows)
+    return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": num_excluded}
 
 
 def _train(

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
 from stable_baselines3.common.utils import set_random_seed
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, has_image, rollout
+from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
+from guiderail.tools.learning.sb3_state import load_module
 
 Weights = dict[str, dict[str, np.ndarray]]
 
@@ -103,7 +104,7 @@ class ParallelLearner(Learner):
             self._exchange(None)
         learner, episode = self._learner, self._simulated.pop(index)
         weights, actor = self._snapshots[self._required(index)].weights, copy.deepcopy(learner.actor())
-        _load_module(actor, weights.get("averaged", weights["actor"]))
+        load_module(actor, weights.get("averaged", weights["actor"]))
         learner.start_recorded(episode.is_greedy, actor)
         for transition in episode.transitions:
             learner.on_step(transition)
@@ -170,29 +171,22 @@ class ParallelLearner(Learner):
         """Return the state of the learner, and the snapshots that the next episodes use."""
         arrays, values = self._learner.state()
         stored = {f"learner/{name}": array for name, array in arrays.items()}
-        for number, module, name, array in self._snapshot_arrays():
-            stored[f"snapshot/{number}/{module}/{name}"] = array
+        stored |= {
+            f"snapshot/{number}/{module}/{name}": array
+            for number, snapshot in self._snapshots.items()
+            for module, weights in snapshot.weights.items()
+            for name, array in weights.items()
+        }
         snapshots = {str(number): [one.transitions, one.greedy_successes] for number, one in self._snapshots.items()}
         return stored, {"learner": values, "learned": self._learned, "snapshots": snapshots}
 
-    def _snapshot_arrays(self) -> Iterator[tuple[int, str, str, np.ndarray]]:
-        for number, snapshot in self._snapshots.items():
-            for module, weights in snapshot.weights.items():
-                for name, array in weights.items():
-                    yield number, module, name, array
-
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Set the state to what `state` returned; episodes simulated ahead of the checkpoint are simulated again."""
-        parts: dict[str, dict[str, np.ndarray]] = {"learner": {}, "snapshot": {}}
-        for name, array in arrays.items():
-            part, _, rest = name.partition("/")
-            parts[part][rest] = array
-        self._learner.restore(parts["learner"], values["learner"])
-        weights: dict[int, Weights] = {}
-        for name, array in parts["snapshot"].items():
-            number, module, rest = name.split("/", 2)
-            weights.setdefault(int(number), {}).setdefault(module, {})[rest] = array
-        self._snapshots = {number: Snapshot(weights[number], *values["snapshots"][str(number)]) for number in weights}
+        self._learner.restore(entries_of(arrays, "learner"), values["learner"])
+        self._snapshots = {}
+        for number, counts in values["snapshots"].items():
+            weights = {name: entries_of(arrays, f"snapshot/{number}/{name}") for name in _modules(self._learner)}
+            self._snapshots[int(number)] = Snapshot(weights, *counts)
         self._learned = self._assigned = values["learned"]
 
 
@@ -239,12 +233,7 @@ def copy_weights(learner: OffPolicyLearner) -> Weights:
 def load_weights(learner: OffPolicyLearner, weights: Weights) -> None:
     """Set the weights that a learner acts with."""
     for name, module in _modules(learner).items():
-        _load_module(module, weights[name])
-
-
-def _load_module(module: torch.nn.Module, weights: Mapping[str, np.ndarray]) -> None:
-    shapes = {key: value.shape for key, value in module.state_dict().items()}  # files store 0-d arrays as 1-d
-    module.load_state_dict({key: torch.from_numpy(value).reshape(shapes[key]) for key, value in weights.items()})
+        load_module(module, weights[name])
 
 
 def _snapshot(learner: OffPolicyLearner) -> Snapshot:

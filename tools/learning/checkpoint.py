@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from guiderail.models.common.files import digest
 from guiderail.tools.files import write_atomically
 
 Actor = dict[str, torch.Tensor]
+Entry = TypeVar("Entry")
 
 
 @dataclass
@@ -88,13 +89,14 @@ class CheckpointSelection:
 
     def restore(self, tensors: Mapping[str, torch.Tensor], values: Mapping[str, Any]) -> None:
         """Set the state to what `state` returned."""
-        actors: dict[str, Actor] = {name: {} for name in values["rows"]}
-        for name, value in tensors.items():
-            actor, key = name.split("/", 1)
-            actors[actor][key] = value
-        candidates = {name: Candidate(actors[name], *rows) for name, rows in values["rows"].items()}
+        candidates = {name: Candidate(entries_of(tensors, name), *rows) for name, rows in values["rows"].items()}
         self._selected = candidates.pop("selected", None)
         self._open = [candidates[name] for name in sorted(candidates, key=int)]
+
+
+def entries_of(entries: Mapping[str, Entry], part: str) -> dict[str, Entry]:
+    """Return the entries whose names begin with `part`/, by the rest of their names."""
+    return {name.removeprefix(f"{part}/"): one for name, one in entries.items() if name.startswith(f"{part}/")}
 
 
 def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """Chunk cloning: an ensemble that is regressed on the commanded poses that follow an observation (ACT's objective)."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -39,8 +39,7 @@ class ChunkLearner(BcLearner):
         super().__init__(config, env, **arguments)
         if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
             raise InputError("chunk reads the commands of its own environment: leave pipelined and num_envs out")
-        base: Any = env.unwrapped
-        self._env = base
+        self._env = cast(Any, env.unwrapped)
         dims = self._env.task.declaration.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)
         self._seen: list[np.ndarray] = []  # observations of the episode
@@ -91,10 +90,8 @@ class ChunkLearner(BcLearner):
     def _train(self) -> None:
         observations, chunks = np.array(self._observations), np.array(self._actions)
         self._center, self._scale = chunks.mean(axis=0), np.maximum(chunks.std(axis=0), MIN_SCALE)
-        inputs, targets = (
-            torch.from_numpy(observations),
-            torch.from_numpy((chunks - self._center) / self._scale).float(),
-        )
+        inputs = torch.from_numpy(observations)
+        targets = torch.from_numpy((chunks - self._center) / self._scale).float()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
             sizes = [observations.shape[1], *self.config.net_arch, chunks.shape[1]]
@@ -157,10 +154,6 @@ class ChunkLearner(BcLearner):
                 **description,
             },
         )
-
-    def has_diverged(self) -> bool:
-        """Return True if a parameter is NaN or infinite."""
-        return not all(bool(torch.isfinite(one).all()) for one in self.network.parameters())
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return everything that the rest of a run depends on: the demonstrations."""

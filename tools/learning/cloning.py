@@ -7,14 +7,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.config import BcConfig
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.networks import export_layers
+from guiderail.tools.learning.sb3_state import load_module
 
 
 class BcLearner(Learner):
@@ -104,7 +105,7 @@ class BcLearner(Learner):
 
     def has_diverged(self) -> bool:
         """Return True if a parameter is NaN or infinite."""
-        return not bool(torch.isfinite(parameters_to_vector(self.network.parameters())).all())
+        return not all(bool(torch.isfinite(one).all()) for one in self.network.parameters())
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
@@ -115,8 +116,7 @@ class BcLearner(Learner):
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Set the state to what `state` returned; raise KeyError or RuntimeError if it does not fit."""
-        names = self.network.state_dict()
-        self.network.load_state_dict({name: torch.from_numpy(np.array(arrays[f"network/{name}"])) for name in names})
+        load_module(self.network, entries_of(arrays, "network"))
         self._observations = [*arrays.get("observations", ())]
         self._actions = [*arrays.get("actions", ())]
         self.episodes = values["episodes"]

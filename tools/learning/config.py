@@ -44,6 +44,7 @@ BatchSize = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(reject_bool)]
 NumUnits = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(reject_bool)]
 Fraction = Annotated[float, Field(ge=0, le=1), BeforeValidator(reject_bool)]
 Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
+Noise = Annotated[float, Field(ge=0, le=10)]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
 EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
 # Absolute, so that a run can be resumed from another folder.
@@ -184,9 +185,7 @@ class ChunkConfig(BcConfig):
     net_arch: NetArch = (64, 64)  # units of the hidden layers of each network
     members: Annotated[Positive, Field(le=50)] = 5  # E, networks of the ensemble
     chunk_steps: Annotated[Positive, Field(le=1000)] = 16  # K, control steps of a chunk
-    observation_noise: Annotated[float, Field(ge=0, le=10)] = (
-        0.1  # standard deviation added to observations in training
-    )
+    observation_noise: Noise = 0.1  # standard deviation added to observations in training
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -198,12 +197,12 @@ class DistillationConfig(ChunkConfig):
     teacher: str = ""  # folder of the teacher's run, or pretrained:NAME
     action_noise: Annotated[float, Field(ge=0, le=1)] = 0.2  # standard deviation added to the teacher's actions
     noisy_copies: NonNegative = 4  # noisy copies of each observation, labeled by the teacher
-    copy_noise: Annotated[float, Field(ge=0, le=10)] = 0.2  # noise of a copy, in standard deviations of each entry
+    copy_noise: Noise = 0.2  # noise of a copy, in standard deviations of each entry
     members: Annotated[Positive, Field(le=50)] = 1  # E, networks of the ensemble
     net_arch: NetArch = (128, 128)  # units of the hidden layers
     batch_size: BatchSize = 256  # observations
     gradient_steps: Positive = 8000  # gradient steps after the last episode
-    observation_noise: Annotated[float, Field(ge=0, le=10)] = 0.0  # noise added in training; labels do not change
+    observation_noise: Noise = 0.0  # noise added in training; labels do not change
 
     def __post_init__(self) -> None:
         if self.demonstration_episodes:
@@ -357,9 +356,8 @@ def check_choices(
             registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
-    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)} - {
-        "algorithm"
-    }
+    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)}
+    known.remove("algorithm")
     for name in settings:
         if name not in known:
             raise InputError(f"no learner has a setting {brief(name)}: {did_you_mean(name, known)}")

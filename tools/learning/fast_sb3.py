@@ -19,6 +19,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 _EPSILON = 1e-5  # default of `torch.nn.functional.layer_norm`
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # names in the state dictionary of `torch.optim.Adam`
@@ -139,9 +140,8 @@ class BatchedMLP:
 def flatten(parameters: Iterable[torch.Tensor]) -> torch.Tensor:
     """Return one buffer of all parameters, in their order; each parameter becomes a view of it."""
     parameters = list(parameters)
-    flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
-    for parameter, part in zip(parameters, _parts(flat, [p.shape for p in parameters]), strict=True):
-        parameter.data = part
+    flat = parameters_to_vector(parameters).detach()
+    vector_to_parameters(flat, parameters)
     return flat
 
 

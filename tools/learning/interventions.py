@@ -49,7 +49,6 @@ class SupervisedEnv(gymnasium.Wrapper):
     """Environment whose episodes a supervisor can end."""
 
     def __init__(self, env: gymnasium.Env, supervisor: Supervisor):
-        """Wrap `env`; labels of `supervisor` end its episodes."""
         super().__init__(env)
         self._supervisor = supervisor
 

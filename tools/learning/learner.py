@@ -274,14 +274,10 @@ def _make_wandb_output(folder: str) -> Any:
     run = wandb.init(project="guiderail", name=Path(folder).parent.name, id=identifier, dir=folder, resume="allow")
 
     class WandbOutput(KVWriter):
-        """Output format that logs the values of an entry at its number of control steps."""
-
         def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-            """Log the values."""
             run.log(dict(key_values), step=step)  # a copy, because the logger clears the dictionary
 
         def close(self) -> None:
-            """Finish the run."""
             run.finish()
 
     return WandbOutput()

@@ -18,6 +18,15 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 
 
+class SpacesOnlyEnv(gymnasium.Env):
+    """Environment with the spaces of another one and nothing else, to send to another process."""
+
+    def __init__(self, env: gymnasium.Env, observation_space: spaces.Box | None = None):
+        """Copy the spaces of `env`, with another observation space if one is given."""
+        self.observation_space, self.action_space = observation_space or env.observation_space, env.action_space
+        self.privileged_space = getattr(env.unwrapped, "privileged_space", None)
+
+
 class FirstEntries(BaseFeaturesExtractor):
     """Feature extractor of an actor: the first entries of the critics' larger observation."""
 
@@ -72,10 +81,8 @@ def observe_privileged(
     if not hasattr(policy, "make_actor"):
         raise InputError(f"{algorithm.__name__} has no critic apart from its actor: leave privileged_critic out")
     base.observes_privileged = True
-    critic = gymnasium.Env()
-    critic.action_space = env.action_space
     infinite = np.full(observed.shape[0] + hidden.shape[0], np.inf, np.float32)
-    critic.observation_space = spaces.Box(-infinite, infinite)
+    critic = SpacesOnlyEnv(env, spaces.Box(-infinite, infinite))
     return critic, asymmetric_policy(policy, observed.shape[0]), hidden.shape[0]
 
 
@@ -186,19 +193,8 @@ class DetachedFeatures(BaseFeaturesExtractor):
     """Features of another extractor, without gradients: the actor uses the critic's encoder but does not train it."""
 
     def __init__(self, observation_space: spaces.Box, features: ImageFeatures):
-        """Construct the extractor on `features`."""
         super().__init__(observation_space, features.features_dim)
         self.features: Any = features
-
-    @property
-    def pool(self) -> int:
-        """Side of the averaged squares of the shared extractor [pixels]."""
-        return int(self.features.pool)
-
-    @property
-    def convolutions(self) -> Any:
-        """Convolutions of the shared extractor."""
-        return self.features.convolutions
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Map observations to features."""
@@ -239,7 +235,6 @@ class DroppedNormalizedReLU(NormalizedReLU):
     """Dropout, followed by layer normalization and a rectifier (DroQ; Hiraoka et al., 2022)."""
 
     def __init__(self, probability: float):
-        """Construct the module, which drops each feature with a probability in training mode."""
         super().__init__()
         self.dropout = torch.nn.Dropout(probability)
 
@@ -266,6 +261,7 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
     features = actor.features_extractor
+    features = features.features if isinstance(features, DetachedFeatures) else features
     encoder = [_arrays(one) for one in getattr(features, "convolutions", ())]
     pool = {"pool": getattr(features, "pool", 1)}
     return export_layers(layers, actor.action_space, {**pool, "squash": "tanh", **description}, encoder)

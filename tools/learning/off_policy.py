@@ -28,13 +28,14 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.checkpoint import CheckpointSelection, load_checkpoint
+from guiderail.tools.learning.checkpoint import CheckpointSelection, entries_of, load_checkpoint
 from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error
 from guiderail.tools.learning.networks import (
     ImageFeatures,
     NormalizedReLU,
+    SpacesOnlyEnv,
     add_dropout,
     export_policy,
     image_shape,
@@ -97,10 +98,7 @@ class OffPolicyLearner(Learner):
         if self._image_shape is not None:
             if config.privileged_critic:
                 raise InputError("a privileged critic takes no images: leave the setting privileged_critic out")
-            packed = gymnasium.Env()
-            packed.observation_space = packed_space(cast(spaces.Box, env.observation_space))
-            packed.action_space = env.action_space
-            env = packed
+            env = SpacesOnlyEnv(env, packed_space(cast(spaces.Box, env.observation_space)))
             networks["features_extractor_class"] = ImageFeatures
             networks["features_extractor_kwargs"] = {
                 "shape": self._image_shape,
@@ -412,8 +410,7 @@ class OffPolicyLearner(Learner):
         self.transitions, self.model._n_updates = values["transitions"], values["updates"]
         self.episodes, self.greedy_successes = values["episodes"], values["greedy_successes"]
         if self.selection is not None:
-            actors = {key.removeprefix("selection/"): v for key, v in tensors.items() if key.startswith("selection/")}
-            self.selection.restore(actors, values["selection"])
+            self.selection.restore(entries_of(tensors, "selection"), values["selection"])
         restore_random(arrays, values)
         self.random.bit_generator.state = values["exploration"]
         self._check_restored(arrays, values)
@@ -482,9 +479,6 @@ class Td3Learner(OffPolicyLearner):
         action, space = super().explore(observation), self.model.action_space
         deviation = self.config.exploration_noise * (space.high - space.low) / 2
         return np.clip(self.random.normal(action, deviation), space.low, space.high).astype(space.dtype)
-
-    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        return {"actor": self.model.actor.optimizer, "critic": self.model.critic.optimizer}
 
 
 class CrossQLearner(OffPolicyLearner):

@@ -13,7 +13,6 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pyarrow as pa
 import torch
@@ -23,7 +22,9 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.evaluation.step_log import write_step_log
 from guiderail.tools.learning.actors import Weights, copy_weights, load_weights, record_transition
+from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import LEARNERS, Learner
+from guiderail.tools.learning.networks import SpacesOnlyEnv as SpacesOnlyEnv
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 
 
@@ -186,18 +187,13 @@ class PipelinedLearner(Learner):
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Set the state to what `state` returned, and submit the pending episode."""
-        parts = {
-            part: {key[len(part) + 1 :]: value for key, value in arrays.items() if key.startswith(part + "/")}
-            for part in ("acting", "learning", "pending")
-        }
-        self._acting.restore(parts["acting"], values["acting"])
-        self._send(("restore", parts["learning"], values["learning"]))
+        self._acting.restore(entries_of(arrays, "acting"), values["acting"])
+        self._send(("restore", entries_of(arrays, "learning"), values["learning"]))
         if (message := self._receive()) is not None:
             raise ValueError(message)
-        if parts["pending"]:
-            names = [name for name in _STORED if name in parts["pending"]]
-            columns = zip(*(parts["pending"][name] for name in names), strict=True)
-            self._pending = [Transition(**dict(zip(names, one, strict=True)), info={}) for one in columns]
+        if columns := entries_of(arrays, "pending"):
+            rows = zip(*columns.values(), strict=True)
+            self._pending = [Transition(**dict(zip(columns, row, strict=True)), info={}) for row in rows]
         self.submit_episode()
 
     def _send(self, message: tuple[Any, ...]) -> None:
@@ -225,15 +221,6 @@ class PipelinedLearner(Learner):
 _STORED = (
     "observation", "action", "reward", "next_observation", "terminated", "truncated", "privileged", "next_privileged",
 )  # fmt: skip
-
-
-class SpacesOnlyEnv(gymnasium.Env):
-    """Environment with the spaces of another one and nothing else, to send to another process."""
-
-    def __init__(self, env: gymnasium.Env):
-        """Copy the spaces of `env`."""
-        self.observation_space, self.action_space = env.observation_space, env.action_space
-        self.privileged_space = getattr(env.unwrapped, "privileged_space", None)
 
 
 def _process_ended_error() -> InputError:

@@ -136,11 +136,7 @@ class RunFolder:
         refuse_existing_run(self.path)
 
     def refuse_another(self, config: RunConfig) -> None:
-        """Check that the folder holds the run of a configuration.
-
-        Raises:
-            InputError: If task, environment, learner, seed or the files of the task differ.
-        """
+        """Raise an InputError if the folder's run has another task, environment, learner, seed or other task files."""
         stored = self.config()
         stored.refuse_changed_task(self.path)
         # An option that is missing in the stored configuration has its default.

@@ -10,6 +10,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from guiderail.tools.learning.checkpoint import entries_of
+
 
 class DemonstrationReplayBuffer(NStepReplayBuffer):
     """Replay buffer with a fixed fraction of demonstrated transitions in every batch (RLPD; Ball et al., 2023).
@@ -63,17 +65,23 @@ def restore_modules(
 ) -> None:
     """Set modules and optimizers from the arrays that `module_arrays` returned, given as tensors."""
     for name, module in modules.items():
-        own = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(name + "/")}
-        # Files store 0-d arrays, such as counters of steps, as 1-d arrays.
-        shapes = {key: value.shape for key, value in module.state_dict().items()}
-        module.load_state_dict({k: v.reshape(shapes.get(k, v.shape)) for k, v in own.items()})
+        load_module(module, entries_of(tensors, name))
     for name, optimizer in optimizers.items():
         moments: dict[int, dict[str, torch.Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith(f"optimizer/{name}/"):
-                _, _, index, moment = key.split("/")
-                moments.setdefault(int(index), {})[moment] = value
+        for key, value in entries_of(tensors, f"optimizer/{name}").items():
+            index, moment = key.split("/")
+            moments.setdefault(int(index), {})[moment] = value
         optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def load_module(module: torch.nn.Module, arrays: Mapping[str, Any]) -> None:
+    """Set the parameters and buffers of a module from arrays or tensors by name.
+
+    Files store 0-d arrays, such as counters of steps, as 1-d arrays.
+    """
+    shapes = {name: value.shape for name, value in module.state_dict().items()}
+    tensors = {name: torch.as_tensor(value) for name, value in arrays.items()}
+    module.load_state_dict({name: one.reshape(shapes.get(name, one.shape)) for name, one in tensors.items()})
 
 
 def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -9,16 +9,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import pandas as pd
 
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
-from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline
 from guiderail.tools.evaluation.metrics import own_episodes, summary
-from guiderail.tools.evaluation.rollout import EpisodeProgress, PolicyFn, check_seed
+from guiderail.tools.evaluation.rollout import EpisodeProgress, check_seed
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.learner import check_log_formats
@@ -34,6 +33,7 @@ SUMMARY = (
     "max_commanded_violation", "peak_force", "collisions", "wall_time",
 )  # fmt: skip
 
+_find_scripted = partial(make_baseline, name="scripted")
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -124,7 +124,7 @@ def train(
     return start_or_resume(
         name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
         episodes=episodes, seed=seed, log=log, resume=resume, imports=imports, sb3_callbacks=callbacks,
-        pictures=pictures, find_demonstrator=partial(make_baseline, name="scripted"),
+        pictures=pictures,
     )  # fmt: skip
 
 
@@ -145,7 +145,7 @@ def start_or_resume(
     pictures: bool = True,
     sb3_callbacks: Any = None,
     make_supervisor: Callable[[], Supervisor] | None = None,
-    find_demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
+    find_demonstrator: Callable[[str], MakePolicy] = _find_scripted,
 ) -> Run:
     """Train with a progress bar and draw the learning curve and the replay page; None stands for a default.
 
@@ -158,7 +158,7 @@ def start_or_resume(
     - `sb3_callbacks`: callbacks of Stable-Baselines3.
     - `make_supervisor`: constructs the supervisor of a run with a human in the loop.
     - `find_demonstrator`: returns the policy of the learner's `demonstration_episodes` for a task's name, or raises an
-      InputError if there is none.
+      InputError if there is none; by default it returns the scripted policy of the task.
     """
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
@@ -177,9 +177,7 @@ def start_or_resume(
         config = configure(task, environment, imports=imports, **with_defaults(task, given))
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
-    demonstrator = (
-        find_demonstrator(config.task) if find_demonstrator and config.learner.demonstration_episodes else None
-    )
+    demonstrator = find_demonstrator(config.task) if config.learner.demonstration_episodes else None
     supervisor = make_supervisor() if config.human_in_the_loop and make_supervisor is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
         run_training(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
@@ -87,73 +88,61 @@ def run_training(
         )
     learning_log = LearningLog(folder.logs, log)
     torch.set_num_threads(1)  # faster for two runs at once, and sums do not depend on the number of cores
-    env = make_environment(config.task, config.environment)
-    if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
-        env.close()
-        raise InputError(
-            f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave the "
-            "setting demonstration_episodes out"
-        )
-    arguments = learner_arguments(config, cast(Any, env.unwrapped).task)
-    try:
-        learner: Learner = LEARNERS.get(config.learner.algorithm)(config.learner, env, **arguments)
-    except MemoryError as error:
-        env.close()
-        raise InputError(
-            f"the replay buffer does not fit into memory ({error}): give a smaller --set buffer_size=..."
-        ) from error
-    env.reset(seed=config.seed)  # samples the hidden values of the run
-    if not resume:
-        folder.refuse_existing()
-    is_new_folder = not folder.path.exists()
-    callbacks = None
-    try:
+    with ExitStack() as stack:
+        env = stack.enter_context(closing(make_environment(config.task, config.environment)))
+        if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
+            raise InputError(
+                f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
+                "the setting demonstration_episodes out"
+            )
+        arguments = learner_arguments(config, cast(Any, env.unwrapped).task)
+        try:
+            learner: Learner = LEARNERS.get(config.learner.algorithm)(config.learner, env, **arguments)
+        except MemoryError as error:
+            raise InputError(
+                f"the replay buffer does not fit into memory ({error}): give a smaller --set buffer_size=..."
+            ) from error
+        env.reset(seed=config.seed)  # samples the hidden values of the run
+        if not resume:
+            folder.refuse_existing()
+        is_new_folder = not folder.path.exists()
+        stack.callback(lambda: learner.close())
+        stack.callback(learning_log.close)
+        callbacks = None
         if sb3_callbacks is not None:
             from guiderail.tools.learning.sb3_callbacks import Sb3Callbacks
 
             if config.learner.pipelined or config.learner.num_envs:
                 raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
-            callbacks = Sb3Callbacks(sb3_callbacks, learner)
-        with folder.locked():
-            if config.learner.pipelined:
-                from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
+            callbacks = stack.enter_context(closing(Sb3Callbacks(sb3_callbacks, learner)))
+        stack.enter_context(folder.locked())
+        if config.learner.pipelined:
+            from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 
-                child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
-                learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
-            elif config.learner.num_envs:
-                learner = _parallel(folder, config, env, learner, demonstrator)
-            learner.records_metrics = bool(log)
-            if not resume:
-                folder.create(config)
-            try:
-                return _train(
-                    folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log, callbacks
-                )
-            except InputError:
-                # A folder that holds only a configuration would make the user's next attempt fail.
-                # The folder of a learner that diverged is kept.
-                if not resume and not learner.has_diverged():
-                    folder.remove_unstarted(remove_folder=is_new_folder)
-                raise
-    finally:
-        if callbacks is not None:
-            callbacks.close()
-        learning_log.close()
-        learner.close()
-        env.close()
+            child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
+            learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
+        elif config.learner.num_envs:
+            from guiderail.tools.learning.actors import ParallelLearner
 
-
-def _parallel(
-    folder: RunFolder, config: RunConfig, env: gymnasium.Env, learner: Learner, demonstrator: Demonstrator | None
-) -> ParallelLearner:
-    from guiderail.tools.learning.actors import ParallelLearner
-
-    demonstrations = config.learner.demonstration_episodes
-    return ParallelLearner(
-        learner, env, num_envs=config.learner.num_envs, seed=config.seed, num_episodes=config.episodes,
-        demonstrator=(demonstrator(env), demonstrations) if demonstrator is not None and demonstrations else None,
-        callbacks=(StepLog(env, folder.steps),) if config.step_log else (),
-    )  # fmt: skip
+            number = config.learner.demonstration_episodes
+            learner = ParallelLearner(
+                learner, env, num_envs=config.learner.num_envs, seed=config.seed, num_episodes=config.episodes,
+                demonstrator=(demonstrator(env), number) if demonstrator is not None and number else None,
+                callbacks=(StepLog(env, folder.steps),) if config.step_log else (),
+            )  # fmt: skip
+        learner.records_metrics = bool(log)
+        if not resume:
+            folder.create(config)
+        try:
+            return _train(
+                folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log, callbacks
+            )
+        except InputError:
+            # A folder that holds only a configuration would make the user's next attempt fail.
+            # The folder of a learner that diverged is kept.
+            if not resume and not learner.has_diverged():
+                folder.remove_unstarted(remove_folder=is_new_folder)
+            raise
 
 
 def _train(

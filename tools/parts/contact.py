@@ -132,13 +132,14 @@ def choose_contact(
             number = len(surfaces[name].bodies)
             snapped = frozenset(range(number - snapping, number)) if name == "plug" else frozenset()
             contact = Contact(name, tuple(pieces), snapped)
-            refusal = _refusal_of_drake(folder, contact, surfaces, make_file)
+            _write_pieces(folder, contact, surfaces)
+            refusal = _refusal_of_drake(folder, make_file(contact, PUSHES[0]))
             seconds += cpu_time() - start
             if refusal:
                 report(f"{name}: Drake refuses its contact geometry ({refusal})")
             else:
-                choices += _adapt_settings(folder, contact, surfaces, make_file, allowed, log)
-                if all(rank(max(choices, key=lambda one: rank(one, allowed)), allowed)[:3]):
+                choices += _adapt_settings(folder, contact, make_file, allowed, log)
+                if all(max(rank(choice, allowed) for choice in choices)[:3]):
                     break
             start = cpu_time()
         if any(choice.aligned.success for choice in choices):
@@ -164,13 +165,10 @@ def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
     return seats, is_shallow, choice.speed >= MIN_SPEED, choice.speed if is_shallow else -choice.deepest
 
 
-def _refusal_of_drake(
-    folder: Path, contact: Contact, surfaces: dict[str, ContactSurface], make_file: MakeFile
-) -> str | None:
+def _refusal_of_drake(folder: Path, file: Any) -> str | None:
     """Return the reason why Drake rejects the geometry, or None; Drake runs in a child process, as it may abort."""
-    _write_pieces(folder, contact, surfaces)
     try:
-        run_isolated(_make_station, folder, make_file(contact, PUSHES[0]), cpu_seconds=CHECK_SECONDS)
+        run_isolated(_make_station, folder, file, cpu_seconds=CHECK_SECONDS)
     except IsolatedError as error:
         return str(error)
     return None
@@ -184,12 +182,7 @@ def _make_station(folder: Path, file: Any) -> None:
 
 
 def _adapt_settings(
-    folder: Path,
-    contact: Contact,
-    surfaces: dict[str, ContactSurface],
-    make_file: MakeFile,
-    allowed: float,
-    log: Callable[[str], None],
+    folder: Path, contact: Contact, make_file: MakeFile, allowed: float, log: Callable[[str], None]
 ) -> list[Choice]:
     """Return the choices tried, each with settings derived from the penetration measured with the previous ones.
 
@@ -199,7 +192,7 @@ def _adapt_settings(
     choices: list[Choice] = []
     start = cpu_time()
     for _ in range(MAX_TRIALS):
-        choice = _try_contact(folder, contact, surfaces, make_file)
+        choice = _try_contact(folder, contact, make_file)
         choices.append(choice)
         resting = max(trial.resting_penetration for trial in choice.trials)
         log(
@@ -227,13 +220,12 @@ def cpu_time() -> float:
     return sum(os.times()[:4])
 
 
-def _try_contact(folder: Path, contact: Contact, surfaces: dict[str, ContactSurface], make_file: MakeFile) -> Choice:
+def _try_contact(folder: Path, contact: Contact, make_file: MakeFile) -> Choice:
     """Return the trials with the first snap modulus and push depth that seat the plug, or the last ones tried."""
     from guiderail.tools.parts.trial import insert
 
     for soft in SNAP_MODULI if contact.snapping else (contact.modulus,):
         contact = replace(contact, snap_modulus=soft)
-        _write_pieces(folder, contact, surfaces)
         for push in PUSHES if contact.snapping else PUSHES[:1]:
             file = make_file(contact, push)
             aligned = insert(folder, file, snapping=contact.snapping_pieces)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.errors import InputError
@@ -73,7 +76,8 @@ def read_parts(
         )
     first, second = (load_part(path, str(known)) for path, known in zip((plug, socket), units, strict=True))
     scale = UNITS[str(units[1])]
-    first = first.transform(_rotation(np.asarray(plug_pose[3:]) * DEGREE), np.asarray(plug_pose[:3]) * scale)
+    turned = Rotation.from_euler("xyz", np.asarray(plug_pose[3:]) * DEGREE).as_matrix()
+    first = first.transform(turned, np.asarray(plug_pose[:3]) * scale)
     z = np.array(AXES[axis], dtype=float)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
@@ -96,12 +100,6 @@ def _refuse_separate(plug: Part, socket: Part) -> None:
             f"the parts are {1e3 * gaps.max():.4g} mm apart: draw them assembled in one frame, or place the plug with "
             "--plug-pose"
         )
-
-
-def _rotation(angles: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_euler("xyz", angles).as_matrix()
 
 
 def create_task(
@@ -148,7 +146,7 @@ def create_task(
     """
     check_new(out, "folder with --out, or remove it")
     _check_arguments(plug_pose, turn, shrink, force_limit, friction, scenario, hard_episodes)
-    clock = Stopwatch()
+    start = cpu_time()
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     for part in parts:
         if str(part.repair):
@@ -175,43 +173,35 @@ def create_task(
         "deviation_mm": round(1e3 * deviation, 4),
         "repair": "; ".join(text for part in parts if (text := str(part.repair))) or "none",
         "triangles": [surface.num_triangles for surface in surfaces.values()],
-        "preparation_s": clock.read(),
+        "preparation_s": _seconds_since(start),
     }
     values = {"name": out.name, "force_limit": force_limit, "friction": friction, "path": path, "sides": sides}
+    values["scenario"] = tuple(file.name for file in scenario)
     with atomic_folder(out) as folder:
         for file in scenario:
             shutil.copy(file, folder / file.name)
         for name, surface in surfaces.items():
             (folder / f"{name}.obj").write_text(obj_text(*surface.visual), encoding="utf-8")
-
-        def make_file(contact: Contact, push: float) -> PartTaskFile:
-            return _task_file(parts, surfaces, contact, push, values, [file.name for file in scenario])
-
+        make_file = partial(_task_file, parts, surfaces, values)
         choice = choose_contact(folder, surfaces, make_file, tolerance, clearance, log)
         task = make_file(choice.contact, choice.push)
-        measured, search = _measure(folder, task, choice, prepared, clock, log)
+        measured, search = _measure(folder, task, choice, prepared, start, log)
         if not only_insert:
             task = task.model_copy(update={"search": search})
             from guiderail.tools.parts.trial import add_convex_pieces
 
             if not (scenario or choice.contact.snapping):
                 task = add_convex_pieces(folder, task, surfaces, tolerance, log)
-            measured = _write_task(folder, task, choice, measured, hard_episodes, clock, log)
+            measured = _write_task(folder, task, choice, measured, hard_episodes, start, log)
     if only_insert:
         shutil.rmtree(out)
         return measured
     return {"task": str(out), **measured, "page": str(out / "preview.html")}
 
 
-class Stopwatch:
-    """CPU time since the construction, including finished child processes."""
-
-    def __init__(self) -> None:
-        self._start = cpu_time()
-
-    def read(self) -> float:
-        """Return the CPU time so far [s]."""
-        return round(cpu_time() - self._start, 2)
+def _seconds_since(start: float) -> float:
+    """Return the CPU time since `start`, a result of `cpu_time`, for a table [s]."""
+    return round(cpu_time() - start, 2)
 
 
 def _describe_surfaces(
@@ -264,10 +254,8 @@ def _check_arguments(
 def _snapping(plug: Part, socket: Part, path: InsertionMotion, deviation: float) -> frozenset[int]:
     """Return the indices of the plug's bodies that overlap the socket during the motion.
 
-    `deviation` is the largest overlap caused by the decimation of both parts [m].
-
-    Raises:
-        InputError: If all bodies overlap: the plug is a rigid part that does not fit.
+    `deviation` is the largest overlap caused by the decimation of both parts [m]. If all bodies overlap, the plug is a
+    rigid part that does not fit, and an InputError is raised.
     """
     ways = find_obstructions(plug, socket, path)
     blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > MAX_RESTING_OVERLAP + deviation)
@@ -286,14 +274,14 @@ def _measure(
     file: PartTaskFile,
     choice: Choice,
     prepared: dict[str, Any],
-    clock: Stopwatch,
+    start: float,
     log: Callable[[str], None],
 ) -> tuple[dict[str, Any], SearchNumbers]:
     """Return the measurements of the chosen contact, and those that the scripted search uses."""
     from guiderail.diagrams.tasks.part.file import SearchNumbers
     from guiderail.tools.parts.trial import insert, measure_lever_sign
 
-    inserted_s, contact, aligned = clock.read(), choice.contact, choice.aligned
+    inserted_s, contact, aligned = _seconds_since(start), choice.contact, choice.aligned
     misaligned = choice.misaligned or tuple(
         insert(folder, file, offset=xy, snapping=contact.snapping_pieces) for xy in MISALIGNMENTS
     )
@@ -329,7 +317,7 @@ def _write_task(
     choice: Choice,
     measured: dict[str, Any],
     hard_episodes: int,
-    clock: Stopwatch,
+    start: float,
     log: Callable[[str], None],
 ) -> dict[str, Any]:
     """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
@@ -346,7 +334,7 @@ def _write_task(
             "--center and --turn, or give a larger --force-limit"
         )
     measured["demonstrations_seated"] = f"{succeeded} of {NUM_DEMONSTRATIONS}"
-    measured["total_s"] = clock.read()
+    measured["total_s"] = _seconds_since(start)
     file = file.model_copy(update={"measured": measured})
     write_task_file(folder, file)
     if hard_episodes:
@@ -354,19 +342,14 @@ def _write_task(
         radius = float(np.hypot(*mesh.vertices[mesh.triangles].reshape(-1, 3)[:, :2].T).max())
         file = calibrate(folder, file, radius, hard_episodes, log)
         if "hard" in file.measured:
-            file.measured["hard"]["seconds"] = round(clock.read() - measured["total_s"], 2)
+            file.measured["hard"]["seconds"] = round(_seconds_since(start) - measured["total_s"], 2)
         write_task_file(folder, file)
     write_preview(folder / "preview.html", folder, file, choice.aligned)
     return file.measured
 
 
 def _task_file(
-    parts: tuple[Part, Part],
-    surfaces: dict[str, ContactSurface],
-    contact: Contact,
-    push: float,
-    values: dict[str, Any],
-    scenario: Sequence[str],
+    parts: tuple[Part, Part], surfaces: dict[str, ContactSurface], values: dict[str, Any], contact: Contact, push: float
 ) -> PartTaskFile:
     from guiderail.diagrams.envs.options import validate_options
     from guiderail.diagrams.tasks.part.file import NAMESPACE, MotionNumbers, PartModel, PartTaskFile, Piece, Tolerance
@@ -389,9 +372,9 @@ def _task_file(
             convex=(),
         )
     content: dict[str, Any] = dict(
-        name=f"{NAMESPACE}/{_plain_name(values['name'])}",
+        name=f"{NAMESPACE}/" + re.sub(r"[^\w.-]", "_", values["name"]),
         **models,
-        scenario=tuple(scenario),
+        scenario=values["scenario"],
         motion=validate_options(
             MotionNumbers,
             {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push},
@@ -405,10 +388,6 @@ def _task_file(
         rim_sides=values["sides"][1],
     )
     return validate_options(PartTaskFile, content, "a task of parts")
-
-
-def _plain_name(name: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "_.-" else "_" for letter in name)
 
 
 def _size(part: Part) -> str:

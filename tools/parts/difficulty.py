@@ -136,7 +136,6 @@ class StopOnRim(gymnasium.Wrapper):
     """Wrapper that truncates an episode if the plug is still on the rim `PATIENCE` after the search."""
 
     def __init__(self, env: gymnasium.Env, file: PartTaskFile):
-        """Construct the wrapper for an environment with the task file `file`."""
         super().__init__(env)
         numbers = file.motion
         times, _ = numbers.plan_search()

@@ -109,17 +109,11 @@ SLIDERS = {
     "pitch [degrees]": Slider(10.0, 0.5, ("KeyK", "KeyI"), DEGREE),
     "roll [degrees]": Slider(10.0, 0.5, ("KeyJ", "KeyL"), DEGREE),
 }
-KEEP, DISCARD, UNDO, SLOW, END = (
-    "keep (Enter)",
-    "discard (Backspace)",
-    "undo 1 s (U)",
-    "slow motion (M)",
-    "end (Escape)",
-)
+KEEP, DISCARD, UNDO = "keep (Enter)", "discard (Backspace)", "undo 1 s (U)"
+SLOW, END = "slow motion (M)", "end (Escape)"
 BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END: "Escape"}
-MAX_SPEED = np.array(
-    [20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE]
-)  # of the command [m/s], [rad/s]
+# Largest speed of the command [m/s], [rad/s].
+MAX_SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])
 SLOW_RATE = 0.25  # of real time, in slow motion
 UNDO_TIME = 1.0  # motion that one undo takes back [s]
 MAX_UNDOS = 60  # consecutive undos: each needs a copy of the simulation's state

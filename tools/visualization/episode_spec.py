@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import MakePolicy
 from guiderail.tools.evaluation.metrics import COLLISION
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, check_seed
-from guiderail.tools.evaluation.subject import find_subject, refuse_guidance_change
+from guiderail.tools.evaluation.subject import find_subject
 
 
 @dataclass(frozen=True)
@@ -52,12 +51,9 @@ class EpisodeSpec:
         subject = find_subject(policy, task, environment, trust_policy=trust_policy)
         config, folder = subject.config, subject.folder
         assert config is not None
-        changed = changed_environment(config.task, config.environment, environment or {})
-        if folder is not None:
-            refuse_guidance_change(config.environment, changed)
         return cls(
             task=config.task,
-            environment=changed,
+            environment=subject.changed_environment(environment or {}),
             policy=subject.make_policy,
             acting=subject.name if folder is None else "after learning",
             title=subject.name if folder is None else config.learner.algorithm.upper(),

@@ -112,7 +112,9 @@ class Motion(EnvCallback):
         # The tolerance is far below a step of the simulation, and far above rounding errors.
         if time > len(self._poses) * self._period - 1e-6:
             query = self._eval_query(root)
-            self._poses.append(np.array([_pose(query.GetPoseInWorld(frame)) for frame in self._frames.values()]))
+            poses = [query.GetPoseInWorld(frame) for frame in self._frames.values()]
+            numbers = [[*X.translation(), *X.rotation().ToQuaternion().wxyz()] for X in poses]
+            self._poses.append(np.array(numbers))
         return EventStatus.DidNothing()
 
 
@@ -125,10 +127,6 @@ def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple
 def state_names(task: Any) -> Sequence[str]:
     """Return the names of the states of a task's template, in order; empty without a template."""
     return [state.name for state in task.template().template.states] if "template" in type(task).provides() else []
-
-
-def _pose(X_WF: Any) -> list[float]:
-    return [*X_WF.translation(), *X_WF.rotation().ToQuaternion().wxyz()]
 
 
 def _encode(poses: np.ndarray) -> str:
@@ -149,12 +147,8 @@ TEMPLATE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=T
 TRANSPARENCY = 0.35  # opacity of bodies when the page shows them transparent
 EPISODES = 4  # number of held-out episodes
 
-GREY, BLACK, GREEN, RED = (
-    (0.55, 0.55, 0.6, 0.8),
-    (0.1, 0.1, 0.1, 1.0),
-    (0.1, 0.65, 0.25, 1.0),
-    (0.85, 0.1, 0.1, 1.0),
-)
+GREY, BLACK = (0.55, 0.55, 0.6, 0.8), (0.1, 0.1, 0.1, 1.0)
+GREEN, RED = (0.1, 0.65, 0.25, 1.0), (0.85, 0.1, 0.1, 1.0)
 PALE = 0.3  # opacity of the paths of episodes that are not selected
 
 

@@ -123,8 +123,8 @@ def _read(
         raise InputError(f"{file} has fewer than two lines of numbers: a motion needs at least two")
     assumptions: list[str] = []
     clock, times = _time(file, columns, time_unit, assumptions)
-    position = [one for axis in "xyz" if (one := _column(file, columns, axis)) is not None]
-    if len(position) < 3:
+    position = _columns(file, columns, "xyz")
+    if not position:
         raise InputError(
             f"{file} has no columns x, y and z: name them so; outputs other than a pose need no import: "
             "guiderail reads them as they are, with time in seconds"
@@ -155,11 +155,7 @@ def _read(
 
 
 def _table(file: Path) -> list[_Column]:
-    """Return the columns of a table, empty fields as NaN.
-
-    Raises:
-        InputError: If the file is not a table of numbers, or a line has more or fewer fields than the header.
-    """
+    """Return the columns of a table of numbers, empty fields as NaN; every line has as many fields as the header."""
     try:
         data = read_bytes(file, "table", MAX_FILE_SIZE)
         text = data.decode("utf-8-sig")  # Excel writes a byte-order mark, which is not part of a name
@@ -188,11 +184,7 @@ def _table(file: Path) -> list[_Column]:
 def _units(
     file: Path, columns: Sequence[_Column], known: Collection[str], given: str | None, option: str
 ) -> list[str | None]:
-    """Return the unit of each column: the one in its name, else the given one.
-
-    Raises:
-        InputError: If a column states another unit than the given one, or an unknown one.
-    """
+    """Return the unit of each column: the one in its name, else the given one, from which no name may differ."""
     units = []
     for column in columns:
         unit = _unit_of_name(file, column.name, known) or given
@@ -205,11 +197,7 @@ def _units(
 
 
 def _unit_of_name(file: Path, name: str, known: Collection[str]) -> str | None:
-    """Return the unit in a column's name, in brackets or as its ending; None if it has neither.
-
-    Raises:
-        InputError: If the name has brackets that contain no known unit.
-    """
+    """Return the unit in a column's name, in brackets or as its ending; None if it has neither."""
     plain = unicodedata.normalize("NFKC", name).lower()  # maps the micro sign to the Greek letter
     if inside := [text.strip() for text in re.findall(r"[\[(]([^\[\]()]*)", plain)]:
         units = [unit for text in inside if (unit := _SAME_UNIT.get(text, text)) in known]
@@ -228,23 +216,21 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | None:
-    """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if there is none.
-
-    Raises:
-        InputError: If there are several.
-    """
+    """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if there is none."""
     named = rf"{wanted}(_mm|_cm|_m|_rad|_deg)?"
     exact = [one for one in columns if re.fullmatch(named, one.plain)]
     ends = [one for one in columns if re.fullmatch(_PREFIX + named, one.plain)]
     return _only(file, exact or [one for one in ends if not _NO_POSE.fullmatch(one.plain)], wanted)
 
 
-def _only(file: Path, found: Sequence[_Column], wanted: str) -> _Column | None:
-    """Return the only column, or None without one.
+def _columns(file: Path, columns: Sequence[_Column], wanted: Sequence[str]) -> list[_Column]:
+    """Return the columns `wanted`, or none if one of them is missing."""
+    found = [one for name in wanted if (one := _column(file, columns, name)) is not None]
+    return found if len(found) == len(wanted) else []
 
-    Raises:
-        InputError: If there are several.
-    """
+
+def _only(file: Path, found: Sequence[_Column], wanted: str) -> _Column | None:
+    """Return the only column, or None without one; raise an InputError if there are several."""
     if len(found) > 1:
         names = _listed([one.name for one in found])
         raise InputError(f"{file} has {names}, and does not state which of them is {wanted}: keep only that one")
@@ -289,8 +275,7 @@ def _rotations(
 ) -> tuple[list[_Column], Rotation | None]:
     """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation."""
     for names in _QUATERNION:
-        matches = [one for name in names if (one := _column(file, columns, name)) is not None]
-        if len(matches) == len(names):
+        if matches := _columns(file, columns, names):
             return matches, rotations_of(np.column_stack([one.values for one in matches]), str(file))
     for names in _UNNAMED:
         same = [_only(file, [one for one in columns if one.plain == name], name) for name in names]
@@ -304,16 +289,13 @@ def _rotations(
             values = np.column_stack([one.values for one in matches])
             return matches, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
     for euler in _EULER:
-        matches = [one for name in euler if (one := _column(file, columns, name)) is not None]
-        if len(matches) == len(euler):
+        if matches := _columns(file, columns, euler):
             units = _units(file, matches, _ANGLE_UNITS, angles, "--angles")
-            for column, one_unit in zip(matches, units, strict=True):
-                if one_unit is None:
-                    raise InputError(
-                        f"{file} does not state whether {column.name} is in degrees: give --angles deg or rad"
-                    )
+            if None in units:
+                name = matches[units.index(None)].name
+                raise InputError(f"{file} does not state whether {name} is in degrees: give --angles deg or rad")
             assumptions.append("roll, pitch and yaw are about fixed axes, Rz(yaw) Ry(pitch) Rx(roll)")
-            scales = [_ANGLE_UNITS[str(one_unit)] for one_unit in units]
+            scales = [_ANGLE_UNITS[str(unit)] for unit in units]
             rotation_angles = np.column_stack([column.values for column in matches]) * scales
             return matches, Rotation.from_euler("xyz", rotation_angles)
     return [], None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -118,8 +119,9 @@ def _read_bag(
         assumptions.append("joints are revolute, so that their positions are in radians")
         names = tuple(f"{name} [rad]" for name in messages[0].name)
         return times, _joint_positions(messages, f"on {chosen} of {bag}"), names, assumptions
-    poses = [_within(message, POSES[kinds[chosen]]) for message in messages]
-    positions = np.array([_xyz(pose) for pose in poses])
+    poses = [reduce(getattr, POSES[kinds[chosen]], message) for message in messages]
+    points = [getattr(pose, "position", None) or pose.translation for pose in poses]
+    positions = np.array([(p.x, p.y, p.z) for p in points])
     orientations = [getattr(pose, "orientation", None) or pose.rotation for pose in poses]
     rotations = rotations_of(np.array([(q.x, q.y, q.z, q.w) for q in orientations]), str(bag))
     frame = _frame(messages[0], POSES[kinds[chosen]])
@@ -165,19 +167,8 @@ def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
     ]
 
 
-def _within(message: Any, path: Sequence[str]) -> Any:
-    for name in path:
-        message = getattr(message, name)
-    return message
-
-
-def _xyz(pose: Any) -> tuple[float, float, float]:
-    p = getattr(pose, "position", None) or pose.translation
-    return p.x, p.y, p.z
-
-
 def _frame(message: Any, path: Sequence[str]) -> str:
-    for holder in (message, _within(message, path[:1])):
+    for holder in (message, reduce(getattr, path[:1], message)):
         header = getattr(holder, "header", None)
         if header is not None:
             return str(header.frame_id)
