@@ -239,6 +239,18 @@ def external_wrench(
     return wrench
 
 
+def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies of stiffness and damping (6,) of a pose's coordinates; `owner` needs them, for messages.
+
+    Raises:
+        InputError: If a shape is wrong, a stiffness is not positive, or a damping is negative.
+    """
+    K, D = np.array(stiffness, dtype=float), np.array(damping, dtype=float)
+    if not K.shape == D.shape == (6,) or not (K > 0.0).all() or not (D >= 0.0).all():
+        raise InputError(f"{owner} needs six positive stiffnesses and six dampings, none negative")
+    return K, D
+
+
 def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) -> float:
     """Return the energy [J] of springs K e that are clipped at a limit F each, the sum of Huber's functions.
 
