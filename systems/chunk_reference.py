@@ -79,11 +79,7 @@ class ChunkReference(LeafSystem):
     get_reference_window_output_port = output_getter("reference_window", "means and covariances, ((H+1)(O + O²),)")
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        """Advance by a control step.
-
-        Raises:
-            PolicyError: If the base policy does not return chunks.
-        """
+        """Advance by a control step; raise a `PolicyError` if the base policy does not return chunks."""
         state = context.get_discrete_state(self._state).value().copy()
         state[-1] += 1.0
         if self._policy is not None and state[-1] % self._replan_steps == 0:

@@ -172,14 +172,10 @@ class MujocoGantry(LeafSystem):
         context.SetDiscreteState(self._state, self._at_rest(pose))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Scale the friction coefficients and the stiffness of contacts and springs; `context` is this system's.
+        """Scale all friction coefficients, and the stiffness of contacts and springs; `context` is this system's.
 
-        For a modulus above 1 the step of the engine is divided by √modulus, rounded up.
-
-        Args:
-            context: Context of this system.
-            friction: Factor of all friction coefficients.
-            modulus: Factor of the stiffness of contacts and springs.
+        `friction` and `modulus` are factors. For a modulus above 1 the step of the engine is divided by √modulus,
+        rounded up.
         """
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 

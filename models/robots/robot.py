@@ -149,10 +149,7 @@ _END_EFFECTORS: Registry[EndEffector] = Registry(
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot to the registry and return it.
-
-    Args:
-        robot: Robot with a name that is not registered yet.
+    """Add a robot, whose name is not registered yet, to the registry and return it.
 
     Raises:
         InputError: If the name is taken.

@@ -201,13 +201,14 @@ class SharedControlTemplate:
     @cached_property
     def _max_speeds(self) -> tuple[tuple[float, float], ...]:
         """Largest speed [m/s] and angular speed [rad/s] of the command in each state."""
+
+        def least(speed: float, of_state: float | None) -> float:
+            return speed if of_state is None else min(speed, of_state)
+
         return tuple(
             (
-                min(self.max_speed_m_per_s, math.inf if state.max_speed_m_per_s is None else state.max_speed_m_per_s),
-                min(
-                    self.max_speed_rad_per_s,
-                    math.inf if state.max_speed_rad_per_s is None else state.max_speed_rad_per_s,
-                ),
+                least(self.max_speed_m_per_s, state.max_speed_m_per_s),
+                least(self.max_speed_rad_per_s, state.max_speed_rad_per_s),
             )
             for state in self.states
         )
