@@ -177,6 +177,9 @@ class CartesianImpedanceController(LeafSystem):
         )
         M = plant.CalcMassMatrix(plant_context)
         q, v = plant.GetPositions(plant_context), plant.GetVelocities(plant_context)
+        gravity_torque = np.zeros_like(v)
+        if self._compensate_gravity:
+            gravity_torque = -plant.CalcGravityGeneralizedForces(plant_context)
         return impedance_torques(
             K=gains.stiffness,
             damping_ratio=gains.damping_ratio,
@@ -189,7 +192,7 @@ class CartesianImpedanceController(LeafSystem):
             M=M,
             v=v,
             posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
-            gravity_torque=self._gravity_torque(plant_context),
+            gravity_torque=gravity_torque,
             torque_limits=self._torque_limits,
             bound=self._bound(context),
         )
@@ -199,8 +202,3 @@ class CartesianImpedanceController(LeafSystem):
             return self._gains.bound
         bound = self._gains.bound or WrenchBound(self._gains.wrench_limits, np.inf, np.inf)
         return bound.lowered_to(self._max_wrench_port.Eval(context))
-
-    def _gravity_torque(self, plant_context: Context) -> np.ndarray:
-        if not self._compensate_gravity:
-            return np.zeros(self._plant.num_velocities())
-        return -self._plant.CalcGravityGeneralizedForces(plant_context)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
@@ -100,14 +100,7 @@ class EpisodeMonitor(LeafSystem):
         self._termination_port = declare.part_output(self, "termination", self._next, lambda state: state[-1])
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
-    def get_signal_input_port(self, name: str) -> InputPort:
-        """Return the port of the signal `name`.
-
-        Raises:
-            InputError: If no term depends on such a signal.
-        """
-        return self._signals.port(name)
-
+    get_signal_input_port = declare.get_signal_input_port
     get_termination_output_port = output_getter("termination", "index into `TERMINATIONS`, (1,)")
 
     def _calc_next(self, context: Context) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
@@ -65,14 +65,7 @@ class Recorder(LeafSystem):
         self._num_recorded_port = self.DeclareStateOutputPort("num_recorded", self._count)
         declare.update(self, period, self._record)
 
-    def get_signal_input_port(self, name: str) -> InputPort:
-        """Return the port of the signal `name`.
-
-        Raises:
-            InputError: If no such signal is recorded.
-        """
-        return self._signals.port(name)
-
+    get_signal_input_port = declare.get_signal_input_port
     get_num_recorded_output_port = output_getter("num_recorded", "number of samples so far, (1,)")
 
     def recording(self, context: Context) -> Recording:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
-from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
@@ -78,14 +78,7 @@ class RewardSystem(LeafSystem):
         """Names of the terms, in order."""
         return tuple(self._term_ports)
 
-    def get_signal_input_port(self, name: str) -> InputPort:
-        """Return the port of the signal `name`.
-
-        Raises:
-            InputError: If no term depends on such a signal.
-        """
-        return self._signals.port(name)
-
+    get_signal_input_port = declare.get_signal_input_port
     get_reward_output_port = output_getter("reward", "sum of all terms, (1,)")
 
     def get_term_output_port(self, name: str) -> OutputPort:

@@ -210,13 +210,9 @@ class ReferenceTrajectory:
         return inside + before + after
 
     def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
-        """Return this trajectory with a new time between steps and `time_scale` times its duration.
+        """Return this trajectory with a `period` [s] between steps and `time_scale` times its duration.
 
         Means and covariances are interpolated linearly. The number of steps times the period is the new duration.
-
-        Args:
-            period: Time between steps [s], positive.
-            time_scale: Factor of the duration, positive.
 
         Raises:
             InputError: If an argument is not positive, or fewer than two steps remain.

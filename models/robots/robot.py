@@ -149,7 +149,10 @@ _END_EFFECTORS: Registry[EndEffector] = Registry(
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot, whose name is not registered yet, to the registry and return it.
+    """Add a robot to the registry and return it.
+
+    Args:
+        robot: Robot with a name that is not registered yet.
 
     Raises:
         InputError: If the name is taken.

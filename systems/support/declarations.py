@@ -64,6 +64,15 @@ class SignalPorts:
         return {name: port.Eval(context) for name, port in self._ports.items()}
 
 
+def get_signal_input_port(self: Any, name: str) -> InputPort:
+    """Return the port of the signal `name`; a method of systems that store `SignalPorts` as `_signals`.
+
+    Raises:
+        InputError: If there is no such signal.
+    """
+    return self._signals.port(name)
+
+
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
     """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` describes it."""
     try:
@@ -191,10 +200,7 @@ def reset_to_default(system: LeafSystem) -> Callable[[Context, DiscreteValues], 
 
 
 def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
-    """Declare a discrete state that contains a vector input port, sampled at initialization and once per period [s].
-
-    Returns:
-        Index of the discrete state.
+    """Declare and return a discrete state with samples of a vector port, at initialization and once per period [s].
 
     Raises:
         InputError: If the period is not positive and finite.
