@@ -107,10 +107,7 @@ class Policy:
 
     @classmethod
     def load(cls, folder: Path | str) -> Policy:
-        """Read the policy that a training run saved in its folder.
-
-        Args:
-            folder: Folder with `policy.safetensors` and `policy.json`.
+        """Read the policy that a training run saved in a folder as `policy.safetensors` and `policy.json`.
 
         Raises:
             InputError: If a file is missing or damaged.

@@ -5,12 +5,13 @@ from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import after_start, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 
@@ -68,7 +69,6 @@ class ActiveConstraintProjector(LeafSystem):
         max_tracking_error: float = np.inf,
     ):
         super().__init__()
-        check_period(period)
         if not max_tracking_error > 0.0:
             raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
@@ -79,35 +79,24 @@ class ActiveConstraintProjector(LeafSystem):
 
         # The last command (6,), and the pose (6,) measured at that time.
         self._last = self.DeclareDiscreteState(12)
-        last = self.discrete_state_ticket(self._last)
-        constraints = {self._state_port.ticket(), self.frames.ticket}
-        self._command = declare_cache(
-            self,
-            "command",
-            self._calc_command,
-            prerequisites_of_calc=constraints | {last, self._requested_pose_port.ticket()},
+        constraints = [self._state_port, self.frames.ticket]
+        self._command = declare.cache(
+            self, "command", self._calc_command, [*constraints, self._last, self._requested_pose_port]
         )
-        command = {self._command.ticket()}
-        self._desired_pose_port = self.DeclareVectorOutputPort(
-            "desired_pose", 6, self._calc_desired_pose, prerequisites_of_calc=command
+        self._desired_pose_port = declare.part_output(
+            self, "desired_pose", self._command, lambda command: command[:6], 6
         )
-        self._last_desired_pose_port = self.DeclareVectorOutputPort(
-            "last_desired_pose", 6, self._calc_last_desired_pose, prerequisites_of_calc={last}
+        self._last_desired_pose_port = declare.part_output(
+            self, "last_desired_pose", self._last, lambda last: last[:6], 6
         )
-        self._fallback_port = self.DeclareVectorOutputPort(
-            "fallback", 1, self._calc_fallback, prerequisites_of_calc=command
+        self._fallback_port = declare.part_output(self, "fallback", self._command, lambda command: command[6])
+        self._commanded_violation_port = declare.scalar_output(
+            self, "commanded_violation", self._commanded_violation, [self._command, *constraints]
         )
-        self._commanded_violation_port = self.DeclareVectorOutputPort(
-            "commanded_violation", 1, self._calc_commanded_violation, prerequisites_of_calc=command | constraints
+        self._measured_violation_port = declare.scalar_output(
+            self, "measured_violation", self._measured_violation, [*constraints, self._pose_port]
         )
-        self._measured_violation_port = self.DeclareVectorOutputPort(
-            "measured_violation",
-            1,
-            self._calc_measured_violation,
-            prerequisites_of_calc=constraints | {self._pose_port.ticket()},
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, self._start)
 
     get_requested_pose_input_port = input_getter("requested_pose", "requested pose H^im, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
@@ -151,20 +140,11 @@ class ActiveConstraintProjector(LeafSystem):
         )
         return transform_to_pose(command.X_WE)
 
-    def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._command.Eval(context)[:6])
+    def _commanded_violation(self, context: Context) -> float:
+        return self._violation(context, self._command.Eval(context)[:6])
 
-    def _calc_last_desired_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._last).value()[:6])
-
-    def _calc_fallback(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._command.Eval(context)[6])
-
-    def _calc_commanded_violation(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._violation(context, self._command.Eval(context)[:6]))
-
-    def _calc_measured_violation(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._violation(context, self._pose_port.Eval(context)))
+    def _measured_violation(self, context: Context) -> float:
+        return self._violation(context, self._pose_port.Eval(context))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = self._pose_port.Eval(context)
@@ -176,8 +156,7 @@ class ActiveConstraintProjector(LeafSystem):
         command = self._template.command(state, X_WE, X_WE, frames, self._period)
         discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
 
+    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No step has ended at time zero. An event offset of one period would not fall on k * period exactly.
-        if context.get_time() > 0:
-            command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)
-            discrete_state.set_value(np.concatenate([command, measured]))
+        command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)
+        discrete_state.set_value(np.concatenate([command, measured]))

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
-from guiderail.systems.support.declarations import declare_cache, declare_plant_context, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
@@ -130,40 +131,24 @@ class CartesianImpedanceController(LeafSystem):
         self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
         self._followed_pose = LastValidPose(
-            self,
-            self._desired_pose_port,
-            self._command_time_port,
-            self._measured_pose,
-            period=period,
-            timeout=timeout,
+            self, self._desired_pose_port, self._command_time_port, self._pose, period=period, timeout=timeout
         )
 
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
-        state = {self._estimated_state_port.ticket()}
-        self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
-        self._law = declare_cache(
-            self,
-            "law",
-            self._calc_law,
-            prerequisites_of_calc=self._followed_pose.tickets | state | {self._max_wrench_port.ticket()},
+        self._plant_context = declare.plant_context(
+            self, plant, self._estimated_state_port.Eval, [self._estimated_state_port]
         )
-        law = {self._law.ticket()}
-        self._generalized_force_port = self.DeclareVectorOutputPort(
-            "generalized_force", num_joints, self._calc_generalized_force, prerequisites_of_calc=law
+        sources = [*self._followed_pose.tickets, self._estimated_state_port, self._max_wrench_port]
+        self._law = declare.cache(self, "law", self._calc_law, sources)
+        self._generalized_force_port = declare.part_output(
+            self, "generalized_force", self._law, lambda law: law.torque, num_joints
         )
-        self._pose_port = self.DeclareVectorOutputPort("pose", 6, self._calc_pose, prerequisites_of_calc=state)
-        self._impedance_wrench_port = self.DeclareVectorOutputPort(
-            "impedance_wrench", 6, self._calc_impedance_wrench, prerequisites_of_calc=law
+        self._pose_port = declare.output(self, "pose", 6, self._pose, [self._estimated_state_port])
+        self._impedance_wrench_port = declare.part_output(
+            self, "impedance_wrench", self._law, lambda law: law.wrench, 6
         )
-        self._saturation_port = self.DeclareVectorOutputPort(
-            "saturation", 1, self._calc_saturation, prerequisites_of_calc=law
-        )
-        self._command_timed_out_port = self.DeclareVectorOutputPort(
-            "command_timed_out",
-            1,
-            self._followed_pose.calc_timed_out,
-            prerequisites_of_calc=self._followed_pose.timed_out_tickets,
-        )
+        self._saturation_port = declare.part_output(self, "saturation", self._law, lambda law: float(law.is_saturated))
+        self._command_timed_out_port = self._followed_pose.declare_timed_out_output(self)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
@@ -175,11 +160,8 @@ class CartesianImpedanceController(LeafSystem):
     get_saturation_output_port = output_getter("saturation", "flag that the wrench or a motor is at its limit, (1,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
-    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
-        self._plant.SetPositionsAndVelocities(plant_context, self._estimated_state_port.Eval(context))
-
-    def _measured_pose(self, context: Context) -> np.ndarray:
-        return self._pose_port.Eval(context)
+    def _pose(self, context: Context) -> np.ndarray:
+        return transform_to_pose(self._tool_center.CalcPose(self._plant_context.Eval(context), self._target))
 
     def _calc_law(self, context: Context) -> JointTorques:
         plant, gains = self._plant, self._gains
@@ -195,6 +177,9 @@ class CartesianImpedanceController(LeafSystem):
         )
         M = plant.CalcMassMatrix(plant_context)
         q, v = plant.GetPositions(plant_context), plant.GetVelocities(plant_context)
+        gravity_torque = np.zeros_like(v)
+        if self._compensate_gravity:
+            gravity_torque = -plant.CalcGravityGeneralizedForces(plant_context)
         return impedance_torques(
             K=gains.stiffness,
             damping_ratio=gains.damping_ratio,
@@ -207,7 +192,7 @@ class CartesianImpedanceController(LeafSystem):
             M=M,
             v=v,
             posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
-            gravity_torque=self._gravity_torque(plant_context),
+            gravity_torque=gravity_torque,
             torque_limits=self._torque_limits,
             bound=self._bound(context),
         )
@@ -217,21 +202,3 @@ class CartesianImpedanceController(LeafSystem):
             return self._gains.bound
         bound = self._gains.bound or WrenchBound(self._gains.wrench_limits, np.inf, np.inf)
         return bound.lowered_to(self._max_wrench_port.Eval(context))
-
-    def _gravity_torque(self, plant_context: Context) -> np.ndarray:
-        if not self._compensate_gravity:
-            return np.zeros(self._plant.num_velocities())
-        return -self._plant.CalcGravityGeneralizedForces(plant_context)
-
-    def _calc_generalized_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._law.Eval(context).torque)
-
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        X_TP = self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)
-        output.SetFromVector(transform_to_pose(X_TP))
-
-    def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._law.Eval(context).wrench)
-
-    def _calc_saturation(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(self._law.Eval(context).is_saturated))

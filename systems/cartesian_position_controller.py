@@ -11,11 +11,12 @@ from pydrake.multibody.inverse_kinematics import (
 )
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
-from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import CommandValidity
 
@@ -109,14 +110,13 @@ class CartesianPositionController(LeafSystem):
         self._plant, self._target, self._tool_center = plant, target, tool_center
         self._period, self._speed_limits = period, speed_limits
         self._posture, self._posture_gain = np.array(posture, dtype=float), posture_gain
-        parameters = DifferentialInverseKinematicsParameters(num_joints, num_joints)
-        parameters.set_time_step(period)
-        parameters.set_nominal_joint_position(np.asarray(posture, dtype=float))
-        parameters.set_joint_centering_gain(posture_gain * np.eye(num_joints))
         self._position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
         self._velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
-        parameters.set_joint_velocity_limits(self._velocity_limits)
-        self._parameters = parameters
+        self._parameters = DifferentialInverseKinematicsParameters(num_joints, num_joints)
+        self._parameters.set_time_step(period)
+        self._parameters.set_nominal_joint_position(self._posture)
+        self._parameters.set_joint_centering_gain(posture_gain * np.eye(num_joints))
+        self._parameters.set_joint_velocity_limits(self._velocity_limits)
 
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
@@ -127,16 +127,14 @@ class CartesianPositionController(LeafSystem):
         self._command = self.DeclareDiscreteState(num_joints)
         self._is_stuck = self.DeclareDiscreteState(1)
         self._has_timed_out = self.DeclareDiscreteState(1)
-        command = {self.discrete_state_ticket(self._command)}
-        self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=command)
+        self._plant_context = declare.plant_context(self, plant, self._joint_command, [self._command])
         self._joint_positions_port = self.DeclareStateOutputPort("joint_positions", self._command)
-        self._pose_port = self.DeclareVectorOutputPort(
-            "pose", 6, self._calc_pose, prerequisites_of_calc={self._plant_context.ticket()}
+        self._pose_port = declare.output(
+            self, "pose", 6, lambda context: transform_to_pose(self._X_TP(context)), [self._plant_context]
         )
         self._stuck_port = self.DeclareStateOutputPort("stuck", self._is_stuck)
         self._command_timed_out_port = self.DeclareStateOutputPort("command_timed_out", self._has_timed_out)
-        self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
+        declare.update(self, period, self._step, self._start_at_measured_positions)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_positions_input_port = input_getter("positions", "measured joint positions, (n,) [rad]")
@@ -146,11 +144,11 @@ class CartesianPositionController(LeafSystem):
     get_stuck_output_port = output_getter("stuck", "flag that the desired direction cannot be followed, (1,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
-    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
-        self._plant.SetPositions(plant_context, self._joint_command(context))
-
     def _joint_command(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._command).value()
+
+    def _X_TP(self, context: Context) -> RigidTransform:
+        return self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)
 
     def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = self._positions_port.Eval(context)
@@ -159,8 +157,8 @@ class CartesianPositionController(LeafSystem):
                 f"the first joint command is the measured one, so measured positions must be finite, not {measured}"
             )
         discrete_state.set_value(self._command, measured)
-        discrete_state.set_value(self._is_stuck, [0.0])
-        discrete_state.set_value(self._has_timed_out, [0.0])
+        for flag in (self._is_stuck, self._has_timed_out):
+            discrete_state.set_value(flag, [0.0])
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         is_valid = self._validity.is_valid(context, context.get_time())
@@ -168,8 +166,7 @@ class CartesianPositionController(LeafSystem):
         if not is_valid:
             return
         plant, plant_context = self._plant, self._plant_context.Eval(context)
-        X_TP = self._tool_center.CalcPose(plant_context, self._target)
-        V = self._desired_velocity(X_TP, pose_to_transform(self._desired_pose_port.Eval(context)))
+        V = self._desired_velocity(self._X_TP(context), pose_to_transform(self._desired_pose_port.Eval(context)))
         J = plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
         )
@@ -206,10 +203,6 @@ class CartesianPositionController(LeafSystem):
         self._parameters.set_joint_position_limits(position_limits)
         result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
         return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
-
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        X_TP = self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)
-        output.SetFromVector(transform_to_pose(X_TP))
 
 
 def _within(values: np.ndarray, limits: tuple[np.ndarray, np.ndarray]) -> bool:

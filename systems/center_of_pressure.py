@@ -1,10 +1,11 @@
 """Center of pressure of a contact, computed from its wrench."""
 
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
@@ -36,14 +37,14 @@ class CenterOfPressure(LeafSystem):
         super().__init__()
         if not min_force > 0.0:
             raise InputError(f"a center of pressure needs a positive minimum force, not {min_force} N")
-        self._min_force = min_force
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
-        self._center_of_pressure_port = self.DeclareVectorOutputPort(
-            "center_of_pressure", 2, self._calc_center_of_pressure, prerequisites_of_calc={self._wrench_port.ticket()}
+        self._center_of_pressure_port = declare.output(
+            self,
+            "center_of_pressure",
+            2,
+            lambda context: center_of_pressure(self._wrench_port.Eval(context), min_force),
+            [self._wrench_port],
         )
 
     get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
     get_center_of_pressure_output_port = output_getter("center_of_pressure", "center of pressure, (2,) [m]")
-
-    def _calc_center_of_pressure(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(center_of_pressure(self._wrench_port.Eval(context), self._min_force))

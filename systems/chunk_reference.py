@@ -1,13 +1,14 @@
 """Chunks of a base policy as the reference window of a movement primitive."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import BasePolicy, chunk_samples, mean_and_variance
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.policy_system import PolicyError
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ChunkReference(LeafSystem):
@@ -56,7 +57,6 @@ class ChunkReference(LeafSystem):
         period: float,
     ):
         super().__init__()
-        check_period(period)
         if observation_size < 1 or horizon < 0 or replan_steps < 1:
             raise InputError(
                 f"observation_size and replan_steps are at least 1 and horizon at least 0, not {observation_size}, "
@@ -70,26 +70,16 @@ class ChunkReference(LeafSystem):
         self._observation_port = self.DeclareVectorInputPort("observation", observation_size)
         # [means and variances of the chunk (2, H + replan_steps, O); control steps since the start, −1 before it]
         self._state = self.DeclareDiscreteState(np.append(np.zeros(2 * self._num_points * outputs), -1.0))
-        self._window = declare_cache(
-            self, "window", self._calc_window, prerequisites_of_calc={self.discrete_state_ticket(self._state)}
+        self._reference_window_port = declare.output(
+            self, "reference_window", (horizon + 1) * (outputs + outputs**2), self._window, [self._state]
         )
-        self._reference_window_port = self.DeclareVectorOutputPort(
-            "reference_window",
-            (horizon + 1) * (outputs + outputs**2),
-            self._calc_reference_window,
-            prerequisites_of_calc={self._window.ticket()},
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update)
 
     get_observation_input_port = input_getter("observation", "observation of the base policy, (n,)")
     get_reference_window_output_port = output_getter("reference_window", "means and covariances, ((H+1)(O + O²),)")
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        """Advance by a control step.
-
-        Raises:
-            PolicyError: If the base policy does not return chunks.
-        """
+        """Advance by a control step; raise a `PolicyError` if the base policy does not return chunks."""
         state = context.get_discrete_state(self._state).value().copy()
         state[-1] += 1.0
         if self._policy is not None and state[-1] % self._replan_steps == 0:
@@ -101,7 +91,7 @@ class ChunkReference(LeafSystem):
             state[:-1] = np.concatenate(mean_and_variance(samples, self._num_points)).ravel()
         discrete_state.set_value(self._state, state)
 
-    def _calc_window(self, context: Context) -> np.ndarray:
+    def _window(self, context: Context) -> np.ndarray:
         state = context.get_discrete_state(self._state).value()
         step, outputs = int(state[-1]), self._reference.num_outputs
         at = np.minimum(max(step, 0) + np.arange(self._horizon + 1), self._reference.num_steps - 1)
@@ -113,6 +103,3 @@ class ChunkReference(LeafSystem):
             means = chunk[0]
             covariances = self._floor * self._reference.covariances[at] + chunk[1][:, :, None] * np.eye(outputs)
         return np.concatenate([means.ravel(), covariances.ravel()])
-
-    def _calc_reference_window(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._window.Eval(context))

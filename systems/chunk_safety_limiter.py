@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.chunk_guard import MIN_STEPS, ChunkGuard
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import after_start, input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,6 @@ class ChunkSafetyLimiter(LeafSystem):
 
     def __init__(self, guard: ChunkGuard, num_steps: int, replan_steps: int, period: float):
         super().__init__()
-        check_period(period)
         if not 1 <= replan_steps <= num_steps or num_steps < MIN_STEPS:
             raise InputError(
                 f"num_steps of a chunk must be at least {MIN_STEPS}, and replan_steps from 1 to num_steps, not "
@@ -65,22 +65,13 @@ class ChunkSafetyLimiter(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", self._outputs)
         # [last three commands and rest of the limited chunk (3 + K, O); rate, fallback, control steps since the start]
         self._state = self.DeclareDiscreteState((3 + num_steps) * self._outputs + 3)
-        self._plan = declare_cache(
-            self,
-            "plan",
-            self._calc_plan,
-            prerequisites_of_calc={self._chunk_port.ticket(), self.discrete_state_ticket(self._state)},
+        self._plan = declare.cache(self, "plan", self._calc_plan, [self._chunk_port, self._state])
+        self._desired_pose_port = declare.part_output(
+            self, "desired_pose", self._plan, lambda plan: plan.outputs[0], self._outputs
         )
-        plan = {self._plan.ticket()}
-        self._desired_pose_port = self.DeclareVectorOutputPort(
-            "desired_pose", self._outputs, self._calc_desired_pose, prerequisites_of_calc=plan
-        )
-        self._rate_port = self.DeclareVectorOutputPort("rate", 1, self._calc_rate, prerequisites_of_calc=plan)
-        self._fallback_port = self.DeclareVectorOutputPort(
-            "fallback", 1, self._calc_fallback, prerequisites_of_calc=plan
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
+        self._rate_port = declare.part_output(self, "rate", self._plan, lambda plan: plan.rate)
+        self._fallback_port = declare.part_output(self, "fallback", self._plan, lambda plan: plan.fallback)
+        declare.update(self, period, self._advance, self._reset)
 
     get_chunk_input_port = input_getter("chunk", "requested outputs, (K*O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,), read at initialization")
@@ -103,19 +94,9 @@ class ChunkSafetyLimiter(LeafSystem):
         limited = self._guard.limit(requested, past, rest)
         return _Plan(limited.outputs, limited.rate, float(limited.is_fallback))
 
+    @after_start
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No command has been executed at time zero; see `HistoryBuffer`.
-        if context.get_time() > 0:
-            state, plan = context.get_discrete_state(self._state).value(), self._plan.Eval(context)
-            past = state[self._outputs : 3 * self._outputs]
-            values = [past, plan.outputs.ravel(), plan.outputs[-1], [plan.rate, plan.fallback, state[-1] + 1.0]]
-            discrete_state.set_value(np.concatenate(values))
-
-    def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._plan.Eval(context).outputs[0])
-
-    def _calc_rate(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._plan.Eval(context).rate)
-
-    def _calc_fallback(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._plan.Eval(context).fallback)
+        state, plan = context.get_discrete_state(self._state).value(), self._plan.Eval(context)
+        past = state[self._outputs : 3 * self._outputs]
+        values = [past, plan.outputs.ravel(), plan.outputs[-1], [plan.rate, plan.fallback, state[-1] + 1.0]]
+        discrete_state.set_value(np.concatenate(values))

@@ -4,7 +4,8 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class CommandDisturbance(LeafSystem):
@@ -37,7 +38,6 @@ class CommandDisturbance(LeafSystem):
 
     def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
         super().__init__()
-        check_period(period)
         if size < 1:
             raise InputError(f"a command has at least one number, not {size}")
         if not 0.0 <= loss_probability < 1.0:
@@ -52,15 +52,11 @@ class CommandDisturbance(LeafSystem):
         self._delay_line = self.DeclareDiscreteState(delay * size) if delay else None  # oldest command first
         self._command_port = self.DeclareVectorInputPort("command", size)
         self._pose_port = self.DeclareVectorInputPort("pose", size)
-        state = {self.discrete_state_ticket(index) for index in (self._is_lost, self._last_delivered)}
-        source = (
-            self._command_port.ticket() if self._delay_line is None else self.discrete_state_ticket(self._delay_line)
+        source = self._command_port if self._delay_line is None else self._delay_line
+        self._delivered_command_port = declare.output(
+            self, "delivered_command", size, self._delivered, [self._is_lost, self._last_delivered, source]
         )
-        self._delivered_command_port = self.DeclareVectorOutputPort(
-            "delivered_command", size, self._calc_delivered_command, prerequisites_of_calc=state | {source}
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, self._reset)
 
     get_command_input_port = input_getter("command", "command, (n,)")
     get_pose_input_port = input_getter("pose", "measured pose, (n,)")
@@ -81,7 +77,7 @@ class CommandDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value()[0] + 1.0
         discrete_state.set_value(self._count, [count])
-        discrete_state.set_value(self._last_delivered, self._eval_delivered(context))
+        discrete_state.set_value(self._last_delivered, self._delivered(context))
         if self._delay_line is not None:
             command = self._command_port.Eval(context)
             line = context.get_discrete_state(self._delay_line).value()
@@ -91,13 +87,10 @@ class CommandDisturbance(LeafSystem):
             sample = np.random.default_rng([int(seed), int(count)]).uniform()
             discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
 
-    def _eval_delivered(self, context: Context) -> np.ndarray:
+    def _delivered(self, context: Context) -> np.ndarray:
         last = context.get_discrete_state(self._last_delivered).value()
         if context.get_discrete_state(self._is_lost).value()[0]:
             return last
         if self._delay_line is None:
             return self._command_port.Eval(context)
         return context.get_discrete_state(self._delay_line).value()[: len(last)]
-
-    def _calc_delivered_command(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._eval_delivered(context))

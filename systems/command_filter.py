@@ -1,10 +1,11 @@
 """Filter of commanded positions that depends on the last command."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.control.command_filters import CommandLaw
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import after_start, input_getter, output_getter
 
 
 class CommandFilter(LeafSystem):
@@ -38,27 +39,17 @@ class CommandFilter(LeafSystem):
 
     def __init__(self, law: CommandLaw, period: float):
         super().__init__()
-        check_period(period)
         self._law, outputs = law, law.num_outputs
         size = len(law.start(np.zeros(outputs)))
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
         self._last = self.DeclareDiscreteState(size)  # state of the law, which begins with the last command
-        self._command = declare_cache(
-            self,
-            "command",
-            self._calc_command,
-            prerequisites_of_calc={self._desired_pose_port.ticket(), self.discrete_state_ticket(self._last)},
+        self._command = declare.cache(self, "command", self._calc_command, [self._desired_pose_port, self._last])
+        self._safe_pose_port = declare.part_output(
+            self, "safe_pose", self._command, lambda command: command[:outputs], outputs
         )
-        command = {self._command.ticket()}
-        self._safe_pose_port = self.DeclareVectorOutputPort(
-            "safe_pose", outputs, self._calc_safe_pose, prerequisites_of_calc=command
-        )
-        self._intervention_port = self.DeclareVectorOutputPort(
-            "intervention", 1, self._calc_intervention, prerequisites_of_calc=command
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._intervention_port = declare.part_output(self, "intervention", self._command, lambda command: command[-1])
+        declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
@@ -68,19 +59,12 @@ class CommandFilter(LeafSystem):
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._law.start(self._pose_port.Eval(context)))
 
+    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No command has been executed at time zero.
-        if context.get_time() > 0:
-            discrete_state.set_value(self._command.Eval(context)[:-1])
+        discrete_state.set_value(self._command.Eval(context)[:-1])
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the next state, which begins with the safe command, and the intervention flag."""
         last = context.get_discrete_state(self._last).value()
         state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
         return np.append(state, float(is_changed))
-
-    def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._command.Eval(context)[: self._law.num_outputs])
-
-    def _calc_intervention(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._command.Eval(context)[-1])

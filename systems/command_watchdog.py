@@ -1,6 +1,5 @@
 """Watchdog that outputs the last valid command when commands stop."""
 
-import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
@@ -46,31 +45,18 @@ class CommandWatchdog(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
         self._followed_pose = LastValidPose(
-            self,
-            self._desired_pose_port,
-            self._command_time_port,
-            self._measured_pose,
-            period=period,
-            timeout=timeout,
+            self, self._desired_pose_port, self._command_time_port, self._pose_port.Eval, period=period, timeout=timeout
         )
         self._safe_pose_port = self.DeclareVectorOutputPort(
             "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._followed_pose.tickets
         )
-        self._command_timed_out_port = self.DeclareVectorOutputPort(
-            "command_timed_out",
-            1,
-            self._followed_pose.calc_timed_out,
-            prerequisites_of_calc=self._followed_pose.timed_out_tickets,
-        )
+        self._command_timed_out_port = self._followed_pose.declare_timed_out_output(self)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
     get_safe_pose_output_port = output_getter("safe_pose", "last valid desired pose, (O,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
-
-    def _measured_pose(self, context: Context) -> np.ndarray:
-        return self._pose_port.Eval(context)
 
     def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._followed_pose.eval(context))

@@ -1,10 +1,11 @@
 """Constraint violation of a pose."""
 
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import Source, check_period, input_getter, output_getter
 
 
 class ConstraintViolation(LeafSystem):
@@ -40,15 +41,13 @@ class ConstraintViolation(LeafSystem):
         check_period(period)
         self._constraints, self._period = constraints, period
         self._pose_port = self.DeclareVectorInputPort("pose", constraints.num_outputs)
-        prerequisites = {self._pose_port.ticket()}
+        sources: list[Source] = [self._pose_port]
         self._step = None
         if constraints.num_steps is not None:
             self._step = self.DeclareDiscreteState(1)
-            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
-            prerequisites.add(self.discrete_state_ticket(self._step))
-        self._violation_port = self.DeclareVectorOutputPort(
-            "violation", 1, self._calc_violation, prerequisites_of_calc=prerequisites
-        )
+            declare.update(self, period, self._advance)
+            sources.append(self._step)
+        self._violation_port = declare.scalar_output(self, "violation", self._violation, sources)
 
     get_pose_input_port = input_getter("pose", "pose, (O,)")
     get_violation_output_port = output_getter("violation", "violation max(c − G y), (1,)")
@@ -56,8 +55,8 @@ class ConstraintViolation(LeafSystem):
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value([round(context.get_time() / self._period)])
 
-    def _calc_violation(self, context: Context, output: BasicVector) -> None:
+    def _violation(self, context: Context) -> float:
         step = 0 if self._step is None else int(context.get_discrete_state(self._step).value()[0])
         violation = self._constraints.violation(self._pose_port.Eval(context), step)
         # max(UNCONSTRAINED, violation) would turn NaN into "no constraint".
-        output.SetAtIndex(0, self.UNCONSTRAINED if violation < self.UNCONSTRAINED else violation)
+        return self.UNCONSTRAINED if violation < self.UNCONSTRAINED else violation

@@ -8,7 +8,8 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ContactDetector(LeafSystem):
@@ -45,7 +46,6 @@ class ContactDetector(LeafSystem):
         self, plant: MultibodyPlant, bodies: Sequence[RigidBody], obstacles: Sequence[RigidBody], period: float
     ):
         super().__init__()
-        check_period(period)
         self._bodies = {int(body.index()) for body in bodies}
         self._obstacles = {int(body.index()) for body in obstacles}
         if self._bodies & self._obstacles:
@@ -60,8 +60,7 @@ class ContactDetector(LeafSystem):
         self._collision_port = self.DeclareStateOutputPort("collision", self._collision)
         self._has_collided_port = self.DeclareStateOutputPort("has_collided", self._has_collided)
         self._contact_force_port = self.DeclareStateOutputPort("contact_force", self._contact_force)
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_contact_results_input_port = input_getter("contact_results", "plant's contact results")
     get_collision_output_port = output_getter("collision", "flag that a body touches an obstacle now, (1,)")
@@ -88,10 +87,6 @@ class ContactDetector(LeafSystem):
 
     def _is_collision(self, a: int, b: int) -> bool:
         return (a in self._bodies and b in self._obstacles) or (b in self._bodies and a in self._obstacles)
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for index in (self._collision, self._has_collided, self._contact_force):
-            discrete_state.set_value(index, [0.0])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         force = self._largest_force(context)

@@ -3,13 +3,21 @@
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
-from guiderail.models.control.wrench import MAX_WRENCH_SIZE, POSE_ORDER, WrenchBound, admissible_share, spring_energy
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.models.control.wrench import (
+    MAX_WRENCH_SIZE,
+    POSE_ORDER,
+    WrenchBound,
+    admissible_share,
+    check_spring_damper,
+    spring_energy,
+)
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class _Admitted(NamedTuple):
@@ -62,11 +70,7 @@ class EnergyTank(LeafSystem):
         self, stiffness: np.ndarray, damping: np.ndarray, bound: WrenchBound, *, capacity: float, period: float
     ):
         super().__init__()
-        check_period(period)
-        self._stiffness, self._damping = (np.array(values, dtype=float) for values in (stiffness, damping))
-        shapes_agree = self._stiffness.shape == self._damping.shape == (POSE_SIZE,)
-        if not shapes_agree or not (self._stiffness > 0.0).all() or not (self._damping >= 0.0).all():
-            raise InputError("an energy tank needs six positive stiffnesses and six dampings, none negative")
+        self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
         if not 0.0 < capacity < np.inf:
             raise InputError(f"an energy tank's capacity must be positive, not {capacity} J")
         self._bound, self._capacity, self._period = bound, capacity, period
@@ -77,20 +81,17 @@ class EnergyTank(LeafSystem):
         self._last_limits = self.DeclareDiscreteState(POSE_SIZE)
         self._last_pose = self.DeclareDiscreteState(POSE_SIZE)
         self._content = self.DeclareDiscreteState([capacity])
-        inputs = {port.ticket() for port in (self._desired_pose_port, self._pose_port, self._max_wrench_port)}
+        inputs = (self._desired_pose_port, self._pose_port, self._max_wrench_port)
         states = (self._last_reference, self._last_limits, self._last_pose, self._content)
-        everything = inputs | {self.discrete_state_ticket(state) for state in states}
-        self._admitted = declare_cache(self, "admitted", self._calc_admitted, prerequisites_of_calc=everything)
-        admitted = {self._admitted.ticket()}
-        self._reference_pose_port = self.DeclareVectorOutputPort(
-            "reference_pose", POSE_SIZE, self._calc_reference_pose, prerequisites_of_calc=admitted
+        self._admitted = declare.cache(self, "admitted", self._calc_admitted, [*inputs, *states])
+        self._reference_pose_port = declare.output(
+            self, "reference_pose", POSE_SIZE, self._reference_pose, [self._admitted]
         )
-        self._admitted_wrench_port = self.DeclareVectorOutputPort(
-            "admitted_wrench", MAX_WRENCH_SIZE, self._calc_admitted_wrench, prerequisites_of_calc=admitted
+        self._admitted_wrench_port = declare.output(
+            self, "admitted_wrench", MAX_WRENCH_SIZE, self._admitted_wrench, [self._admitted]
         )
         self._energy_port = self.DeclareStateOutputPort("energy", self._content)
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
@@ -129,16 +130,16 @@ class EnergyTank(LeafSystem):
         added = spring_energy(K, admitted, pose_difference(next_reference, pose)) - stored
         return _Admitted(next_reference, admitted, min(self._capacity, max(energy - added, 0.0)))
 
-    def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
+    def _reference_pose(self, context: Context) -> np.ndarray:
         desired = self._desired_pose_port.Eval(context)
-        output.SetFromVector(self._admitted.Eval(context).reference if is_finite(desired) else desired)
+        return self._admitted.Eval(context).reference if is_finite(desired) else desired
 
-    def _calc_admitted_wrench(self, context: Context, output: BasicVector) -> None:
+    def _admitted_wrench(self, context: Context) -> np.ndarray:
         bound = self._requested_bound(context)
         numbers = np.empty(MAX_WRENCH_SIZE)
         numbers[:POSE_SIZE] = self._admitted.Eval(context).limits[POSE_ORDER]
         numbers[POSE_SIZE:] = bound.force, bound.torque
-        output.SetFromVector(numbers)
+        return numbers
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)

@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import SignalPorts, check_period, check_takes, declare_cache, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import SignalPorts, after_start, check_takes, output_getter
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.
@@ -84,7 +85,6 @@ class EpisodeMonitor(LeafSystem):
         super().__init__()
         if not terms:
             raise InputError("a monitor needs at least one condition")
-        check_period(period)
         of_task = f" of {task_name}" if task_name else ""
         for term in terms:
             for function in filter(None, (term.condition, term.progress)):
@@ -94,29 +94,13 @@ class EpisodeMonitor(LeafSystem):
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
 
         # [count, maximum progress] of each term, then the index of the termination.
-        self._initial_state = np.append(np.tile([0.0, -np.inf], len(self._terms)), 0.0)
-        self._state = self.DeclareDiscreteState(self._initial_state)
+        self._state = self.DeclareDiscreteState(np.append(np.tile([0.0, -np.inf], len(self._terms)), 0.0))
         # The output and the event of the same instant share one evaluation.
-        self._next = declare_cache(
-            self,
-            "next_state",
-            self._calc_next,
-            prerequisites_of_calc=self._signals.tickets | {self.discrete_state_ticket(self._state)},
-        )
-        self._termination_port = self.DeclareVectorOutputPort(
-            "termination", 1, self._calc_termination, prerequisites_of_calc={self._next.ticket()}
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._next = declare.cache(self, "next_state", self._calc_next, [*self._signals.tickets, self._state])
+        self._termination_port = declare.part_output(self, "termination", self._next, lambda state: state[-1])
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
-    def get_signal_input_port(self, name: str) -> InputPort:
-        """Return the port of the signal `name`.
-
-        Raises:
-            InputError: If no term depends on such a signal.
-        """
-        return self._signals.port(name)
-
+    get_signal_input_port = declare.get_signal_input_port
     get_termination_output_port = output_getter("termination", "index into `TERMINATIONS`, (1,)")
 
     def _calc_next(self, context: Context) -> np.ndarray:
@@ -136,13 +120,6 @@ class EpisodeMonitor(LeafSystem):
                 state[-1] = self._indices[i]
         return state
 
-    def _calc_termination(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._next.Eval(context)[-1])
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._initial_state)
-
+    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No step has ended at time zero. An event offset of one period would not coincide exactly with k * period.
-        if context.get_time() > 0:
-            discrete_state.set_value(self._next.Eval(context))
+        discrete_state.set_value(self._next.Eval(context))

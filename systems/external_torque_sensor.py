@@ -10,13 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.sensor_disturbance import DRIFT_TIME
-from guiderail.systems.support.declarations import (
-    check_period,
-    declare_cache,
-    declare_plant_context,
-    input_getter,
-    output_getter,
-)
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 FRICTION_SPEED = 0.01  # joint speed at which friction has 76 % of its magnitude [rad/s]
 
@@ -97,31 +92,19 @@ class ExternalTorqueSensor(LeafSystem):
         self._noise_sample, self._walk = self.DeclareDiscreteState(n), self.DeclareDiscreteState(n)
         self._state_port = self.DeclareVectorInputPort("state", 2 * n)
         self._contact_torque_port = self.DeclareVectorInputPort("contact_torque", n)
-        state, parameters = self._state_port.ticket(), self.all_parameters_ticket()
-        self._model = declare_plant_context(self, plant, self._set_positions, prerequisites_of_calc={state})
-        self._bodies_set = declare_cache(self, "actual_bodies", self._actual_bodies, prerequisites_of_calc={parameters})
+        self._model = declare.plant_context(self, plant, self._positions, [self._state_port])
+        self._bodies_set = declare.cache(self, "actual_bodies", self._actual_bodies, [self.all_parameters_ticket()])
         # The value is [plant context, bodies set in it]: bodies change only at a reset, positions at every step.
         self._actual = self.DeclareCacheEntry(
             description="actual_arm",
             value_producer=ValueProducer(
                 allocate=lambda: Value([plant.CreateDefaultContext(), None]), calc=self._calc_actual
             ),
-            prerequisites_of_calc={state, self._bodies_set.ticket()},
+            prerequisites_of_calc={self._state_port.ticket(), self._bodies_set.ticket()},
         )
-        self._external_torque_port = self.DeclareVectorOutputPort(
-            "external_torque",
-            n,
-            self._calc_external_torque,
-            prerequisites_of_calc={
-                self._contact_torque_port.ticket(),
-                self._model.ticket(),
-                self._actual.ticket(),
-                self.discrete_state_ticket(self._noise_sample),
-                self.discrete_state_ticket(self._walk),
-            },
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        sources = [self._contact_torque_port, self._model, self._actual, self._noise_sample, self._walk]
+        self._external_torque_port = declare.output(self, "external_torque", n, self._external_torque, sources)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_state_input_port = input_getter("state", "positions and velocities of the joints, (2n,)")
     get_contact_torque_input_port = input_getter("contact_torque", "joint torques of contact forces, (n,) [Nm]")
@@ -149,9 +132,8 @@ class ExternalTorqueSensor(LeafSystem):
         masses = context.get_mutable_numeric_parameter(self._mass)
         masses.SetAtIndex(self._payload_index, masses.GetAtIndex(self._payload_index) + mass)
 
-    def _set_positions(self, context: Context, plant_context: Context) -> None:
-        n = self._plant.num_positions()
-        self._plant.SetPositions(plant_context, self._state_port.Eval(context)[:n])
+    def _positions(self, context: Context) -> np.ndarray:
+        return self._state_port.Eval(context)[: len(self._noise)]
 
     def _actual_bodies(self, context: Context) -> list[tuple[float, np.ndarray]]:
         """Return actual mass [kg] and center of mass (3,) [m] of each body."""
@@ -164,18 +146,12 @@ class ExternalTorqueSensor(LeafSystem):
 
     def _calc_actual(self, context: Context, value: AbstractValue) -> None:
         arm, actual = value.get_mutable_value(), self._bodies_set.Eval(context)
-        self._set_positions(context, arm[0])
+        self._plant.SetPositions(arm[0], self._positions(context))
         if arm[1] is not actual:
             for body, (mass, center) in zip(self._bodies, actual, strict=True):
                 body.SetMass(arm[0], mass)
                 body.SetCenterOfMassInBodyFrame(arm[0], center)
             arm[1] = actual
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        n = len(self._noise)
-        discrete_state.set_value(self._count, np.zeros(1))
-        discrete_state.set_value(self._noise_sample, np.zeros(n))
-        discrete_state.set_value(self._walk, np.zeros(n))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value()[0] + 1.0
@@ -186,7 +162,7 @@ class ExternalTorqueSensor(LeafSystem):
         discrete_state.set_value(self._noise_sample, self._noise * noise)
         discrete_state.set_value(self._walk, walk + self._step * self._drift * step)
 
-    def _calc_external_torque(self, context: Context, output: BasicVector) -> None:
+    def _external_torque(self, context: Context) -> np.ndarray:
         n = len(self._noise)
         contact, velocities = self._contact_torque_port.Eval(context), self._state_port.Eval(context)[n:]
         gravity = self._plant.CalcGravityGeneralizedForces(self._model.Eval(context))
@@ -195,7 +171,7 @@ class ExternalTorqueSensor(LeafSystem):
             context.get_numeric_parameter(index).value() for index in (self._gain, self._offset, self._friction)
         )
         noise, walk = (context.get_discrete_state(index).value() for index in (self._noise_sample, self._walk))
-        output.SetFromVector(
+        return (
             contact
             + gain * (contact + gravity)
             + (actual - gravity)

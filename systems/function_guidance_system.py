@@ -6,7 +6,8 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 GuidanceFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Function of action (A,), pose (O,) and wrench (W,) that returns the desired pose (O,)."""
@@ -48,7 +49,6 @@ class FunctionGuidanceSystem(LeafSystem):
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
         super().__init__()
-        check_period(period)
         if min(action_size, pose_size, wrench_size) < 1:
             raise InputError(f"guidance needs sizes of at least 1, not {action_size}, {pose_size} and {wrench_size}")
         self._function = function
@@ -61,8 +61,7 @@ class FunctionGuidanceSystem(LeafSystem):
         self._desired_pose_port = self.DeclareStateOutputPort("desired_pose", self._desired_pose)
         self._held_action_port = self.DeclareStateOutputPort("held_action", self._held_action)
         self._fallback_port = self.DeclareStateOutputPort("fallback", self._fallback)
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
+        declare.update(self, period, self._step, self._reset)
 
     get_action_input_port = input_getter("action", "policy's action in [−1, 1], (A,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")

@@ -1,10 +1,11 @@
 """Desired state of the position drives of a gripper."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class GripperCommand(LeafSystem):
@@ -41,17 +42,13 @@ class GripperCommand(LeafSystem):
             raise InputError("a gripper needs a lower limit, an upper limit and an opening for each of its joints")
         if not ((self._lower <= opening) & (opening <= self._upper)).all():
             raise InputError(f"a gripper's opening must be within its joints' limits, not {opening}")
-        check_period(period)
         num_joints = len(opening)
         self._position_port = self.DeclareVectorInputPort("position", num_joints)
         self._last_position = self.DeclareDiscreteState(opening)
-        self._desired_state_port = self.DeclareVectorOutputPort(
-            "desired_state",
-            2 * num_joints,
-            self._calc_desired_state,
-            prerequisites_of_calc={self._position_port.ticket(), self.discrete_state_ticket(self._last_position)},
+        self._desired_state_port = declare.output(
+            self, "desired_state", 2 * num_joints, self._desired_state, [self._position_port, self._last_position]
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update)
 
     get_position_input_port = input_getter("position", "desired positions, (n,); optional")
     get_desired_state_output_port = output_getter("desired_state", "desired positions and velocities, (2n,)")
@@ -63,9 +60,9 @@ class GripperCommand(LeafSystem):
         position = self._position_port.Eval(context)
         return np.where(np.isfinite(position), np.clip(position, self._lower, self._upper), last)
 
-    def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
+    def _desired_state(self, context: Context) -> np.ndarray:
         position = self._valid_position(context)
-        output.SetFromVector(np.concatenate([position, np.zeros_like(position)]))
+        return np.concatenate([position, np.zeros_like(position)])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._valid_position(context))

@@ -2,11 +2,12 @@
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_SENDERS, Fault, Heartbeat
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 FORGET_TIME = 1.0  # age of a heartbeat above which its sender is ignored while another monitor is alive [s]
 
@@ -41,27 +42,17 @@ class HeartbeatMonitor(LeafSystem):
 
     def __init__(self, *, period: float, timeout: float):
         super().__init__()
-        check_period(period)
         if not 0.0 < timeout < np.inf:
             raise InputError(f"the heartbeat timeout must be positive, not {timeout} s")
         self._period, self._timeout = period, timeout
         self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         # For each sender [sender; its last sequence number; time since that heartbeat in s]; NaN if unused.
-        self._initial = np.full(3 * MAX_SENDERS, np.nan)
-        self._state = self.DeclareDiscreteState(self._initial)
-        self._fault_port = self.DeclareVectorOutputPort(
-            "fault",
-            1,
-            self._calc_fault,
-            prerequisites_of_calc={
-                self._heartbeats_port.ticket(),
-                self._status_fault_port.ticket(),
-                self.discrete_state_ticket(self._state),
-            },
+        self._state = self.DeclareDiscreteState(np.full(3 * MAX_SENDERS, np.nan))
+        self._fault_port = declare.scalar_output(
+            self, "fault", self._fault, [self._heartbeats_port, self._status_fault_port, self._state]
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_heartbeats_input_port = input_getter("heartbeats", "newest `Heartbeat` of each sender; other types are ignored")
     get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
@@ -85,20 +76,17 @@ class HeartbeatMonitor(LeafSystem):
         rows = sorted((age, sender, sequence) for sender, (sequence, age) in known.items())[:MAX_SENDERS]
         return np.array([(sender, sequence, age) for age, sender, sequence in rows]).reshape(len(rows), 3)
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._initial)
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state, senders = self._initial.copy(), self._senders(context)
+        state, senders = np.full(3 * MAX_SENDERS, np.nan), self._senders(context)
         senders[:, 2] += self._period
         state[: senders.size] = senders.ravel()
         discrete_state.set_value(state)
 
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+    def _fault(self, context: Context) -> float:
         fault = float(self._status_fault_port.Eval(context)[0])
         if fault == Fault.NONE and self._is_stopping_or_missing(context):
-            fault = float(Fault.MONITOR_STOP)
-        output.SetAtIndex(0, fault)
+            return float(Fault.MONITOR_STOP)
+        return fault
 
     def _is_stopping_or_missing(self, context: Context) -> bool:
         ages = {sender: age for sender, _, age in self._senders(context).tolist()}

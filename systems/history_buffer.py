@@ -4,7 +4,8 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import after_start, input_getter, output_getter
 
 
 class HistoryBuffer(LeafSystem):
@@ -42,15 +43,13 @@ class HistoryBuffer(LeafSystem):
         super().__init__()
         if num_outputs < 1 or length < 1:
             raise InputError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
-        check_period(period)
         self._shape = (length, num_outputs)
 
         self._output_port = self.DeclareVectorInputPort("output", num_outputs)
         self._initial_output_port = self.DeclareVectorInputPort("initial_output", num_outputs)
         self._state = self.DeclareDiscreteState(length * num_outputs)
         self._history_port = self.DeclareStateOutputPort("history", self._state)
-        self.DeclareInitializationDiscreteUpdateEvent(self._fill)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._shift)
+        declare.update(self, period, self._shift, self._fill)
 
     get_output_input_port = input_getter("output", "output to store, (O,)")
     get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,); optional")
@@ -60,9 +59,7 @@ class HistoryBuffer(LeafSystem):
         initial = self._initial_output_port if self._initial_output_port.HasValue(context) else self._output_port
         discrete_state.set_value(np.tile(initial.Eval(context), self._shape[0]))
 
+    @after_start
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No output has been executed at time zero. An event offset of one period cannot be used: period + k * period
-        # differs from (k + 1) * period in the last bit for every third k.
-        if context.get_time() > 0:
-            remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]
-            discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))
+        remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]
+        discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class HistoryLengthSchedule(LeafSystem):
@@ -61,27 +62,22 @@ class HistoryLengthSchedule(LeafSystem):
             )
         if dwell_steps < 1 or wrench_size < 1:
             raise InputError(f"dwell steps and wrench size must be at least 1, not {dwell_steps} and {wrench_size}")
-        check_period(period)
         self._lengths = sorted({int(length) for length in lengths}, reverse=True)
         self._contact_threshold, self._release_threshold = contact_threshold, release_threshold
         self._dwell_steps = dwell_steps
         self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
         # [index into `_lengths`, longest first; 1 in contact, else 0; steps in free space since the last longer length]
         self._state = self.DeclareDiscreteState(3)
-        self._history_length_port = self.DeclareVectorOutputPort(
+        self._history_length_port = declare.scalar_output(
+            self,
             "history_length",
-            1,
-            self._calc_history_length,
-            prerequisites_of_calc={self.discrete_state_ticket(self._state)},
+            lambda context: self._lengths[int(context.get_discrete_state(self._state).value()[0])],
+            [self._state],
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_wrench_input_port = input_getter("wrench", "measured wrench, (W,), force first")
     get_history_length_output_port = output_getter("history_length", "history length P, (1,)")
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._state, np.zeros(3))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         index, in_contact, num_free_steps = context.get_discrete_state(self._state).value()
@@ -95,6 +91,3 @@ class HistoryLengthSchedule(LeafSystem):
             if num_free_steps >= self._dwell_steps:
                 index, num_free_steps = max(index - 1, 0), 0
         discrete_state.set_value(self._state, [index, in_contact, num_free_steps])
-
-    def _calc_history_length(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._lengths[int(context.get_discrete_state(self._state).value()[0])])

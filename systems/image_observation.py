@@ -2,10 +2,11 @@
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
@@ -46,18 +47,15 @@ class ImageObservation(LeafSystem):
             )
         self._image_port = self.DeclareAbstractInputPort("image", Value(ImageRgba8U(width, height)))
         self._state_port = self.DeclareVectorInputPort("state", state_size)
-        self._observation_port = self.DeclareVectorOutputPort(
-            "observation",
-            3 * height * width + state_size,
-            self._calc_observation,
-            prerequisites_of_calc={self._image_port.ticket(), self._state_port.ticket()},
-        )
+        size = 3 * height * width + state_size
+        sources = [self._image_port, self._state_port]
+        self._observation_port = declare.output(self, "observation", size, self._observation, sources)
 
     get_image_input_port = input_getter("image", "color image, an abstract `ImageRgba8U`")
     get_state_input_port = input_getter("state", "further entries of the observation, (n,)")
     get_observation_output_port = output_getter("observation", "image in [0, 1] and state, (3 · height · width + n,)")
 
-    def _calc_observation(self, context: Context, output: BasicVector) -> None:
+    def _observation(self, context: Context) -> np.ndarray:
         image = self._image_port.Eval(context).data[:, :, :3]
         pixels = np.moveaxis(image, -1, 0).ravel() / 255.0
-        output.SetFromVector(np.concatenate([pixels, self._state_port.Eval(context)]))
+        return np.concatenate([pixels, self._state_port.Eval(context)])

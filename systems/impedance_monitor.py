@@ -1,9 +1,10 @@
 """Contact force and saturation of an impedance controller."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
@@ -40,20 +41,16 @@ class ImpedanceMonitor(LeafSystem):
         if self._limits.shape != (6,) or not (self._limits > 0.0).all():
             raise InputError(f"an impedance monitor needs six positive limits, not {limits}")
         self._impedance_wrench_port = self.DeclareVectorInputPort("impedance_wrench", 6)
-        wrench = {self._impedance_wrench_port.ticket()}
-        self._contact_force_port = self.DeclareVectorOutputPort(
-            "contact_force", 1, self._calc_contact_force, prerequisites_of_calc=wrench
-        )
-        self._saturation_port = self.DeclareVectorOutputPort(
-            "saturation", 1, self._calc_saturation, prerequisites_of_calc=wrench
-        )
+        sources = [self._impedance_wrench_port]
+        self._contact_force_port = declare.scalar_output(self, "contact_force", self._contact_force, sources)
+        self._saturation_port = declare.scalar_output(self, "saturation", self._saturation, sources)
 
     get_impedance_wrench_input_port = input_getter("impedance_wrench", "wrench that the impedance applies, (6,)")
     get_contact_force_output_port = output_getter("contact_force", "norm of the force of the impedance, (1,) [N]")
     get_saturation_output_port = output_getter("saturation", "flag that a component is at its limit, (1,)")
 
-    def _calc_contact_force(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(np.linalg.norm(self._impedance_wrench_port.Eval(context)[:3])))
+    def _contact_force(self, context: Context) -> float:
+        return float(np.linalg.norm(self._impedance_wrench_port.Eval(context)[:3]))
 
-    def _calc_saturation(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float((np.abs(self._impedance_wrench_port.Eval(context)) >= 0.999 * self._limits).any()))
+    def _saturation(self, context: Context) -> float:
+        return float((np.abs(self._impedance_wrench_port.Eval(context)) >= 0.999 * self._limits).any())

@@ -7,7 +7,8 @@ from pydrake.systems.framework import Context, DiscreteValues, EventStatus, Leaf
 
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, declare_plant_context, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class JointTorqueWrench(LeafSystem):
@@ -56,7 +57,6 @@ class JointTorqueWrench(LeafSystem):
         damping: float = 1e-4,
     ):
         super().__init__()
-        check_period(period)
         if not 0.0 <= time_constant < np.inf or not damping >= 0.0:
             raise InputError("a wrench estimate's time constant and damping must not be negative")
         num_joints = plant.num_positions()
@@ -68,30 +68,21 @@ class JointTorqueWrench(LeafSystem):
         self._state = self.DeclareDiscreteState(6)
         self._has_sample = self.DeclareDiscreteState(1)
         self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
-        self._plant_context = declare_plant_context(
-            self, plant, self._set_plant_state, prerequisites_of_calc={self._positions_port.ticket()}
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        self._plant_context = declare.plant_context(self, plant, self._positions_port.Eval, [self._positions_port])
+        declare.update(self, period, self._sample)
 
     get_positions_input_port = input_getter("positions", "measured joint positions, (n,) [rad]")
     get_external_torque_input_port = input_getter("external_torque", "external joint torques, (n,) [Nm]")
     get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
-
-    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
-        self._plant.SetPositions(plant_context, self._positions_port.Eval(context))
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         external_torque = self._external_torque_port.Eval(context)
         # NaN would remain in the state of the filter.
         if not is_finite(self._positions_port.Eval(context)) or not is_finite(external_torque):
             return EventStatus.DidNothing()
+        plant_context, target = self._plant_context.Eval(context), self._target
         J = self._plant.CalcJacobianSpatialVelocity(
-            self._plant_context.Eval(context),
-            JacobianWrtVariable.kV,
-            self._tool_center,
-            np.zeros(3),
-            self._target,
-            self._target,
+            plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), target, target
         )
         # [torque, force], as the Jacobian's rows are [rotational, translational]
         F = np.linalg.solve(J @ J.T + self._damping, J @ external_torque)

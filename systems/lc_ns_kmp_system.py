@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,6 @@ class LcNsKmpSystem(LeafSystem):
             constraints, others = primitive.constraints, other.constraints
             if not (np.array_equal(constraints.G, others.G) and np.array_equal(constraints.c, others.c)):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
-        check_period(period)
         self._primitive, self._period = primitive, period
         self._by_history_length = {
             one.history: (one, _checked_gain(one_gain, outputs)) for one, one_gain in [(primitive, gain), *shorter]
@@ -100,27 +100,19 @@ class LcNsKmpSystem(LeafSystem):
         self._step = self.DeclareDiscreteState(1)
         self._initial_command = primitive.constraints.nearest(primitive.reference.means[0])
         self._last_command = self.DeclareDiscreteState(self._initial_command)
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
+        declare.update(self, period, self._advance, self._reset)
 
-        prerequisites = {
-            self._null_space_action_port.ticket(),
-            self.discrete_state_ticket(self._step),
-            self.discrete_state_ticket(self._last_command),
-            self._motion_time_port.ticket(),
-            self._reference_window_port.ticket(),
-        }
-        prerequisites |= {port.ticket() for port in (self._history_port, self._history_length_port) if port is not None}
-        self._prediction = declare_cache(self, "prediction", self._predict, prerequisites_of_calc=prerequisites)
-        prediction = {self._prediction.ticket()}
-        self._command_port = self.DeclareVectorOutputPort(
-            "command", outputs, self._calc_command, prerequisites_of_calc=prediction
+        optional = [port for port in (self._history_port, self._history_length_port) if port is not None]
+        ports = [self._null_space_action_port, self._motion_time_port, self._reference_window_port, *optional]
+        self._prediction = declare.cache(self, "prediction", self._predict, [*ports, self._step, self._last_command])
+        self._command_port = declare.part_output(
+            self, "command", self._prediction, lambda prediction: prediction.output, outputs
         )
-        self._constraint_violation_port = self.DeclareVectorOutputPort(
-            "constraint_violation", 1, self._calc_constraint_violation, prerequisites_of_calc=prediction
+        self._constraint_violation_port = declare.part_output(
+            self, "constraint_violation", self._prediction, self._violation
         )
-        self._fallback_port = self.DeclareVectorOutputPort(
-            "fallback", 1, self._calc_fallback, prerequisites_of_calc=prediction
+        self._fallback_port = declare.part_output(
+            self, "fallback", self._prediction, lambda prediction: prediction.fallback
         )
 
     @property
@@ -172,8 +164,7 @@ class LcNsKmpSystem(LeafSystem):
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._period)
         if step > 0:
-            prediction = self._prediction.Eval(context)
-            discrete_state.set_value(self._last_command, prediction.output)
+            discrete_state.set_value(self._last_command, self._prediction.Eval(context).output)
         discrete_state.set_value(self._step, [step])
 
     def _predict(self, context: Context) -> _Prediction:
@@ -208,16 +199,9 @@ class LcNsKmpSystem(LeafSystem):
             output, fallback = self._primitive.constraints.nearest(last_command, step), 1.0
         return _Prediction(step, output, fallback)
 
-    def _calc_command(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._prediction.Eval(context).output)
-
-    def _calc_constraint_violation(self, context: Context, output: BasicVector) -> None:
-        prediction = self._prediction.Eval(context)
+    def _violation(self, prediction: _Prediction) -> float:
         violation = self._primitive.constraints.violation(prediction.output, prediction.step)
-        output.SetAtIndex(0, max(violation, ConstraintViolation.UNCONSTRAINED))
-
-    def _calc_fallback(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._prediction.Eval(context).fallback)
+        return max(violation, ConstraintViolation.UNCONSTRAINED)
 
 
 def _checked_gain(gain: np.ndarray | None, outputs: int) -> np.ndarray:

@@ -1,10 +1,11 @@
 """Mean contact force of a control step."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import declare_sample, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class MeanForce(LeafSystem):
@@ -42,13 +43,11 @@ class MeanForce(LeafSystem):
             raise InputError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
         self._scale = 1.0 / substeps
         self._force_sum_port = self.DeclareVectorInputPort("force_sum", size)
-        self._last_sum = declare_sample(self, self._force_sum_port, period)
-        prerequisites = {self._force_sum_port.ticket(), self.discrete_state_ticket(self._last_sum)}
-        self._force_port = self.DeclareVectorOutputPort(
-            "force", size, self._calc_force, prerequisites_of_calc=prerequisites
-        )
-        self._magnitude_port = self.DeclareVectorOutputPort(
-            "magnitude", 1, self._calc_magnitude, prerequisites_of_calc=prerequisites
+        self._last_sum = declare.sample(self, self._force_sum_port, period)
+        sources = [self._force_sum_port, self._last_sum]
+        self._force_port = declare.output(self, "force", size, self._mean, sources)
+        self._magnitude_port = declare.scalar_output(
+            self, "magnitude", lambda context: float(np.linalg.norm(self._mean(context))), sources
         )
 
     get_force_sum_input_port = input_getter("force_sum", "sum of the forces of all plant steps so far, (D,) [N]")
@@ -57,9 +56,3 @@ class MeanForce(LeafSystem):
 
     def _mean(self, context: Context) -> np.ndarray:
         return (self._force_sum_port.Eval(context) - context.get_discrete_state(self._last_sum).value()) * self._scale
-
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._mean(context))
-
-    def _calc_magnitude(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(np.linalg.norm(self._mean(context))))

@@ -1,10 +1,12 @@
 """Measured pose of a body in the pose coordinates of a station."""
 
+import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import transform_to_pose
 
@@ -37,12 +39,10 @@ class MeasuredPose(LeafSystem):
         self._body_poses_port = self.DeclareAbstractInputPort(
             "body_poses", plant.get_body_poses_output_port().Allocate()
         )
-        self._pose_port = self.DeclareVectorOutputPort(
-            "pose", 6, self._calc_pose, prerequisites_of_calc={self._body_poses_port.ticket()}
-        )
+        self._pose_port = declare.output(self, "pose", 6, self._pose, [self._body_poses_port])
 
     get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
     get_pose_output_port = output_getter("pose", "pose X_TP, (6,)")
 
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(transform_to_pose(self._X_TW @ self._body_poses_port.Eval(context)[self._body]))
+    def _pose(self, context: Context) -> np.ndarray:
+        return transform_to_pose(self._X_TW @ self._body_poses_port.Eval(context)[self._body])

@@ -7,7 +7,8 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import check_period, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import output_getter
 
 DEAD_ZONE = 0.1
 """Dead zone of the gamepad axes, because a released stick is rarely exactly at zero."""
@@ -39,7 +40,6 @@ class MeshcatDevice(LeafSystem):
         self, meshcat: Meshcat, axes: Sequence[tuple[int, float]], keys: Sequence[tuple[str, str]], period: float
     ):
         super().__init__()
-        check_period(period)
         if len(axes) != len(keys) or not axes:
             raise InputError(f"a device needs as many axes as pairs of keys, not {len(axes)} and {len(keys)}")
         self._meshcat, self._axes = meshcat, tuple(axes)
@@ -48,8 +48,7 @@ class MeshcatDevice(LeafSystem):
             meshcat.AddSlider(name, -1.0, 1.0, 0.25, 0.0, lower, higher)
         self._state = self.DeclareDiscreteState(len(axes))
         self._action_port = self.DeclareStateOutputPort("action", self._state)
-        self.DeclareInitializationDiscreteUpdateEvent(self._sample)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        declare.update(self, period, self._sample, self._sample)
 
     get_action_output_port = output_getter("action", "operator's input, (n,), in [−1, 1]")
 

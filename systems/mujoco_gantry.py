@@ -9,10 +9,11 @@ from pydrake.geometry import FramePoseVector
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError, import_extra
-from guiderail.models.common.transforms import POSE_SIZE
+from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
@@ -133,25 +134,18 @@ class MujocoGantry(LeafSystem):
         self._nominal = _Nominal(step, *(getattr(model, name).copy() for name in _Nominal._fields[1:]))
         self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
         self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
-        state = {self.discrete_state_ticket(self._state)}
-        body_poses = state | {self._nominal_body_poses_port.ticket()}
-
-        def declare_state_output(name: str, entries: slice) -> OutputPort:
-            def calc(context: Context, output: BasicVector) -> None:
-                output.SetFromVector(self._values(context)[entries])
-
-            return self.DeclareVectorOutputPort(name, 6, calc, prerequisites_of_calc=state)
-
-        self._pose_port = declare_state_output("pose", self._positions)
-        self._state_port = self.DeclareVectorOutputPort(
-            "state", 2 * POSE_SIZE, self._calc_state, prerequisites_of_calc=state
+        body_poses = declare.tickets(self, [self._state, self._nominal_body_poses_port])
+        self._pose_port = declare.part_output(
+            self, "pose", self._state, lambda state: state[self._positions], POSE_SIZE
         )
-        self._wrench_port = declare_state_output("wrench", self._filtered)
-        self._impedance_wrench_port = self.DeclareVectorOutputPort(
-            "impedance_wrench",
-            6,
-            self._calc_impedance_wrench,
-            prerequisites_of_calc=state | {self._desired_pose_port.ticket()},
+        self._state_port = declare.part_output(
+            self, "state", self._state, lambda state: [*state[self._positions], *state[self._velocities]], 2 * POSE_SIZE
+        )
+        self._wrench_port = declare.part_output(
+            self, "wrench", self._state, lambda state: state[self._filtered], WRENCH_SIZE
+        )
+        self._impedance_wrench_port = declare.output(
+            self, "impedance_wrench", WRENCH_SIZE, self._impedance_wrench, [self._state, self._desired_pose_port]
         )
         self._body_poses_port = self.DeclareAbstractOutputPort(
             "body_poses", poses.Allocate, self._calc_body_poses, prerequisites_of_calc=body_poses
@@ -162,7 +156,7 @@ class MujocoGantry(LeafSystem):
             self._calc_geometry_poses,
             prerequisites_of_calc=body_poses,
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_nominal_body_poses_input_port = input_getter("nominal_body_poses", "body poses of the static plant")
@@ -178,14 +172,10 @@ class MujocoGantry(LeafSystem):
         context.SetDiscreteState(self._state, self._at_rest(pose))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Scale the friction coefficients and the stiffness of contacts and springs; `context` is this system's.
+        """Scale all friction coefficients, and the stiffness of contacts and springs; `context` is this system's.
 
-        For a modulus above 1 the step of the engine is divided by √modulus, rounded up.
-
-        Args:
-            context: Context of this system.
-            friction: Factor of all friction coefficients.
-            modulus: Factor of the stiffness of contacts and springs.
+        `friction` and `modulus` are factors. For a modulus above 1 the step of the engine is divided by √modulus,
+        rounded up.
         """
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 
@@ -266,16 +256,12 @@ class MujocoGantry(LeafSystem):
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
-        state = self._values(context)
-        output.SetFromVector([*state[self._positions], *state[self._velocities]])
-
-    def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
+    def _impedance_wrench(self, context: Context) -> np.ndarray:
         model, state = self.model, self._values(context)
         springs, dampers = model.actuator_gainprm[:POSE_SIZE, 0], -model.actuator_biasprm[:POSE_SIZE, 2]
         spring_force = springs * (self._desired_pose_port.Eval(context) - state[self._positions])
         limits = model.actuator_forcerange[:POSE_SIZE]
-        output.SetFromVector(np.clip(spring_force - dampers * state[self._velocities], limits[:, 0], limits[:, 1]))
+        return np.clip(spring_force - dampers * state[self._velocities], limits[:, 0], limits[:, 1])
 
     def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
         poses = list(self._nominal_body_poses_port.Eval(context))

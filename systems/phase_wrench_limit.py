@@ -1,11 +1,12 @@
 """Limits of force and torque that change with the state of a shared control template."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, approach_bound
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class PhaseWrenchLimit(LeafSystem):
@@ -41,7 +42,6 @@ class PhaseWrenchLimit(LeafSystem):
 
     def __init__(self, limits: np.ndarray, max_rate: np.ndarray, *, period: float):
         super().__init__()
-        check_period(period)
         self._limits, rate = np.array(limits, dtype=float), np.array(max_rate, dtype=float)
         if self._limits.ndim != 2 or not len(self._limits) or self._limits.shape[1] != MAX_WRENCH_SIZE:
             raise InputError(f"the wrench limits of states are rows of {MAX_WRENCH_SIZE}, not {self._limits.shape}")
@@ -54,18 +54,11 @@ class PhaseWrenchLimit(LeafSystem):
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
         # NaN until the first update: the state at the port is initialized at the same instant as this system.
         self._bound = self.DeclareDiscreteState(np.full(MAX_WRENCH_SIZE, np.nan))
-        self._phase_max_wrench_port = self.DeclareVectorOutputPort(
-            "phase_max_wrench",
-            MAX_WRENCH_SIZE,
-            self._calc_phase_max_wrench,
-            prerequisites_of_calc={
-                self._state_port.ticket(),
-                self._max_wrench_port.ticket(),
-                self.discrete_state_ticket(self._bound),
-            },
+        sources = [self._state_port, self._max_wrench_port, self._bound]
+        self._phase_max_wrench_port = declare.output(
+            self, "phase_max_wrench", MAX_WRENCH_SIZE, self._phase_max_wrench, sources
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
     get_max_wrench_input_port = input_getter("max_wrench", "task's limit of the wrench, (8,); optional")
@@ -80,14 +73,11 @@ class PhaseWrenchLimit(LeafSystem):
         bound = context.get_discrete_state(self._bound).value()
         return self._limit(context) if np.isnan(bound).any() else bound
 
-    def _calc_phase_max_wrench(self, context: Context, output: BasicVector) -> None:
+    def _phase_max_wrench(self, context: Context) -> np.ndarray:
         bound = self._present(context)
         if self._max_wrench_port.HasValue(context):
             bound = np.minimum(bound, self._max_wrench_port.Eval(context))
-        output.SetFromVector(bound)
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._bound, np.full(MAX_WRENCH_SIZE, np.nan))
+        return bound
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         bound = approach_bound(self._present(context), self._limit(context), self._max_change)

@@ -74,11 +74,7 @@ class PolicySystem(LeafSystem):
     get_action_output_port = output_getter("action", "last action, (A,), in [−1, 1]")
 
     def _update(self, context: Context, state: State) -> None:
-        """Set the action.
-
-        Raises:
-            PolicyError: If the policy does not return A finite numbers.
-        """
+        """Set the action; raise a `PolicyError` if the policy does not return A finite numbers."""
         returned = self._policy(self._observe(context))
         try:
             action = np.asarray(returned, dtype=float)

@@ -1,13 +1,14 @@
 """Limiter of velocity, acceleration and jerk of a desired pose."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionLimits
-from guiderail.systems.support.declarations import check_period, declare_cache, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 # Modes in order of preference. If the axes cannot be synchronized for numerical reasons (about one of 10,000
 # adversarial commands), each axis has its own trajectory; if that fails too, the motion is braked to rest.
@@ -53,7 +54,6 @@ class PoseMotionLimiter(LeafSystem):
 
     def __init__(self, limits: MotionLimits, *, period: float):
         super().__init__()
-        check_period(period)
         self._period = period
         per_axis = zip(limits.linear, limits.rotation_vector_limits(), strict=True)
         self._limits = [np.repeat([linear, angular], 3) / np.sqrt(3.0) for linear, angular in per_axis]
@@ -62,22 +62,10 @@ class PoseMotionLimiter(LeafSystem):
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
         # [position and rotation vector; velocity; acceleration; last valid target; quaternion at the start]
         self._state = self.DeclareDiscreteState(28)
-        self._next_state = declare_cache(
-            self,
-            "next_state",
-            self._calc_next_state,
-            prerequisites_of_calc={
-                self._desired_pose_port.ticket(),
-                self._pose_port.ticket(),
-                self._blend_factor_port.ticket(),
-                self.discrete_state_ticket(self._state),
-            },
-        )
-        self._limited_pose_port = self.DeclareVectorOutputPort(
-            "limited_pose", 6, self._calc_limited_pose, prerequisites_of_calc={self._next_state.ticket()}
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        ports = (self._desired_pose_port, self._pose_port, self._blend_factor_port)
+        self._next_state = declare.cache(self, "next_state", self._calc_next_state, [*ports, self._state])
+        self._limited_pose_port = declare.output(self, "limited_pose", 6, self._limited_pose, [self._next_state])
+        declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
@@ -102,10 +90,10 @@ class PoseMotionLimiter(LeafSystem):
         state[:18] = np.concatenate(_plan(motion).at_time(self._period)[:3])
         return state
 
-    def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
+    def _limited_pose(self, context: Context) -> np.ndarray:
         state = self._next_state.Eval(context)
         angles = (Rotation.from_quat(state[24:]) * Rotation.from_rotvec(state[3:6])).as_euler("xyz")
-        output.SetFromVector(np.concatenate([state[:3], angles[::-1]]))
+        return np.concatenate([state[:3], angles[::-1]])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(_at_rest(self._pose_port.Eval(context)))

@@ -1,11 +1,12 @@
 """Rate limiter of a desired pose."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_difference
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class PoseRateLimiter(LeafSystem):
@@ -40,7 +41,6 @@ class PoseRateLimiter(LeafSystem):
 
     def __init__(self, *, period: float, speed: float = 0.25, angular_speed: float = 1.5):
         super().__init__()
-        check_period(period)
         if not 0.0 < speed < np.inf or not 0.0 < angular_speed < np.inf:
             raise InputError(f"the speed limits must be positive and finite, not {speed} m/s and {angular_speed} rad/s")
         self._step, self._angular_step = speed * period, angular_speed * period
@@ -48,26 +48,16 @@ class PoseRateLimiter(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
         self._last_pose = self.DeclareDiscreteState(6)
-        self._limited_pose_port = self.DeclareVectorOutputPort(
-            "limited_pose",
-            6,
-            self._calc_limited_pose,
-            prerequisites_of_calc={
-                self._desired_pose_port.ticket(),
-                self._pose_port.ticket(),
-                self._blend_factor_port.ticket(),
-                self.discrete_state_ticket(self._last_pose),
-            },
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        sources = [self._desired_pose_port, self._pose_port, self._blend_factor_port, self._last_pose]
+        self._limited_pose_port = declare.output(self, "limited_pose", 6, self._limited_pose, sources)
+        declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
     get_blend_factor_input_port = input_getter("blend_factor", "blend factor, (1,); 0 while the arm is not controlled")
     get_limited_pose_output_port = output_getter("limited_pose", "rate-limited pose, (6,)")
 
-    def _eval_limited_pose(self, context: Context) -> np.ndarray:
+    def _limited_pose(self, context: Context) -> np.ndarray:
         if self._blend_factor_port.Eval(context)[0] <= 0.0:
             return self._pose_port.Eval(context)
         last = context.get_discrete_state(self._last_pose).value()
@@ -83,11 +73,8 @@ class PoseRateLimiter(LeafSystem):
         change[3:] = np.clip(change[3:], -self._angular_step, self._angular_step)
         return last + change
 
-    def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._eval_limited_pose(context))
-
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._pose_port.Eval(context))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._eval_limited_pose(context))
+        discrete_state.set_value(self._limited_pose(context))

@@ -1,8 +1,10 @@
 """Wrench on a tool from the generalized forces along its pose coordinates."""
 
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+import numpy as np
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
@@ -32,15 +34,12 @@ class PoseWrench(LeafSystem):
         super().__init__()
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._generalized_force_port = self.DeclareVectorInputPort("generalized_force", POSE_SIZE)
-        inputs = {self._pose_port.ticket(), self._generalized_force_port.ticket()}
-        self._wrench_port = self.DeclareVectorOutputPort(
-            "wrench", WRENCH_SIZE, self._calc_wrench, prerequisites_of_calc=inputs
-        )
+        sources = [self._pose_port, self._generalized_force_port]
+        self._wrench_port = declare.output(self, "wrench", WRENCH_SIZE, self._wrench, sources)
 
     get_pose_input_port = input_getter("pose", "pose X_TP, (6,)")
     get_generalized_force_input_port = input_getter("generalized_force", "generalized forces, (6,) [N, Nm]")
     get_wrench_output_port = output_getter("wrench", "wrench at P in the axes of T, (6,), force first")
 
-    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        pose, force = self._pose_port.Eval(context), self._generalized_force_port.Eval(context)
-        output.SetFromVector(wrench_of_generalized_force(pose, force))
+    def _wrench(self, context: Context) -> np.ndarray:
+        return wrench_of_generalized_force(self._pose_port.Eval(context), self._generalized_force_port.Eval(context))

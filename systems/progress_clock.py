@@ -1,10 +1,10 @@
 """Clock of a movement primitive that waits for a robot that does not follow the commands."""
 
-import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.primitives.stepper import StateProgress
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ProgressClock(LeafSystem):
@@ -33,21 +33,16 @@ class ProgressClock(LeafSystem):
 
     def __init__(self, rule: StateProgress, num_outputs: int, period: float):
         super().__init__()
-        check_period(period)
         self._rule, self._period = rule, period
         self._command_port = self.DeclareVectorInputPort("command", num_outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", num_outputs)
         self._time = self.DeclareDiscreteState(1)
         self._motion_time_port = self.DeclareStateOutputPort("motion_time", self._time)
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_command_input_port = input_getter("command", "last command, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
     get_motion_time_output_port = output_getter("motion_time", "time of the motion, (1,) [s]")
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(np.zeros(1))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         clock = round(context.get_time() / self._period)

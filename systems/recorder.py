@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.declarations import SignalPorts, check_period, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import SignalPorts, output_getter
 
 
 @dataclass(frozen=True)
@@ -56,25 +57,15 @@ class Recorder(LeafSystem):
         super().__init__()
         if not signals or num_samples < 1:
             raise InputError("a recorder needs at least one signal, and room for one sample")
-        check_period(period)
         self._signals = SignalPorts(self, signals)
-        self._sizes = dict(signals)
-        self._num_samples = num_samples
-        self._period = period
+        self._sizes, self._num_samples, self._period = dict(signals), num_samples, period
         self._width = sum(signals.values())
         self._count = self.DeclareDiscreteState(1)
         self._samples = self.DeclareDiscreteState(num_samples * self._width)
         self._num_recorded_port = self.DeclareStateOutputPort("num_recorded", self._count)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._record)
+        declare.update(self, period, self._record)
 
-    def get_signal_input_port(self, name: str) -> InputPort:
-        """Return the port of the signal `name`.
-
-        Raises:
-            InputError: If no such signal is recorded.
-        """
-        return self._signals.port(name)
-
+    get_signal_input_port = declare.get_signal_input_port
     get_num_recorded_output_port = output_getter("num_recorded", "number of samples so far, (1,)")
 
     def recording(self, context: Context) -> Recording:

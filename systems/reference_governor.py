@@ -1,11 +1,12 @@
 """Reference governor of an impedance whose spring and damper belong to the plant."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound, governed_error
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound, check_spring_damper, governed_error
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
@@ -46,33 +47,22 @@ class ReferenceGovernor(LeafSystem):
     def __init__(self, stiffness: np.ndarray, damping: np.ndarray, mass: float, step: float, bound: WrenchBound):
         super().__init__()
         check_period(step)
-        self._stiffness, self._damping = (np.array(values, dtype=float) for values in (stiffness, damping))
-        shapes_agree = self._stiffness.shape == self._damping.shape == (POSE_SIZE,)
-        if not shapes_agree or not (self._stiffness > 0.0).all() or not (self._damping >= 0.0).all():
-            raise InputError("a reference governor needs six positive stiffnesses and six dampings, none negative")
+        self._stiffness, self._damping = check_spring_damper(stiffness, damping, "a reference governor")
         if not 0.0 < mass < np.inf:
             raise InputError(f"the moving mass must be positive, not {mass} kg")
         self._mass, self._step, self._bound = mass, step, bound
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._state_port = self.DeclareVectorInputPort("state", 2 * POSE_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
-        self._reference_pose_port = self.DeclareVectorOutputPort(
-            "reference_pose",
-            POSE_SIZE,
-            self._calc_reference_pose,
-            prerequisites_of_calc={
-                self._desired_pose_port.ticket(),
-                self._state_port.ticket(),
-                self._max_wrench_port.ticket(),
-            },
-        )
+        sources = [self._desired_pose_port, self._state_port, self._max_wrench_port]
+        self._reference_pose_port = declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, sources)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_state_input_port = input_getter("state", "measured pose and its velocity, (12,)")
     get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
     get_reference_pose_output_port = output_getter("reference_pose", "governed pose, (6,)")
 
-    def _calc_reference_pose(self, context: Context, output: BasicVector) -> None:
+    def _reference_pose(self, context: Context) -> np.ndarray:
         state, bound = self._state_port.Eval(context), self._bound
         if self._max_wrench_port.HasValue(context):
             bound = bound.lowered_to(self._max_wrench_port.Eval(context))
@@ -86,4 +76,4 @@ class ReferenceGovernor(LeafSystem):
             self._step,
             bound.in_pose_order,
         )
-        output.SetFromVector(pose + error)
+        return pose + error

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import transform_to_vector
 
@@ -45,18 +47,14 @@ class RelativePoses(LeafSystem):
         self._body_poses_port = self.DeclareAbstractInputPort(
             "body_poses", plant.get_body_poses_output_port().Allocate()
         )
-        self._relative_poses_port = self.DeclareVectorOutputPort(
-            "relative_poses",
-            6 * len(self._bodies),
-            self._calc_relative_poses,
-            prerequisites_of_calc={self._body_poses_port.ticket()},
+        self._relative_poses_port = declare.output(
+            self, "relative_poses", 6 * len(self._bodies), self._relative_poses, [self._body_poses_port]
         )
 
     get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
     get_relative_poses_output_port = output_getter("relative_poses", "poses relative to the reference, (6·n,)")
 
-    def _calc_relative_poses(self, context: Context, output: BasicVector) -> None:
+    def _relative_poses(self, context: Context) -> np.ndarray:
         poses = self._body_poses_port.Eval(context)
         X_WR = poses[self._reference]
-        for i, body in enumerate(self._bodies):
-            output.get_mutable_value()[6 * i : 6 * i + 6] = transform_to_vector(X_WR.InvertAndCompose(poses[body]))
+        return np.concatenate([transform_to_vector(X_WR.InvertAndCompose(poses[body])) for body in self._bodies])

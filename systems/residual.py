@@ -1,9 +1,10 @@
 """Sum of a reference and a residual, for residual learning."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
@@ -38,16 +39,12 @@ class Residual(LeafSystem):
             raise InputError(f"a residual's gain is one finite number per output, not {gain}")
         self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)
         self._action_port = self.DeclareVectorInputPort("action", self._gain.size)
-        self._desired_pose_port = self.DeclareVectorOutputPort(
-            "desired_pose",
-            self._gain.size,
-            self._calc_desired_pose,
-            prerequisites_of_calc={self._reference_port.ticket(), self._action_port.ticket()},
-        )
+        sources = [self._reference_port, self._action_port]
+        self._desired_pose_port = declare.output(self, "desired_pose", self._gain.size, self._desired_pose, sources)
 
     get_reference_input_port = input_getter("reference", "reference, (O,)")
     get_action_input_port = input_getter("action", "policy's action, (O,)")
     get_desired_pose_output_port = output_getter("desired_pose", "desired pose, (O,)")
 
-    def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._reference_port.Eval(context) + self._gain * self._action_port.Eval(context))
+    def _desired_pose(self, context: Context) -> np.ndarray:
+        return self._reference_port.Eval(context) + self._gain * self._action_port.Eval(context)

@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.support.declarations import SignalPorts, check_takes, declare_cache, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import SignalPorts, check_takes, output_getter
 
 
 @dataclass(frozen=True)
@@ -64,17 +66,11 @@ class RewardSystem(LeafSystem):
         for term in terms:
             check_takes(term.value, term.inputs, f"reward term {term.name!r}{self._of_task}")
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
-        self._values = declare_cache(
-            self,
-            "terms",
-            self._calc_terms,
-            prerequisites_of_calc=self._signals.tickets or {self.nothing_ticket()},
-        )
-        values = {self._values.ticket()}
-        self._reward_port = self.DeclareVectorOutputPort("reward", 1, self._calc_reward, prerequisites_of_calc=values)
+        sources = self._signals.tickets or {self.nothing_ticket()}
+        self._values = declare.cache(self, "terms", self._calc_terms, sources)
+        self._reward_port = declare.part_output(self, "reward", self._values, np.sum)
         self._term_ports = {
-            term.name: self.DeclareVectorOutputPort(term.name, 1, self._term_calc(i), prerequisites_of_calc=values)
-            for i, term in enumerate(terms)
+            term.name: declare.part_output(self, term.name, self._values, itemgetter(i)) for i, term in enumerate(terms)
         }
 
     @property
@@ -82,14 +78,7 @@ class RewardSystem(LeafSystem):
         """Names of the terms, in order."""
         return tuple(self._term_ports)
 
-    def get_signal_input_port(self, name: str) -> InputPort:
-        """Return the port of the signal `name`.
-
-        Raises:
-            InputError: If no term depends on such a signal.
-        """
-        return self._signals.port(name)
-
+    get_signal_input_port = declare.get_signal_input_port
     get_reward_output_port = output_getter("reward", "sum of all terms, (1,)")
 
     def get_term_output_port(self, name: str) -> OutputPort:
@@ -116,9 +105,3 @@ class RewardSystem(LeafSystem):
         if not math.isfinite(number):
             raise InputError(f"reward term {term.name!r}{self._of_task} is not finite, but {number}")
         return number
-
-    def _calc_reward(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._values.Eval(context).sum())
-
-    def _term_calc(self, i: int) -> Callable[[Context, BasicVector], None]:
-        return lambda context, output: output.SetAtIndex(0, self._values.Eval(context)[i])

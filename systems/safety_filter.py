@@ -1,10 +1,11 @@
 """Safety filter that projects commanded positions out of keep-out boxes."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.systems.support.declarations import declare_cache, declare_sample, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class SafetyFilter(LeafSystem):
@@ -41,19 +42,14 @@ class SafetyFilter(LeafSystem):
         outputs = keep_out.num_outputs
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
-        self._sampled_pose = declare_sample(self, self._pose_port, period)
-        self._projection = declare_cache(
-            self,
-            "projection",
-            self._calc_projection,
-            prerequisites_of_calc={self._desired_pose_port.ticket(), self.discrete_state_ticket(self._sampled_pose)},
+        self._sampled_pose = declare.sample(self, self._pose_port, period)
+        sources = [self._desired_pose_port, self._sampled_pose]
+        self._projection = declare.cache(self, "projection", self._calc_projection, sources)
+        self._safe_pose_port = declare.part_output(
+            self, "safe_pose", self._projection, lambda projection: projection[:-1], outputs
         )
-        projection = {self._projection.ticket()}
-        self._safe_pose_port = self.DeclareVectorOutputPort(
-            "safe_pose", outputs, self._calc_safe_pose, prerequisites_of_calc=projection
-        )
-        self._intervention_port = self.DeclareVectorOutputPort(
-            "intervention", 1, self._calc_intervention, prerequisites_of_calc=projection
+        self._intervention_port = declare.part_output(
+            self, "intervention", self._projection, lambda projection: projection[-1]
         )
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
@@ -66,9 +62,3 @@ class SafetyFilter(LeafSystem):
         pose = context.get_discrete_state(self._sampled_pose).value()
         safe_pose, is_changed = self._keep_out.project(pose, self._desired_pose_port.Eval(context))
         return np.append(safe_pose, float(is_changed))
-
-    def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._projection.Eval(context)[:-1])
-
-    def _calc_intervention(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._projection.Eval(context)[-1])

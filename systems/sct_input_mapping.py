@@ -4,10 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
@@ -48,40 +49,23 @@ class SctInputMapping(LeafSystem):
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
         check_period(period)
-        self._template = template
-        self._period = period
+        self._template, self._period = template, period
         self.frames = TemplateFrames(self, template, frames)
         self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
-        self._requested_pose_port = self.DeclareVectorOutputPort(
-            "requested_pose",
-            6,
-            self._calc_requested_pose,
-            prerequisites_of_calc={
-                self._action_port.ticket(),
-                self._pose_port.ticket(),
-                self._state_port.ticket(),
-                self.frames.ticket,
-            },
-        )
+        sources = [self._action_port, self._pose_port, self._state_port, self.frames.ticket]
+        self._requested_pose_port = declare.output(self, "requested_pose", 6, self._requested_pose, sources)
 
     get_action_input_port = input_getter("action", "inputs u of a policy or a user, (n,), in [−1, 1]")
     get_pose_input_port = input_getter("pose", "pose H to displace, (6,)")
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
     get_requested_pose_output_port = output_getter("requested_pose", "requested pose H^im, (6,), not constrained")
 
-    def _calc_requested_pose(self, context: Context, output: BasicVector) -> None:
+    def _requested_pose(self, context: Context) -> np.ndarray:
         action = self._action_port.Eval(context)
         if not np.isfinite(action).all():
-            output.SetFromVector(np.full(6, np.nan))
-            return
-        X_WE = pose_to_transform(self._pose_port.Eval(context))
-        displacement = self._template.map(
-            int(self._state_port.Eval(context)[0]),
-            action,
-            X_WE,
-            self.frames.eval(context),
-            self._period,
-        )
-        output.SetFromVector(transform_to_pose(self._template.displace(X_WE, displacement)))
+            return np.full(6, np.nan)
+        state, X_WE = int(self._state_port.Eval(context)[0]), pose_to_transform(self._pose_port.Eval(context))
+        displacement = self._template.map(state, action, X_WE, self.frames.eval(context), self._period)
+        return transform_to_pose(self._template.displace(X_WE, displacement))

@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import after_start, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 
@@ -51,22 +52,20 @@ class SctStateMachine(LeafSystem):
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
-        check_period(period)
         self._template, self._period = template, period
         self.frames = TemplateFrames(self, template, frames)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
         self._state = self.DeclareDiscreteState([float(template.initial_state)])
         self._state_port = self.DeclareStateOutputPort("state", self._state)
-        prerequisites = {self._pose_port.ticket(), self.discrete_state_ticket(self._state), self.frames.ticket}
-        self._transition_distance_port = self.DeclareVectorOutputPort(
-            "transition_distance", 1, self._calc_transition_distance, prerequisites_of_calc=prerequisites
+        sources = [self._pose_port, self._state, self.frames.ticket]
+        self._transition_distance_port = declare.scalar_output(
+            self, "transition_distance", lambda context: template.distance(*self._state_pose_frames(context)), sources
         )
-        self._progress_port = self.DeclareVectorOutputPort(
-            "progress", 1, self._calc_progress, prerequisites_of_calc=prerequisites
+        self._progress_port = declare.scalar_output(
+            self, "progress", lambda context: template.progress(*self._state_pose_frames(context)), sources
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, self._start)
 
     get_pose_input_port = input_getter("pose", "pose at which transition distances are evaluated, (6,)")
     get_initial_pose_input_port = input_getter("initial_pose", "pose that determines the first state, (6,)")
@@ -78,18 +77,11 @@ class SctStateMachine(LeafSystem):
         state = int(context.get_discrete_state(self._state).value()[0])
         return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
 
-    def _calc_transition_distance(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._template.distance(*self._state_pose_frames(context)))
-
-    def _calc_progress(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._template.progress(*self._state_pose_frames(context)))
-
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
         discrete_state.set_value([float(self._template.state_at(X_WE, self.frames.eval(context)))])
 
+    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # No step has ended at time zero. With an event offset of one period, rounding would miss k * period.
-        if context.get_time() > 0:
-            state = self._template.next_state(*self._state_pose_frames(context), self._period)
-            discrete_state.set_value([float(state)])
+        state = self._template.next_state(*self._state_pose_frames(context), self._period)
+        discrete_state.set_value([float(state)])

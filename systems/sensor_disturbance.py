@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 DRIFT_TIME = 10.0
@@ -83,26 +84,15 @@ class SensorDisturbance(LeafSystem):
         self._configuration_port = (
             self.DeclareVectorInputPort("configuration", configuration_size) if configuration_size else None
         )
-        sources = {
-            self._measurement_port.ticket()
-            if self._delay_line is None
-            else self.discrete_state_ticket(self._delay_line)
-        }
+        sources = [self._measurement_port if self._delay_line is None else self._delay_line]
         if self._configuration_port is not None:
-            sources |= {self._configuration_port.ticket(), self.discrete_state_ticket(self._first_configuration)}
-        self._disturbed_measurement_port = self.DeclareVectorOutputPort(
-            "disturbed_measurement",
-            size,
-            self._calc_disturbed_measurement,
-            prerequisites_of_calc=sources
-            | {
-                self.discrete_state_ticket(self._noise_sample),
-                self.discrete_state_ticket(self._walk),
-                self.all_parameters_ticket(),
-            },
+            sources += [self._configuration_port, self._first_configuration]
+        sources += [self._noise_sample, self._walk, self.all_parameters_ticket()]
+        self._disturbed_measurement_port = declare.output(
+            self, "disturbed_measurement", size, self._disturbed_measurement, sources
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._set_default = declare.reset_to_default(self)
+        declare.update(self, period, self._update, self._reset)
 
     get_measurement_input_port = input_getter("measurement", "undisturbed measurement, (n,)")
     get_configuration_input_port = input_getter("configuration", "configuration, (m,), if its size is not 0")
@@ -128,14 +118,9 @@ class SensorDisturbance(LeafSystem):
         context.get_mutable_numeric_parameter(self._gradient).SetFromVector(np.ravel(gradient))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        size = len(self._noise)
-        discrete_state.set_value(self._count, np.zeros(1))
-        discrete_state.set_value(self._noise_sample, np.zeros(size))
-        discrete_state.set_value(self._walk, np.zeros(size))
+        self._set_default(context, discrete_state)
         if self._configuration_port is not None:
             discrete_state.set_value(self._first_configuration, self._configuration_port.Eval(context))
-        if self._delay_line is not None:
-            discrete_state.set_value(self._delay_line, np.zeros(self._delay * size))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value() + 1.0
@@ -153,7 +138,7 @@ class SensorDisturbance(LeafSystem):
             newest = self._measurement_port.Eval(context)
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(newest) :], newest]))
 
-    def _calc_disturbed_measurement(self, context: Context, output: BasicVector) -> None:
+    def _disturbed_measurement(self, context: Context) -> np.ndarray:
         if self._delay_line is None:
             measured = self._measurement_port.Eval(context)
         else:
@@ -172,7 +157,7 @@ class SensorDisturbance(LeafSystem):
             disturbed = disturbed + gradient @ moved
         if self._rounds_any:
             disturbed = np.where(self._is_rounded, np.round(disturbed / self._unit) * self._unit, disturbed)
-        output.SetFromVector(disturbed)
+        return disturbed
 
 
 def _are_magnitudes(values: np.ndarray, shape: tuple[int, ...]) -> bool:

@@ -5,18 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import JointStatus, StatusLimits
 from guiderail.models.control.state_estimator import Estimate, EstimatorState, StateEstimator
-from guiderail.systems.support.declarations import (
-    check_period,
-    declare_cache,
-    declare_plant_context,
-    input_getter,
-    output_getter,
-)
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import JointDynamics
 
 
@@ -62,9 +57,8 @@ class StatusWatchdog(LeafSystem):
         self, plant: MultibodyPlant, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float
     ):
         super().__init__()
-        check_period(period)
         self._estimator = StateEstimator(limits, torque_tolerance, period=period)
-        self._plant, self._dynamics, self._num_joints = plant, JointDynamics(plant), plant.num_positions()
+        self._dynamics, self._num_joints = JointDynamics(plant), plant.num_positions()
         n = self._num_joints
         if len(limits.velocity) != n:
             raise InputError(f"an arm of {n} joints needs as many velocity limits, not {len(limits.velocity)}")
@@ -73,29 +67,21 @@ class StatusWatchdog(LeafSystem):
         self._clock_port = self.DeclareVectorInputPort("clock", 1)
         self._state = self.DeclareDiscreteState(EstimatorState.initial(n).vector())
         self._last_clock = self.DeclareDiscreteState([np.nan])  # value of the clock input at the last check
-        state = {self.discrete_state_ticket(self._state)}
-        self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
-        self._estimate = declare_cache(
-            self,
-            "estimate",
-            self._evaluate,
-            prerequisites_of_calc=state
-            | {self._status_port.ticket(), self._clock_port.ticket(), self.discrete_state_ticket(self._last_clock)},
+        self._plant_context = declare.plant_context(self, plant, self._joint_state, [self._state])
+        sources = [self._state, self._status_port, self._clock_port, self._last_clock]
+        self._estimate = declare.cache(self, "estimate", self._evaluate, sources)
+        self._estimated_state_port = declare.part_output(
+            self, "estimated_state", self._estimate, lambda estimate: estimate.state.accepted_values[: 2 * n], 2 * n
         )
-        estimate = {self._estimate.ticket()}
-        self._estimated_state_port = self.DeclareVectorOutputPort(
-            "estimated_state", 2 * n, self._calc_estimated_state, prerequisites_of_calc=estimate
+        self._velocity_port = declare.part_output(
+            self, "velocity", self._estimate, lambda estimate: estimate.state.velocity, n
         )
-        self._velocity_port = self.DeclareVectorOutputPort(
-            "velocity", n, self._calc_velocity, prerequisites_of_calc=estimate
+        self._external_torque_port = declare.part_output(
+            self, "external_torque", self._estimate, lambda estimate: estimate.state.accepted_values[2 * n :], n
         )
-        self._external_torque_port = self.DeclareVectorOutputPort(
-            "external_torque", n, self._calc_external_torque, prerequisites_of_calc=estimate
-        )
-        self._fault_port = self.DeclareVectorOutputPort("fault", 1, self._calc_fault, prerequisites_of_calc=estimate)
-        self._age_port = self.DeclareVectorOutputPort("age", 1, self._calc_age, prerequisites_of_calc=estimate)
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._fault_port = declare.part_output(self, "fault", self._estimate, lambda estimate: float(estimate.fault))
+        self._age_port = declare.part_output(self, "age", self._estimate, lambda estimate: estimate.age)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_status_input_port = input_getter("status", "newest `JointStatus`; any other object counts as none")
     get_torque_input_port = input_getter("torque", "torques that are sent after this check, (n,) [Nm]")
@@ -109,10 +95,9 @@ class StatusWatchdog(LeafSystem):
     def _state_of(self, context: Context) -> EstimatorState:
         return EstimatorState.from_vector(context.get_discrete_state(self._state).value(), self._num_joints)
 
-    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
+    def _joint_state(self, context: Context) -> np.ndarray:
         state = self._state_of(context)
-        self._plant.SetPositions(plant_context, state.accepted_values[: self._num_joints])
-        self._plant.SetVelocities(plant_context, state.velocity)
+        return np.concatenate([state.accepted_values[: self._num_joints], state.velocity])
 
     def _clock(self, context: Context) -> float:
         return float(self._clock_port.Eval(context)[0]) if self._clock_port.HasValue(context) else np.nan
@@ -126,26 +111,7 @@ class StatusWatchdog(LeafSystem):
         M, drag = self._dynamics.evaluate(self._plant_context.Eval(context))
         return self._estimator.evaluate(state, status, now, M, drag)
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._state, EstimatorState.initial(self._num_joints).vector())
-        discrete_state.set_value(self._last_clock, [np.nan])
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._estimator.advance(self._estimate.Eval(context), self._torque_port.Eval(context))
         discrete_state.set_value(self._state, state.vector())
         discrete_state.set_value(self._last_clock, [self._clock(context)])
-
-    def _calc_estimated_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._estimate.Eval(context).state.accepted_values[: 2 * self._num_joints])
-
-    def _calc_velocity(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._estimate.Eval(context).state.velocity)
-
-    def _calc_external_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._estimate.Eval(context).state.accepted_values[2 * self._num_joints :])
-
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(self._estimate.Eval(context).fault))
-
-    def _calc_age(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._estimate.Eval(context).age)

@@ -5,17 +5,12 @@ from enum import IntEnum
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import STATUS_FAULTS, Fault, damping_torque
-from guiderail.systems.support.declarations import (
-    check_period,
-    declare_cache,
-    declare_plant_context,
-    input_getter,
-    output_getter,
-)
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 # Indices into the discrete state: [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
 # last change to DAMPING or OFF in s; blend factor from 0 to 1].
@@ -150,64 +145,35 @@ class TorqueSafetyLimiter(LeafSystem):
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._velocity_port = self.DeclareVectorInputPort("velocity", num_joints)
         self._command_timed_out_port = self.DeclareVectorInputPort("command_timed_out", 1)
-        self._state = self.DeclareDiscreteState(4)
+        self._state = self.DeclareDiscreteState([ArmState.WAITING, Fault.NONE, 0.0, 0.0])
 
-        state, status_fault = {self.discrete_state_ticket(self._state)}, {self._status_fault_port.ticket()}
-        measured = {
-            port.ticket()
-            for port in (
-                self._estimated_state_port,
-                self._external_torque_port,
-                self._wrench_port,
-                self._pose_port,
-                self._desired_pose_port,
-            )
-        }
-        self._plant_context = declare_plant_context(
-            self, plant, self._set_plant_state, prerequisites_of_calc={self._estimated_state_port.ticket()}
+        self._plant_context = declare.plant_context(
+            self, plant, self._estimated_state_port.Eval, [self._estimated_state_port]
         )
-        self._present_fault = declare_cache(
-            self,
-            "present_fault",
-            self._find_fault,
-            prerequisites_of_calc=state
-            | status_fault
-            | measured
-            | {self._torque_port.ticket(), self._status_age_port.ticket()},
+        measured = [self._estimated_state_port, self._external_torque_port, self._wrench_port, self._pose_port]
+        commanded = [self._desired_pose_port, self._torque_port]
+        status = [self._status_fault_port, self._status_age_port]
+        self._present_fault = declare.cache(
+            self, "present_fault", self._find_fault, [self._state, *measured, *commanded, *status]
         )
-        present_fault = {self._present_fault.ticket()}
-        self._safe_torque_port = self.DeclareVectorOutputPort(
-            "safe_torque",
-            num_joints,
-            self._calc_safe_torque,
-            prerequisites_of_calc=present_fault
-            | state
-            | {self._torque_port.ticket(), self._estimated_state_port.ticket()}
-            | {self._status_age_port.ticket(), self._velocity_port.ticket()},
+        fault_and_state = [self._present_fault, self._state]
+        inputs = [self._torque_port, self._estimated_state_port, self._status_age_port, self._velocity_port]
+        self._safe_torque_port = declare.output(
+            self, "safe_torque", num_joints, self._safe_torque, [*fault_and_state, *inputs]
         )
-        self._fault_port = self.DeclareVectorOutputPort(
-            "fault", 1, self._calc_fault, prerequisites_of_calc=present_fault | state
+        self._fault_port = declare.scalar_output(self, "fault", self._fault, fault_and_state)
+        self._arm_state_port = declare.part_output(self, "arm_state", self._state, lambda state: state[_ARM_STATE])
+        self._blend_factor_port = declare.part_output(
+            self, "blend_factor", self._state, lambda state: state[_BLEND_FACTOR]
         )
-        self._arm_state_port = self.DeclareVectorOutputPort(
-            "arm_state", 1, self._calc_arm_state, prerequisites_of_calc=state
+        self._is_sending_port = declare.scalar_output(
+            self, "is_sending", self._is_sending, [self._state, self._status_fault_port]
         )
-        self._blend_factor_port = self.DeclareVectorOutputPort(
-            "blend_factor", 1, self._calc_blend_factor, prerequisites_of_calc=state
+        self._is_holding_port = declare.scalar_output(self, "is_holding", self._is_holding, fault_and_state)
+        self._not_following_port = declare.scalar_output(
+            self, "not_following", self._not_following, [self._state, self._command_timed_out_port]
         )
-        self._is_sending_port = self.DeclareVectorOutputPort(
-            "is_sending", 1, self._calc_is_sending, prerequisites_of_calc=state | status_fault
-        )
-        self._is_holding_port = self.DeclareVectorOutputPort(
-            "is_holding", 1, self._calc_is_holding, prerequisites_of_calc=present_fault | state
-        )
-        self._not_following_port = self.DeclareVectorOutputPort(
-            "not_following",
-            1,
-            self._calc_not_following,
-            prerequisites_of_calc=state | {self._command_timed_out_port.ticket()},
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_torque_input_port = input_getter("torque", "commanded torques, (n,) [Nm]")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
@@ -250,9 +216,6 @@ class TorqueSafetyLimiter(LeafSystem):
             raise InputError(f"the arm can't resume yet: {fault.description}")
         context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
-    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
-        self._plant.SetPositionsAndVelocities(plant_context, self._estimated_state_port.Eval(context))
-
     def _state_of(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._state).value()
 
@@ -283,9 +246,6 @@ class TorqueSafetyLimiter(LeafSystem):
             return Fault.TORQUE_NOT_FINITE
         return Fault.NONE
 
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._state, [ArmState.WAITING, Fault.NONE, 0.0, 0.0])
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         arm_state, fault, state_time, blend_factor = self._state_of(context)
         state_time += self._period
@@ -304,7 +264,7 @@ class TorqueSafetyLimiter(LeafSystem):
             arm_state, state_time = ArmState.OFF, 0.0
         discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor])
 
-    def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
+    def _safe_torque(self, context: Context) -> np.ndarray:
         arm_state, _, _, blend_factor = self._state_of(context)
         is_active = arm_state in (ArmState.RAMPING, ArmState.RUNNING)
         torque = np.zeros(self._num_joints)
@@ -315,7 +275,7 @@ class TorqueSafetyLimiter(LeafSystem):
         elif is_active or arm_state == ArmState.DAMPING:
             torque = self._damping_torque(context)
         torque = np.where(np.isfinite(torque), torque, 0.0)
-        output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
+        return np.clip(torque, -self._torque_limits, self._torque_limits)
 
     def _freshness(self, context: Context) -> float:
         return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
@@ -328,30 +288,24 @@ class TorqueSafetyLimiter(LeafSystem):
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         return damping_torque(M, velocity, self._limits.decay_time, period=self._period)
 
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+    def _fault(self, context: Context) -> float:
         arm_state, fault, _, _ = self._state_of(context)
         is_stopped = arm_state in (ArmState.DAMPING, ArmState.OFF)
-        output.SetAtIndex(0, float(fault if is_stopped else self._present_fault.Eval(context)))
+        return float(fault if is_stopped else self._present_fault.Eval(context))
 
-    def _calc_arm_state(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._state_of(context)[_ARM_STATE])
-
-    def _calc_blend_factor(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._state_of(context)[_BLEND_FACTOR])
-
-    def _calc_is_sending(self, context: Context, output: BasicVector) -> None:
+    def _is_sending(self, context: Context) -> float:
         arm_state, _, state_time, _ = self._state_of(context)
         is_sending = arm_state in (ArmState.RAMPING, ArmState.RUNNING, ArmState.DAMPING)
         if arm_state == ArmState.OFF:
             is_sending = state_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
-        output.SetAtIndex(0, float(is_sending))
+        return float(is_sending)
 
-    def _calc_is_holding(self, context: Context, output: BasicVector) -> None:
+    def _is_holding(self, context: Context) -> float:
         arm_state, fault, _, _ = self._state_of(context)
         if arm_state in (ArmState.RAMPING, ArmState.RUNNING):
             fault = self._present_fault.Eval(context)
-        output.SetAtIndex(0, float(self._can_hold and arm_state != ArmState.WAITING and fault in STATUS_FAULTS))
+        return float(self._can_hold and arm_state != ArmState.WAITING and fault in STATUS_FAULTS)
 
-    def _calc_not_following(self, context: Context, output: BasicVector) -> None:
+    def _not_following(self, context: Context) -> float:
         has_timed_out = self._command_timed_out_port.Eval(context)[0] > 0.0
-        output.SetAtIndex(0, float(has_timed_out or self._state_of(context)[_ARM_STATE] != ArmState.RUNNING))
+        return float(has_timed_out or self._state_of(context)[_ARM_STATE] != ArmState.RUNNING)

@@ -10,7 +10,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, L
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import external_wrench
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class WrenchSensor(LeafSystem):
@@ -59,7 +60,6 @@ class WrenchSensor(LeafSystem):
         time_constant: float,
     ):
         super().__init__()
-        check_period(period)
         if not 0.0 <= time_constant < np.inf:
             raise InputError(f"a wrench sensor's time constant must not be negative, not {time_constant} s")
         if not tool or wrist.child_body().index() != tool[0].index():
@@ -92,7 +92,7 @@ class WrenchSensor(LeafSystem):
         )
         self._state = self.DeclareDiscreteState(6)
         self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        declare.update(self, period, self._sample)
 
     def connect(self, builder: DiagramBuilder, plant: MultibodyPlant) -> None:
         """Connect all inputs to the output ports of the plant."""

@@ -1,11 +1,12 @@
 """Tare of a wrench measurement: subtraction of its mean in free motion."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class WrenchTare(LeafSystem):
@@ -37,25 +38,15 @@ class WrenchTare(LeafSystem):
 
     def __init__(self, period: float, skipped: int, averaged: int):
         super().__init__()
-        check_period(period)
         if skipped < 0 or averaged < 1:
             raise InputError(f"a tare skips samples from 0 and averages at least one, not {skipped} and {averaged}")
         self._skipped, self._averaged = skipped, averaged
         self._count = self.DeclareDiscreteState(1)  # k
         self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # the mean of the samples so far
         self._measured_wrench_port = self.DeclareVectorInputPort("measured_wrench", WRENCH_SIZE)
-        self._tared_wrench_port = self.DeclareVectorOutputPort(
-            "tared_wrench",
-            WRENCH_SIZE,
-            self._calc_tared_wrench,
-            prerequisites_of_calc={
-                self._measured_wrench_port.ticket(),
-                self.discrete_state_ticket(self._count),
-                self.discrete_state_ticket(self._offset),
-            },
-        )
-        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        sources = [self._measured_wrench_port, self._count, self._offset]
+        self._tared_wrench_port = declare.output(self, "tared_wrench", WRENCH_SIZE, self._tared_wrench, sources)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_measured_wrench_input_port = input_getter("measured_wrench", "wrench with a bias, (6,)")
     get_tared_wrench_output_port = output_getter("tared_wrench", "wrench without the bias, (6,)")
@@ -63,10 +54,6 @@ class WrenchTare(LeafSystem):
     def is_tared(self, context: Context) -> bool:
         """Return True if all samples of the mean have been taken; `context` is this system's."""
         return context.get_discrete_state(self._count).value()[0] >= self._skipped + self._averaged
-
-    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._count, np.zeros(1))
-        discrete_state.set_value(self._offset, np.zeros(WRENCH_SIZE))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self.is_tared(context):
@@ -78,9 +65,7 @@ class WrenchTare(LeafSystem):
             discrete_state.set_value(self._offset, offset + (sample - offset) / (count - self._skipped + 1.0))
         discrete_state.set_value(self._count, [count + 1.0])
 
-    def _calc_tared_wrench(self, context: Context, output: BasicVector) -> None:
-        if self.is_tared(context):
-            offset = context.get_discrete_state(self._offset).value()
-            output.SetFromVector(self._measured_wrench_port.Eval(context) - offset)
-        else:
-            output.SetZero()
+    def _tared_wrench(self, context: Context) -> np.ndarray:
+        if not self.is_tared(context):
+            return np.zeros(WRENCH_SIZE)
+        return self._measured_wrench_port.Eval(context) - context.get_discrete_state(self._offset).value()

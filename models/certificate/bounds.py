@@ -52,11 +52,7 @@ class CertifiedBounds:
 
 
 def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBounds:
-    """Compute the bounds of a loop.
-
-    Args:
-        loop: Primitive in its feedback loop.
-        budget: Budget of the regime *budgeted*; None: skip this regime. Ignored without a history.
+    """Compute the bounds of a loop; without a budget or a history, the regime *budgeted* is skipped.
 
     Raises:
         InputError: If a primitive without a history has more than `MAX_ACTIONS` actions.
@@ -80,10 +76,7 @@ def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBound
 
 
 def action_cells(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
-    """Divide the actions into cells.
-
-    Args:
-        gains: Null-space units per action (O,).
+    """Divide the actions into cells, given the null-space units per action (O,).
 
     Returns:
         The corners (C, O) of all cells as raw actions, and the indices of the corners of each cell.
@@ -218,22 +211,14 @@ def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarra
     low, high = single_output_bounds(loop)
     lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)
     upper = np.where(is_corrected, np.minimum(corrected_bounds[1], high), free.upper)
-    speed, acceleration = free.speed.copy(), free.acceleration.copy()
-    start = np.broadcast_to([loop.start - loop.start_within, loop.start + loop.start_within], (2, *lower.shape[1:]))
-    for n in range(len(lower)):
-        least, greatest = _last_three(lower, n, start[0]), _last_three(upper, n, start[1])
-        recent = is_corrected[max(n - 1, 0) : n + 1]
-        if (n >= 1 or loop.primitive.history) and recent.any():
-            change = np.maximum(greatest[0] - least[1], greatest[1] - least[0]) / loop.period
-            speed[n] = np.where(recent.any(axis=0), change, speed[n])
-        recent = is_corrected[max(n - 2, 0) : n + 1]
-        if (n >= 2 or loop.primitive.history) and recent.any():
-            forward = greatest[0] - 2.0 * least[1] + greatest[2]
-            change = np.maximum(forward, 2.0 * greatest[1] - least[0] - least[2]) / loop.period**2
-            acceleration[n] = np.where(recent.any(axis=0), change, acceleration[n])
+    # Values at each step and at the two steps before it; the robot rests within the start before the first step.
+    least = np.vstack([[loop.start - loop.start_within] * 2, lower])
+    greatest = np.vstack([[loop.start + loop.start_within] * 2, upper])
+    recent = np.vstack([np.zeros((2, lower.shape[1]), bool), is_corrected])
+    steps = np.maximum(greatest[2:] - least[1:-1], greatest[1:-1] - least[2:]) / loop.period
+    forward = greatest[2:] - 2.0 * least[1:-1] + greatest[:-2]
+    bends = np.maximum(forward, 2.0 * greatest[1:-1] - least[2:] - least[:-2]) / loop.period**2
+    has_past = [np.arange(len(lower))[:, None] >= (0 if loop.primitive.history else order) for order in (1, 2)]
+    speed = np.where((recent[2:] | recent[1:-1]) & has_past[0], steps, free.speed)
+    acceleration = np.where((recent[2:] | recent[1:-1] | recent[:-2]) & has_past[1], bends, free.acceleration)
     return Bounds(lower, upper, speed, acceleration)
-
-
-def _last_three(values: np.ndarray, n: int, start: np.ndarray) -> list[np.ndarray]:
-    """Return the values (O,) of step n and the two before it, the newest first; `start` before the first step."""
-    return [values[k] if k >= 0 else start for k in (n, n - 1, n - 2)]

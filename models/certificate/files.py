@@ -120,14 +120,8 @@ def compare_subject(
     """Return the name of the first difference between a certificate and a skill, or None.
 
     All that the checker assumes is compared, except for the budget: the skill's description, kernel, period,
-    impedance, primitive, gains, start and constraints.
-
-    Args:
-        files: Content of each file of a certificate that the checker accepts.
-        loop: Loop of the skill.
-        stiffness: Stiffness of the skill's impedance, as in `certificate_files`.
-        limits: Limits of the skill's impedance, as in `certificate_files`.
-        about: Texts about the skill, as in `certificate_files`.
+    impedance, primitive, gains, start and constraints. `files` has the content of each file of a certificate that the
+    checker accepts; the other arguments describe the skill as in `certificate_files`.
     """
     claims = json.loads(files[CERTIFICATE])
     claimed = {name: claims[name] for name in ("about", "kernel", "period")}

@@ -44,15 +44,10 @@ class BudgetedBounds:
 def bound_within_budget(
     loop: CertifiedLoop, free: Bounds, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
 ) -> BudgetedBounds:
-    """Compute bounds for corrections that satisfy a budget.
+    """Compute bounds of a loop with a history for corrections that satisfy a budget.
 
-    Args:
-        loop: Primitive in its loop, with a history.
-        free: Bounds without active constraints.
-        middle: Motion without actions, as `reach` returns it.
-        generators: Generators, as `reach` returns them.
-        first: First step at which a constraint can be active.
-        budget: Budget of the corrections.
+    `free` are the bounds without active constraints, `middle` and `generators` the results of `reach`, and `first` is
+    the first step at which a constraint can be active.
     """
     primitive, past = loop.primitive, loop.primitive.history
     num_steps, num_outputs = primitive.num_steps, primitive.num_outputs
@@ -95,12 +90,7 @@ def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
 class MultiplierSearch:
     """Greedy search for Lagrange multipliers that tighten the bound in a direction.
 
-    Args:
-        loop: Primitive in its loop.
-        middle: Motion without actions, as `reach` returns it.
-        generators: Generators of `reach`, followed by those of `residue_generators`.
-        first: First step at which a constraint can be active.
-        budget: Budget of the corrections.
+    Arguments are those of `bound_within_budget`, with `generators` followed by those of `residue_generators`.
     """
 
     def __init__(self, loop: CertifiedLoop, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget):
@@ -146,13 +136,9 @@ class MultiplierSearch:
     def bound(
         self, directions: np.ndarray, steps: np.ndarray, outputs: np.ndarray, multipliers: np.ndarray
     ) -> np.ndarray:
-        """Compute the largest displacement (O,) of commands in directions (O, ·), proven by multipliers (O, R).
+        """Compute the largest displacement (O,) of commands in directions (O, ·), the generators along each direction.
 
-        Args:
-            directions: Generators along each direction.
-            steps: Step of each constraint (O, R).
-            outputs: Output of each constraint (O, R).
-            multipliers: Multiplier of each constraint (O, R).
+        It is proven by the `multipliers` (O, R) of the constraints at `steps` (O, R) on `outputs` (O, R).
         """
         rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._past + steps, outputs])
         margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]

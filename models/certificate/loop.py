@@ -1,6 +1,5 @@
 """Primitive in its feedback loop, the subject of a certificate, and its reachable motions without constraints."""
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,13 +58,8 @@ def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds (N, O) by the constraints on a single output, lower and upper, widened by their tolerance."""
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))
-    lower, upper = np.full((2, primitive.num_steps, primitive.num_outputs), [[[-np.inf]], [[np.inf]]])
-    for n, row in itertools.product(range(primitive.num_steps), range(G.shape[1])):
-        involved = np.flatnonzero(G[n, row])
-        if len(involved) == 1:
-            o, bound = involved[0], c[n, row] / G[n, row, involved[0]]
-            if G[n, row, o] > 0.0:
-                lower[n, o] = max(lower[n, o], bound)
-            else:
-                upper[n, o] = min(upper[n, o], bound)
+    is_single = ((G != 0.0).sum(axis=2) == 1)[..., None]
+    bound = c[..., None] / np.where(G == 0.0, 1.0, G)
+    lower = np.where(is_single & (G > 0.0), bound, -np.inf).max(axis=1, initial=-np.inf)
+    upper = np.where(is_single & (G < 0.0), bound, np.inf).min(axis=1, initial=np.inf)
     return lower - TOLERANCE, upper + TOLERANCE

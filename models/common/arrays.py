@@ -24,11 +24,9 @@ _EXACT = 2**53  # a double represents smaller whole numbers exactly
 
 
 def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
-    """Convert values to a new array of doubles without rounding.
+    """Convert numbers, nested in any way that NumPy accepts, to a new array of doubles without rounding.
 
-    Args:
-        values: Numbers, nested in any way that NumPy accepts.
-        what: Name of the values for messages.
+    `what` is the name of the values for messages.
 
     Raises:
         InputError: If the values are ragged or are not real numbers (text, dates, complex numbers, other objects), or a

@@ -249,11 +249,7 @@ def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarr
     """Convert a generalized force along the coordinates of a pose to the wrench (6,) at P in T that does the same work.
 
     The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are
-    linearly dependent for b = ±π/2, near which the result is large.
-
-    Args:
-        pose: X_TP as [x y z a b c] (6,) [m, rad].
-        force: Generalized force (6,) [N, Nm].
+    linearly dependent for b = ±π/2, near which the result is large. The pose is X_TP as [x y z a b c] (6,) [m, rad].
     """
     a, b = pose[3], pose[4]
     about_z, about_y, about_x = force[3:]

@@ -51,10 +51,7 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
 def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: float) -> np.ndarray:
     """Compute D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ, which gives every mode of (K, Λ) the damping ratio ζ.
 
-    Args:
-        K: Stiffness (6, 6), symmetric, positive definite.
-        Lambda_inverse: Inverse inertia at the tool, Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6).
-        damping_ratio: Damping ratio ζ.
+    K is the stiffness (6, 6), symmetric and positive definite, and Λ⁻¹ = J M⁻¹ Jᵀ (6, 6) the inverse inertia.
     """
     L_modes, eigenvalues = _modes(K, _root_of_inverse(Lambda_inverse))
     return (L_modes * _dampings(eigenvalues, damping_ratio)) @ L_modes.T
@@ -87,9 +84,7 @@ def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
 
     Each eigenvalue, a mass m, is multiplied by a factor that falls smoothly with log m, from 1 at `LIGHT` to 0 at
     `HEAVY`. For a regular arm the result equals Λ. In lost directions, the posture's torque then acts on the tool.
-
-    Args:
-        Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6), positive definite, [translational, rotational].
+    The argument is Λ⁻¹ = J M⁻¹ Jᵀ (6, 6), positive definite, [translational, rotational].
     """
     eigenvalues, directions = np.linalg.eigh(_SCALE[:, None] * Lambda_inverse * _SCALE)
     masses = 1.0 / eigenvalues

@@ -17,16 +17,8 @@ def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: f
 
         τ = −M(q) v (1 − exp(−h / T)) / h
 
-    Held for a period h, it multiplies the velocity by exp(−h / T).
-
-    Args:
-        M: Mass matrix, (n, n).
-        v: Joint velocities, (n,) [rad/s].
-        decay_time: T [s].
-        period: h [s].
-
-    Returns:
-        Joint torques, (n,) [Nm].
+    Held for a period h [s], the torque τ (n,) [Nm] multiplies the joint velocities v (n,) [rad/s] by exp(−h / T), with
+    the mass matrix M (n, n) and the decay time T [s].
     """
     return (M @ v) * (np.expm1(-period / decay_time) / period)
 
@@ -161,10 +153,7 @@ class StatusLimits:
     def at_rate(cls, velocity: Sequence[float], period: float, **others: float) -> "StatusLimits":
         """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`.
 
-        Args:
-            velocity: Velocity limits of the joints, (n,) [rad/s].
-            period: Period of the statuses [s].
-            others: Further limits by name.
+        `velocity` are the velocity limits of the joints, (n,) [rad/s], and `others` further limits by name.
         """
         timeout = MAX_MISSED_MESSAGES * period
         return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout, **others)
@@ -180,13 +169,10 @@ class LastStatus:
 
 
 def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
-    """Compare a status with its predecessor and return the first fault, or `Fault.NONE`.
+    """Compare the newest status, None before the first message, with the last readable one at the local time `now` [s].
 
-    Args:
-        status: Newest status; None before the first message.
-        last: Last readable status.
-        now: Local time [s].
-        limits: Plausibility limits.
+    Returns:
+        The first fault, or `Fault.NONE`.
     """
     if status is None:
         return Fault.NO_STATUS

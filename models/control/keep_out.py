@@ -50,15 +50,7 @@ class KeepOut:
         return self._lower.shape[1]
 
     def project(self, position: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Project a desired position to an allowed one.
-
-        Args:
-            position: Current position (O,).
-            desired: Desired position (O,).
-
-        Returns:
-            The allowed position (O,), and True if a box changed it.
-        """
+        """Return the allowed position (O,) for a current and a desired one (O,), and True if a box changed it."""
         target, was_in_box = self._project_to_faces(self._project_to_constraints(desired))
         if was_in_box:
             target = self._project_to_constraints(target)
@@ -69,15 +61,10 @@ class KeepOut:
         return target, was_in_box
 
     def half_spaces(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return half-spaces that exclude the boxes with their margin, selected at a position.
+        """Return half-spaces G y ≥ c that exclude the boxes with their margin, selected at a position (O,).
 
-        They are the constraints and, for each box, the half-space outside the face with the most clearance.
-
-        Args:
-            position: Position (O,).
-
-        Returns:
-            G (F, O) with rows of unit norm, and c (F,), of G y ≥ c.
+        They are the constraints and, for each box, the half-space outside the face with the most clearance. The rows of
+        G (F, O) are of unit norm; c is (F,).
         """
         below, above = self._lower - position, position - self._upper
         clearance = np.hstack([below, above])

@@ -66,12 +66,8 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
 def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:
     """Move a bound straight towards another one, so that no number changes by more than `max_change`.
 
-    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line.
-
-    Args:
-        bound: Bound as a signal (8,).
-        target: Bound to approach (8,).
-        max_change: Largest changes (8,), positive.
+    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line. All bounds
+    are signals (8,), and `max_change` (8,) is positive.
     """
     change = target - bound
     excess = float(np.max(np.abs(change) / max_change))
@@ -95,14 +91,8 @@ def slow_down(
 
     d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
     that does positive work is reduced, so that no energy is added: while it moves to its rest position, the spring
-    returns at most what it stored.
-
-    Args:
-        spring: Force of the spring [N], (3,).
-        damping: Force of the damper D v [N], (3,).
-        velocity: Velocity v [m/s], (3,).
-        impedance: √(k m) of contact and moving mass [N s/m].
-        force: Limit F of the norm of the force [N].
+    returns at most what it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], and
+    `force` is F [N].
     """
     speed = float(np.sqrt(velocity @ velocity))
     if speed == 0.0 or spring @ velocity <= 0.0:
@@ -139,13 +129,7 @@ def bounded_wrench(
 
 
 def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -> float:
-    """Return the largest β from 0 to 1 with s − β d inside the bound, for a spring's wrench s inside it.
-
-    Args:
-        spring: s (6,).
-        damping: d (6,).
-        bound: Bound.
-    """
+    """Return the largest β from 0 to 1 with s − β d inside the bound, for the wrenches s and d (6,), s inside it."""
     wrench = spring - damping
     f, t = wrench[:3], wrench[3:]
     if (np.abs(wrench) <= bound.axes).all() and f @ f <= bound.force**2 and t @ t <= bound.torque**2:
@@ -202,11 +186,9 @@ def governed_error(
 
 
 def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
-    """Compute the center of pressure (−τ_y, τ_x) / f_z relative to the tool center, (2,) [m].
+    """Compute the center of pressure (−τ_y, τ_x) / f_z (2,) [m] of a wrench about the tool center (6,), force first.
 
-    Args:
-        wrench: Wrench about the tool center (6,), force first [N, Nm].
-        min_force: Smallest normal force f_z [N]; below it the result is zero, because the quotient is not reliable.
+    Below the normal force `min_force` [N] the result is zero, because the quotient is not reliable.
     """
     if wrench[2] < min_force:
         return np.zeros(2)
@@ -239,15 +221,23 @@ def external_wrench(
     return wrench
 
 
+def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies of stiffness and damping (6,) of a pose's coordinates; `owner` needs them, for messages.
+
+    Raises:
+        InputError: If a shape is wrong, a stiffness is not positive, or a damping is negative.
+    """
+    K, D = np.array(stiffness, dtype=float), np.array(damping, dtype=float)
+    if not K.shape == D.shape == (6,) or not (K > 0.0).all() or not (D >= 0.0).all():
+        raise InputError(f"{owner} needs six positive stiffnesses and six dampings, none negative")
+    return K, D
+
+
 def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) -> float:
     """Return the energy [J] of springs K e that are clipped at a limit F each, the sum of Huber's functions.
 
-    The energy of a spring is ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond.
-
-    Args:
-        stiffness: K (n,) [N/m, Nm/rad], positive.
-        limits: F (n,) [N, Nm], not negative.
-        error: e (n,) [m, rad].
+    The energy of a spring is ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond, with positive stiffness K (n,)
+    [N/m, Nm/rad], limits F (n,) [N, Nm], not negative, and error e (n,) [m, rad].
     """
     # Plain numbers, as NumPy's overhead would exceed the computation, which runs several times per plant step.
     energy = 0.0

@@ -71,19 +71,11 @@ class LinearConstraints:
             raise InputError(
                 f"the constraints{where} contradict each other: a lower bound exceeds its upper bound; loosen one"
             )
-        num_outputs = lower.shape[-1]
-        rows, bounds = [], []
-        for o in range(num_outputs):
-            for sign, bound in ((1.0, lower[..., o]), (-1.0, -upper[..., o])):
-                if np.all(bound == -np.inf):
-                    continue
-                rows.append(sign * np.eye(num_outputs)[o])
-                bounds.append(bound)
-        G = np.reshape(rows, (len(rows), num_outputs))
-        if lower.ndim == 1:
-            return cls(G, np.reshape(bounds, len(rows)))
-        steps = lower.shape[0]
-        return cls(np.broadcast_to(G, (steps, *G.shape)), np.reshape(bounds, (len(rows), steps)).T)
+        # Rows y_0 ≥ lower_0, −y_0 ≥ −upper_0, y_1 ≥ lower_1, …, without those that are infinite at every step.
+        c = np.stack([lower, -upper], axis=-1).reshape(*lower.shape[:-1], -1)
+        is_finite = (np.atleast_2d(c) != -np.inf).any(axis=0)
+        G = np.kron(np.eye(lower.shape[-1]), [[1.0], [-1.0]])[is_finite]
+        return cls(np.broadcast_to(G, (*lower.shape[:-1], *G.shape)), c[..., is_finite])
 
     @classmethod
     def none(cls, num_outputs: int) -> "LinearConstraints":
@@ -115,14 +107,9 @@ class LinearConstraints:
         return self.G[steps], self.c[steps]
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Compute the maximum over the constraints of c − G y, with rows of unit norm [unit of the output].
+        """Compute the maximum over the constraints of a step of c − G y, with rows of unit norm [unit of the output].
 
-        Args:
-            output: y (O,).
-            step: Step of the constraints.
-
-        Returns:
-            The violation; a negative one is slack, and −inf is returned without constraints.
+        For the output y (O,), a negative violation is slack, and −inf is returned without constraints.
         """
         if self.num_constraints == 0:
             return -np.inf

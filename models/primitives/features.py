@@ -35,11 +35,8 @@ def window_features(
     The history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs.
     The history is kept out of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ with both would lose accuracy.
 
-    Args:
-        kernel: k.
-        history_inputs: Inputs of the history, (P,) or (P, I), may be empty.
-        future_inputs: Inputs of the window, (H+1,) or (H+1, I).
-        history_noise: ħρ, positive if there is a history.
+    Inputs of the history are (P,) or (P, I) and may be empty, those of the window (H+1,) or (H+1, I). `history_noise`
+    is ħρ, positive if there is a history.
 
     Raises:
         InputError: If `history_noise` is too small for the length of the history.
@@ -98,9 +95,7 @@ def _conditioned(
 class KernelBasis:
     """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on few inputs that span the others.
 
-    Args:
-        kernel: k.
-        inputs: Inputs (N, I) that the features represent up to rounding.
+    The features represent the given inputs (N, I) up to rounding.
     """
 
     def __init__(self, kernel: Kernel, inputs: np.ndarray):

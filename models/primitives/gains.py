@@ -21,7 +21,8 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
     `outputs` are indices or a mask of the explored outputs, all by default; the others have authority zero.
     """
     explored = _explored_mask(primitive, outputs)
-    response = _constant_response(primitive)
+    # Output i by a constant raw action of one in output j, (N, O, O).
+    response = _closed_loop(primitive, np.tile(np.eye(primitive.num_outputs), (primitive.num_steps, 1, 1)))
     authority = np.sqrt(np.mean(np.einsum("noo->no", response) ** 2, axis=0))
     return np.where(explored, authority, 0.0)
 
@@ -110,14 +111,13 @@ def _check_response(primitive: LcNsKmp, response: np.ndarray) -> None:
 
 
 def _explored_mask(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray:
-    mask = np.zeros(primitive.num_outputs, dtype=bool)
+    everything = np.arange(primitive.num_outputs)
     if outputs is not None and np.asarray(outputs).dtype == bool:
         outputs = np.flatnonzero(outputs)
-    indices = np.arange(primitive.num_outputs) if outputs is None else np.asarray(outputs, dtype=int)
-    if not len(indices) or indices.min() < 0 or indices.max() >= primitive.num_outputs:
+    indices = everything if outputs is None else np.asarray(outputs, dtype=int)
+    if not len(indices) or not np.isin(indices, everything).all():
         raise InputError(f"action_dims must be among 0 … {primitive.num_outputs - 1}: {indices.tolist()}")
-    mask[indices] = True
-    return mask
+    return np.isin(everything, indices)
 
 
 def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
@@ -131,12 +131,6 @@ def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
         if history:
             past[history + n] += history_map @ past[n : n + history].reshape(-1, batch)
     return past[history:]
-
-
-def _constant_response(primitive: LcNsKmp) -> np.ndarray:
-    """Compute the displacement (N, O, O) of output i by a constant raw action of one in output j."""
-    actions = np.broadcast_to(np.eye(primitive.num_outputs), (primitive.num_steps,) + (primitive.num_outputs,) * 2)
-    return _closed_loop(primitive, actions)
 
 
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:

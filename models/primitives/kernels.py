@@ -19,15 +19,7 @@ class Kernel(Protocol):
     stationary: bool
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return k between the rows of `a` and `b`.
-
-        Args:
-            a: Inputs (N,) or (N, I).
-            b: Inputs (M,) or (M, I).
-
-        Returns:
-            Kernel matrix (N, M), in the precision of the inputs.
-        """
+        """Return k (N, M) between the rows of `a` (N,) or (N, I) and `b` (M,) or (M, I), in their precision."""
         ...
 
 
@@ -84,9 +76,19 @@ def kernel_name(kernel: Kernel) -> str | None:
     return next((name for name in KERNELS.names() if KERNELS.get(name) is type(kernel)), None)
 
 
+@dataclass(frozen=True)
+class _StationaryKernel:
+    length_scale: float = DEFAULT_LENGTH_SCALE
+    stationary = True
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.length_scale) and self.length_scale > 0):
+            raise InputError(f"the kernel's length_scale must be positive and finite, not {self.length_scale}")
+
+
 @register_kernel("squared_exponential")
 @dataclass(frozen=True)
-class SquaredExponential:
+class SquaredExponential(_StationaryKernel):
     """The thesis's kernel k(ζ, ζ') = exp(−‖ζ − ζ'‖² / (2 ℓ²)) (section 4.3.3).
 
     The thesis writes it as exp(−l ‖ζ − ζ'‖²): l = 1 / (2 ℓ²), and its l = 2 is ℓ = 0.5.
@@ -98,12 +100,6 @@ class SquaredExponential:
         InputError: If the length scale is not positive and finite.
     """
 
-    length_scale: float = DEFAULT_LENGTH_SCALE
-    stationary = True
-
-    def __post_init__(self) -> None:
-        _check_positive("length_scale", self.length_scale)
-
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return k between the rows of `a` and `b`, as `Kernel` declares it."""
         return np.exp(-(0.5 / self.length_scale**2) * _squared_distance(a, b))
@@ -111,7 +107,7 @@ class SquaredExponential:
 
 @register_kernel("matern52")
 @dataclass(frozen=True)
-class Matern52:
+class Matern52(_StationaryKernel):
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
     Its functions are only twice differentiable. It suits motions for which the squared exponential kernel is too
@@ -124,12 +120,6 @@ class Matern52:
         InputError: If the length scale is not positive and finite.
     """
 
-    length_scale: float = DEFAULT_LENGTH_SCALE
-    stationary = True
-
-    def __post_init__(self) -> None:
-        _check_positive("length_scale", self.length_scale)
-
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return k between the rows of `a` and `b`, as `Kernel` declares it."""
         s = np.sqrt(5 * _squared_distance(a, b)) / self.length_scale
@@ -139,8 +129,3 @@ class Matern52:
 def _squared_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     a, b = (x[:, None] if x.ndim == 1 else x for x in (np.asarray(a), np.asarray(b)))
     return ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=-1)
-
-
-def _check_positive(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0):
-        raise InputError(f"the kernel's {name} must be positive and finite, not {value}")

@@ -108,13 +108,7 @@ class Kmp:
         return identifier
 
     def move_via_point(self, identifier: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Replace a via-point.
-
-        Args:
-            identifier: Return value of `add_via_point`.
-            input_: New input (I,).
-            mean: New output (O,).
-            covariance: New covariance (O, O).
+        """Replace the via-point of an identifier by one with an input (I,), a mean (O,) and a covariance (O, O).
 
         Raises:
             InputError: As `add_via_point`, or if there is no such via-point.

@@ -9,7 +9,6 @@ the primitive of sKGRL with a history (5.1 to 5.3).
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.deviation import MAX_DEVIATION, check_deviation
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
@@ -138,8 +138,6 @@ class LcNsKmp:
             InputError: If an argument has the wrong shape or is not finite.
             UnsolvableError: If no window within the constraints was found; repeat the last safe command.
         """
-        if step < 0:
-            raise InputError(f"step counts from 0, not {step}")
         factor = self._cache.get(step) or self._factor(step)
         return self._finish(factor, self._stack(null_space_action, history))
 
@@ -184,15 +182,7 @@ class LcNsKmp:
     ) -> PrimitiveStepper:
         """Start an episode that computes one command per control step without a diagram.
 
-        Args:
-            pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first
-                mean by default.
-            gain: Raw null-space action per unit of the action of `PrimitiveStepper.step`, (O,); ones by default.
-            history_source: Outputs that are appended to the history.
-            motion: Filter of the commands by constraints of the motion, as in `PrimitiveStepper`.
-
-        Raises:
-            InputError: If an argument has the wrong shape or is not finite.
+        Arguments and errors are those of `PrimitiveStepper`: `pose` is (O,) or (P, O), and `gain` is (O,).
         """
         from guiderail.models.primitives.stepper import PrimitiveStepper
 
@@ -285,11 +275,8 @@ class LcNsKmp:
                 are so close that their kernel matrix is singular.
             UnsolvableError: If no window within the constraints was found.
         """
-        if step < 0:
-            raise InputError(f"step counts from 0, not {step}")
         step = min(step, self.num_steps - 1)
-        factor = self._factor(step)
-        return self._modified(factor, step, self.horizon, at, null_space_actions, history)
+        return self._modified(self._factor(step), step, self.horizon, at, null_space_actions, history)
 
     def modified_trajectory(
         self, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
@@ -417,6 +404,8 @@ class LcNsKmp:
         return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _factor(self, step: int) -> StepFactor:
+        if step < 0:
+            raise InputError(f"step counts from 0, not {step}")
         if not float(step).is_integer():
             raise InputError(f"a step is a whole number, not {brief(step)}")
         step = min(int(step), self.num_steps - 1)
@@ -483,11 +472,9 @@ def get_shared_primitive(
     Raises:
         InputError: As `LcNsKmp`.
     """
-    arrays = (reference.times, reference.means, reference.covariances, constraints.G, constraints.c)
-    digest = hashlib.blake2b(digest_size=16)
-    for array in arrays:
-        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array, dtype=float).tobytes())
-    key = (digest.digest(), kernel, *sorted(arguments.items()))
+    arrays = {name: getattr(reference, name) for name in ("times", "means", "covariances")}
+    arrays |= {"G": constraints.G, "c": constraints.c}
+    key = (digest(arrays, ""), kernel, *sorted(arguments.items()))
     primitive = _SHARED.get(key)
     if primitive is None:
         primitive = LcNsKmp(reference, kernel=kernel, constraints=constraints, **arguments)

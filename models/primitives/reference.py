@@ -210,13 +210,9 @@ class ReferenceTrajectory:
         return inside + before + after
 
     def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
-        """Return this trajectory with a new time between steps and `time_scale` times its duration.
+        """Return this trajectory with a `period` [s] between steps and `time_scale` times its duration.
 
         Means and covariances are interpolated linearly. The number of steps times the period is the new duration.
-
-        Args:
-            period: Time between steps [s], positive.
-            time_scale: Factor of the duration, positive.
 
         Raises:
             InputError: If an argument is not positive, or fewer than two steps remain.
@@ -381,15 +377,8 @@ def information_criteria(
 ) -> dict[int, float]:
     """Compute the Bayesian information criterion of mixtures by number of components; less is better.
 
-    Args:
-        times: Common clock (N,) [s].
-        outputs: Outputs (M, N, O).
-        candidates: Increasing numbers of components; the search stops once two in a row are not better than the best
-            before.
-        seed: Seed of scikit-learn's generator.
-
-    Raises:
-        InputError: If there are fewer points than the components need.
+    `candidates` are increasing; the search stops once two in a row are not better than the best before. The other
+    arguments and the errors are those of `fit_mixture`.
     """
     return {count: criterion for count, (_, criterion) in _fit_candidates(times, outputs, candidates, seed).items()}
 
@@ -414,17 +403,10 @@ def _fit_candidates(
 
 
 def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute Gaussian mixture regression on time.
+    """Compute Gaussian mixture regression on times (N,) [s].
 
-    Conditioned on time, each component is a line with a constant covariance. The result is the mean and the covariance
-    of their mixture, weighted by the likelihood of the time under each component.
-
-    Args:
-        mixture: Mixture of (time, outputs).
-        times: Times (N,) [s].
-
-    Returns:
-        Means (N, O) and covariances (N, O, O).
+    Conditioned on time, each component is a line with a constant covariance. The results are the means (N, O) and the
+    covariances (N, O, O) of their mixture, weighted by the likelihood of the time under each component.
     """
     offset = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
     variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]

@@ -102,9 +102,7 @@ class PrimitiveStepper:
     def request(self, action: ArrayLike, pose: ArrayLike | None = None) -> tuple[int, np.ndarray, np.ndarray | None]:
         """Return the arguments of `LcNsKmp.predict` for the next step, for a batch of several episodes.
 
-        Args:
-            action: Policy's action (O,), as in `step`.
-            pose: Measured output (O,), as in `step`.
+        `action` (O,) and `pose` (O,) are those of `step`.
 
         Raises:
             InputError: As `step`.

@@ -162,11 +162,7 @@ class StepFactor:
         self.correction_map = L @ self._basis
 
     def correct(self, free: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the least-norm correction of a window.
-
-        Args:
-            free: Constrained directions of the unconstrained window, `constraint_map @ x`, (m,).
-            solver: Solver of the least-norm problem.
+        """Compute the least-norm correction of a window, given its constrained directions `constraint_map @ x` (m,).
 
         Returns:
             The correction v (r,), which moves the executed point by `correction_map @ v`, and the multipliers (m,).

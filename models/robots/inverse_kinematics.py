@@ -55,7 +55,9 @@ class _Problem:
 
     def search(self, within_limits: bool) -> np.ndarray | None:
         """Return the solution found from the posture, otherwise the nearest one found from random starts, or None."""
-        lower, upper = self._limits(within_limits)
+        lower, upper = self._plant.GetPositionLowerLimits(), self._plant.GetPositionUpperLimits()
+        if not within_limits:
+            lower, upper = np.full_like(lower, -np.inf), np.full_like(upper, np.inf)
         solution = self._solve(self._posture, lower, upper, within_limits)
         if solution is not None:
             return solution
@@ -66,10 +68,6 @@ class _Problem:
         solutions = [self._solve(start, lower, upper, within_limits) for start in starts]
         valid = [q for q in solutions if q is not None]
         return min(valid, key=lambda q: float(np.linalg.norm(q - self._posture)), default=None)
-
-    def _limits(self, within_limits: bool) -> tuple[np.ndarray, np.ndarray]:
-        lower, upper = self._plant.GetPositionLowerLimits(), self._plant.GetPositionUpperLimits()
-        return (lower, upper) if within_limits else (np.full_like(lower, -np.inf), np.full_like(upper, np.inf))
 
     def _solve(self, start: np.ndarray, lower: np.ndarray, upper: np.ndarray, within_limits: bool) -> np.ndarray | None:
         ik = InverseKinematics(self._plant, with_joint_limits=within_limits)

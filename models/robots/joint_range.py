@@ -124,10 +124,8 @@ class JointRange:
         """Return the smallest singular value of the scaled Jacobian, and its gradient (n,)."""
         J = self._jacobian(q)
         U, sigma, WT = np.linalg.svd(J, full_matrices=False)
-        gradient = np.zeros(len(q))
-        for joint in range(len(q)):
-            moved = self._jacobian(q + _DIFFERENCE * np.eye(len(q))[joint])
-            gradient[joint] = U[:, -1] @ ((moved - J) / _DIFFERENCE) @ WT[-1]
+        moved = [self._jacobian(q + step) for step in _DIFFERENCE * np.eye(len(q))]
+        gradient = np.array([U[:, -1] @ ((each - J) / _DIFFERENCE) @ WT[-1] for each in moved])
         return float(sigma[-1]), gradient
 
 

@@ -124,14 +124,11 @@ def _read(plant: MultibodyPlant, file: Path, label: str, *, only_one: bool = Fal
 
 
 def _find(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], kind: str, name: str, robot: Robot) -> Any:
-    """Return the frame or the joint, as `kind` says, with a name."""
-    has, get = {
-        "frame": (plant.HasFrameNamed, plant.GetFrameByName),
-        "joint": (plant.HasJointNamed, plant.GetJointByName),
-    }[kind]
+    """Return the frame or the joint with a name; `kind` is "frame" or "joint"."""
+    has_name = getattr(plant, f"Has{kind.title()}Named")
     for model in models:
-        if has(name, model):
-            return get(name, model)
+        if has_name(name, model):
+            return getattr(plant, f"Get{kind.title()}ByName")(name, model)
     raise InputError(f"robot {robot.name!r}: {robot.model.name} has no {kind} {name!r}")
 
 

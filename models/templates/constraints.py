@@ -190,9 +190,10 @@ class Cylinder(PositionConstraint):
         radius = math.hypot(p_FE[0], p_FE[1])
         if self.min_radius_m <= radius <= self.max_radius_m:
             return p_FE
-        bound = self.min_radius_m if radius < self.min_radius_m else self.max_radius_m
+        nudge = _inward_nudge(self.min_radius_m, self.max_radius_m)
+        bound = self.min_radius_m + nudge if radius < self.min_radius_m else self.max_radius_m - nudge
         direction = p_FE[:2] / radius if radius > 0 else np.array([-1.0, 0.0])
-        return np.array([*_nudge_inside(bound, direction, self.min_radius_m, self.max_radius_m), p_FE[2]])
+        return np.array([*(bound * direction), p_FE[2]])
 
 
 @register(ACTIVE_CONSTRAINTS, "sector")
@@ -213,17 +214,15 @@ class Sector(PositionConstraint):
         azimuth = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (lower + upper))
         if lower <= azimuth <= upper:
             return p_FE
-        # Moved inside by a rounding error, so that projecting is idempotent.
-        nudge = min(1e-12, 0.25 * (upper - lower))
+        nudge = _inward_nudge(lower, upper)
         azimuth = lower + nudge if azimuth < lower else upper - nudge
         radius = math.hypot(p_FE[0], p_FE[1])
         return np.array([radius * math.cos(azimuth), radius * math.sin(azimuth), p_FE[2]])
 
 
-def _nudge_inside(bound: float, direction: np.ndarray, lower: float, upper: float) -> np.ndarray:
-    """Return bound · direction, moved inside [lower, upper] by a rounding error so that projecting is idempotent."""
-    nudge = min(1e-12, 0.25 * (upper - lower))
-    return (bound + (nudge if bound == lower else -nudge)) * direction
+def _inward_nudge(lower: float, upper: float) -> float:
+    """Return the distance of a projection from the bounds of an interval, so that projecting is idempotent."""
+    return min(1e-12, 0.25 * (upper - lower))
 
 
 @register(ACTIVE_CONSTRAINTS, "keep_above")

@@ -95,24 +95,16 @@ def draw_figure(template: SharedControlTemplate) -> "Figure":
         text = "\n".join([state.name.upper(), *state_lines(state)])
         axes.text(x[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box, **plain)
     for start, end, condition in list_edges(template):
-        forward = x[end] > x[start]
-        side = 1.0 if forward else -1.0
-        y = 0.25 * side
-        left, right = (start, end) if forward else (end, start)
-        span = (x[left] + width / 2, x[right] - width / 2)
-        axes.annotate(
-            "",
-            xy=(span[1] if forward else span[0], y),
-            xytext=(span[0] if forward else span[1], y),
-            arrowprops={"arrowstyle": "-|>", "color": "#33506b"},
-        )
+        side = 1.0 if x[end] > x[start] else -1.0
+        tail, head = (x[start] + side * width / 2, 0.25 * side), (x[end] - side * width / 2, 0.25 * side)
+        axes.annotate("", xy=head, xytext=tail, arrowprops={"arrowstyle": "-|>", "color": "#33506b"})
         axes.annotate(
             condition,
-            xy=(sum(span) / 2, y),
+            xy=((tail[0] + head[0]) / 2, tail[1]),
             xytext=(0, 4 * side),
             textcoords="offset points",
             ha="center",
-            va="bottom" if forward else "top",
+            va="bottom" if side > 0.0 else "top",
             fontsize=8,
             color="#33506b",
         )

@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
-from guiderail.models.templates.geometry import Frames, angle_between, between, largest
+from guiderail.models.templates.geometry import Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
 from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
@@ -58,8 +58,7 @@ class TemplateState:
     @property
     def frame_names(self) -> set[str]:
         """Names of the object frames that the state refers to."""
-        parts: list[InputMapping | ActiveConstraint | TransitionDistance] = [*self.input_mapping]
-        parts += [*self.active_constraints, self.transition_distance]
+        parts: tuple[StatePart, ...] = (*self.input_mapping, *self.active_constraints, self.transition_distance)
         return {frame for part in parts for frame in part.frame_names}
 
     @cached_property
@@ -113,10 +112,10 @@ class SharedControlTemplate:
         Raises:
             InputError: If there is no such state.
         """
-        for number, candidate in enumerate(self.states):
-            if candidate.name == state:
-                return number
-        raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, [s.name for s in self.states])}")
+        names = [candidate.name for candidate in self.states]
+        if state not in names:
+            raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, names)}")
+        return names.index(state)
 
     def without_active_constraints(self) -> "SharedControlTemplate":
         """Return the template with the same states, input mappings and distances, but no active constraints."""
@@ -201,13 +200,14 @@ class SharedControlTemplate:
     @cached_property
     def _max_speeds(self) -> tuple[tuple[float, float], ...]:
         """Largest speed [m/s] and angular speed [rad/s] of the command in each state."""
+
+        def least(speed: float, of_state: float | None) -> float:
+            return speed if of_state is None else min(speed, of_state)
+
         return tuple(
             (
-                min(self.max_speed_m_per_s, math.inf if state.max_speed_m_per_s is None else state.max_speed_m_per_s),
-                min(
-                    self.max_speed_rad_per_s,
-                    math.inf if state.max_speed_rad_per_s is None else state.max_speed_rad_per_s,
-                ),
+                least(self.max_speed_m_per_s, state.max_speed_m_per_s),
+                least(self.max_speed_rad_per_s, state.max_speed_rad_per_s),
             )
             for state in self.states
         )

@@ -39,15 +39,15 @@ from research.benchmarks import with_progress
 # Outermost callbacks only: nested ones would count twice.
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
-    (PoseWrench, "_calc_wrench"),
+    (PoseWrench, "_wrench"),
     (CartesianImpedanceController, "_calc_law"),
     (CartesianPositionController, "_step"),
-    (MeasuredPose, "_calc_pose"),
+    (MeasuredPose, "_pose"),
     (ContactDetector, "_update"),
     (LastValidPose, "_update"),
     (CommandWatchdog, "_calc_safe_pose"),
-    (ImpedanceMonitor, "_calc_contact_force"),
-    (ImpedanceMonitor, "_calc_saturation"),
+    (ImpedanceMonitor, "_contact_force"),
+    (ImpedanceMonitor, "_saturation"),
     (Recorder, "_record"),
 )
 # From first contact of the plug to its release in the locked state [s].

@@ -1,13 +1,14 @@
 """Declarations that systems share: periods, samples, cache entries, and ports with their getters."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import (
+    BasicVector,
     CacheEntry,
     Context,
     DependencyTicket,
@@ -63,6 +64,15 @@ class SignalPorts:
         return {name: port.Eval(context) for name, port in self._ports.items()}
 
 
+def get_signal_input_port(self: Any, name: str) -> InputPort:
+    """Return the port of the signal `name`; a method of systems that store `SignalPorts` as `_signals`.
+
+    Raises:
+        InputError: If there is no such signal.
+    """
+    return self._signals.port(name)
+
+
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
     """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` describes it."""
     try:
@@ -85,65 +95,156 @@ def check_period(period: float) -> None:
         raise InputError(f"a system's period must be positive and finite, not {period} s")
 
 
-def declare_sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
-    """Declare a discrete state that contains a vector input port, sampled at initialization and once per period [s].
+Source: TypeAlias = InputPort | CacheEntry | DiscreteStateIndex | DependencyTicket
+"""Value that an output or a cache entry is computed from."""
 
-    Returns:
-        Index of the discrete state.
+
+def tickets(system: LeafSystem, sources: Iterable[Source]) -> set[DependencyTicket]:
+    """Return the dependency tickets of input ports, cache entries and discrete states of a system."""
+
+    def ticket(source: Source) -> DependencyTicket:
+        if isinstance(source, DiscreteStateIndex):
+            return system.discrete_state_ticket(source)
+        return source if isinstance(source, DependencyTicket) else source.ticket()
+
+    return {ticket(source) for source in sources}
+
+
+def output(
+    system: LeafSystem,
+    name: str,
+    size: int,
+    value: Callable[[Context], np.ndarray | Sequence[float]],
+    sources: Iterable[Source],
+) -> OutputPort:
+    """Declare a vector output port with the `value` (size,) that is computed from `sources`."""
+
+    def calc(context: Context, vector: BasicVector) -> None:
+        vector.SetFromVector(value(context))
+
+    return system.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=tickets(system, sources))
+
+
+def scalar_output(
+    system: LeafSystem, name: str, value: Callable[[Context], float], sources: Iterable[Source]
+) -> OutputPort:
+    """Declare a vector output port (1,) with the `value` that is computed from `sources`."""
+
+    def calc(context: Context, vector: BasicVector) -> None:
+        vector.SetAtIndex(0, value(context))
+
+    return system.DeclareVectorOutputPort(name, 1, calc, prerequisites_of_calc=tickets(system, sources))
+
+
+def part_output(
+    system: LeafSystem,
+    name: str,
+    source: CacheEntry | DiscreteStateIndex,
+    part: Callable[[Any], Any],
+    size: int | None = None,
+) -> OutputPort:
+    """Declare a vector output port with a part of the value of a cache entry or a discrete state.
+
+    `part` returns an array (size,) of this value; without a size, it returns a number and the port is (1,).
+    """
+
+    def value_of_state(context: Context) -> Any:
+        return part(context.get_discrete_state(source).value())
+
+    def value_of_cache(context: Context) -> Any:
+        return part(source.Eval(context))
+
+    value = value_of_state if isinstance(source, DiscreteStateIndex) else value_of_cache
+    if size is None:
+        return scalar_output(system, name, value, [source])
+    return output(system, name, size, value, [source])
+
+
+def after_start(
+    update: Callable[[Any, Context, DiscreteValues], None],
+) -> Callable[[Any, Context, DiscreteValues], None]:
+    """Return a method of a system that updates the discrete state except at time zero, when no step has ended.
+
+    An event offset of one period cannot be used: period + k * period differs from (k + 1) * period in the last bit for
+    every third k.
+    """
+
+    def update_after_start(self: Any, context: Context, discrete_state: DiscreteValues) -> None:
+        if context.get_time() > 0:
+            update(self, context, discrete_state)
+
+    return update_after_start
+
+
+def update(
+    system: LeafSystem,
+    period: float,
+    calc: Callable[[Context, DiscreteValues], Any],
+    reset: Callable[[Context, DiscreteValues], Any] | None = None,
+) -> None:
+    """Declare the update `calc` of the discrete state once per period [s], and an optional reset at initialization.
 
     Raises:
         InputError: If the period is not positive and finite.
     """
     check_period(period)
+    if reset is not None:
+        system.DeclareInitializationDiscreteUpdateEvent(reset)
+    system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, calc)
+
+
+def reset_to_default(system: LeafSystem) -> Callable[[Context, DiscreteValues], None]:
+    """Return a reset that restores the default of every discrete state that has been declared."""
+    default = system.AllocateDiscreteVariables()
+    return lambda context, discrete_state: discrete_state.SetFrom(default)
+
+
+def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
+    """Declare and return a discrete state with samples of a vector port, at initialization and once per period [s].
+
+    Raises:
+        InputError: If the period is not positive and finite.
+    """
     state = system.DeclareDiscreteState(port.size())
 
-    def sample(context: Context, discrete_state: DiscreteValues) -> None:
+    def calc(context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(state, port.Eval(context))
 
-    system.DeclareInitializationDiscreteUpdateEvent(sample)
-    system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, sample)
+    update(system, period, calc, calc)
     return state
 
 
-def declare_cache(
-    system: LeafSystem,
-    name: str,
-    calc: Callable[[Context], object],
-    *,
-    prerequisites_of_calc: set[DependencyTicket],
-) -> CacheEntry:
-    """Declare a cache entry with a value that `calc` computes from the system's context.
-
-    Its name is a description. `prerequisites_of_calc` are the tickets of the values that `calc` reads.
-    """
+def cache(system: LeafSystem, name: str, calc: Callable[[Context], object], sources: Iterable[Source]) -> CacheEntry:
+    """Declare a cache entry with the description `name` and a value that `calc` computes from `sources`."""
     return system.DeclareCacheEntry(
         description=name,
         value_producer=ValueProducer(
             allocate=Value[object], calc=lambda context, value: value.set_value(calc(context))
         ),
-        prerequisites_of_calc=prerequisites_of_calc,
+        prerequisites_of_calc=tickets(system, sources),
     )
 
 
-def declare_plant_context(
-    system: LeafSystem,
-    plant: MultibodyPlant,
-    set_state: Callable[[Context, Context], None],
-    *,
-    prerequisites_of_calc: set[DependencyTicket],
+def plant_context(
+    system: LeafSystem, plant: MultibodyPlant, state: Callable[[Context], np.ndarray], sources: Iterable[Source]
 ) -> CacheEntry:
     """Declare a cache entry that contains a context of the finalized plant, for its kinematics and inertia.
 
-    `set_state` writes the plant's state, given the system's context and the plant's context. It reads the values of
-    `prerequisites_of_calc`.
+    `state` computes the joint positions, or positions and velocities, from `sources`.
     """
+    num_positions = plant.num_positions()
+
+    def calc(context: Context, value: AbstractValue) -> None:
+        numbers, plant_context = state(context), value.get_mutable_value()
+        if len(numbers) == num_positions:
+            plant.SetPositions(plant_context, numbers)
+        else:
+            plant.SetPositionsAndVelocities(plant_context, numbers)
+
     return system.DeclareCacheEntry(
         description="plant_context",
-        value_producer=ValueProducer(
-            allocate=lambda: Value(plant.CreateDefaultContext()),
-            calc=lambda context, value: set_state(context, value.get_mutable_value()),
-        ),
-        prerequisites_of_calc=prerequisites_of_calc,
+        value_producer=ValueProducer(allocate=lambda: Value(plant.CreateDefaultContext()), calc=calc),
+        prerequisites_of_calc=tickets(system, sources),
     )
 
 

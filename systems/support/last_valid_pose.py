@@ -3,9 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket, DiscreteValues, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period
 
 _TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s], far above rounding errors after days, far below any period
@@ -65,7 +66,7 @@ class LastValidPose:
 
     Attributes:
         tickets: Dependencies of `eval`.
-        timed_out_tickets: Dependencies of `calc_timed_out`.
+        timed_out_tickets: Dependencies of the validity of the present command.
 
     Raises:
         InputError: If an argument is out of range.
@@ -85,14 +86,9 @@ class LastValidPose:
         self._validity = CommandValidity(desired_pose, command_time, period=period, timeout=timeout)
         self._last_pose = system.DeclareDiscreteState(desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
-        system.DeclareInitializationDiscreteUpdateEvent(self._reset)
-        system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self.timed_out_tickets: set[DependencyTicket] = {
-            desired_pose.ticket(),
-            command_time.ticket(),
-            system.discrete_state_ticket(self._check_time),
-        }
-        self.tickets = self.timed_out_tickets | {system.discrete_state_ticket(self._last_pose)}
+        declare.update(system, period, self._update, self._reset)
+        self.timed_out_tickets = declare.tickets(system, [desired_pose, command_time, self._check_time])
+        self.tickets = self.timed_out_tickets | declare.tickets(system, [self._last_pose])
 
     def eval(self, context: Context) -> np.ndarray:
         """Return the desired pose to follow, (O,)."""
@@ -100,9 +96,11 @@ class LastValidPose:
             return self._desired_pose.Eval(context)
         return context.get_discrete_state(self._last_pose).value()
 
-    def calc_timed_out(self, context: Context, output: BasicVector) -> None:
-        """Set the output (1,) to 1 if the present command is not valid, otherwise to 0."""
-        output.SetAtIndex(0, float(not self._is_valid(context)))
+    def declare_timed_out_output(self, system: LeafSystem) -> OutputPort:
+        """Declare the output port ``command_timed_out`` (1,), 1 if the present command is not valid, otherwise 0."""
+        return declare.scalar_output(
+            system, "command_timed_out", lambda context: float(not self._is_valid(context)), self.timed_out_tickets
+        )
 
     def _is_valid(self, context: Context) -> bool:
         return self._validity.is_valid(context, context.get_discrete_state(self._check_time).value().item())

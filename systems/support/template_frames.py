@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, DependencyTicket, Le
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
-from guiderail.systems.support.declarations import declare_cache
+from guiderail.systems.support import declarations as declare
 
 
 class TemplateFrames:
@@ -35,9 +35,7 @@ class TemplateFrames:
         self._indices = [
             system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in template.frames
         ]
-        self._cache = declare_cache(
-            system, "template_frames", self._calc, prerequisites_of_calc={system.all_parameters_ticket()}
-        )
+        self._cache = declare.cache(system, "template_frames", self._calc, [system.all_parameters_ticket()])
 
     @property
     def ticket(self) -> DependencyTicket:
