@@ -364,22 +364,16 @@ def build_task_diagram(
 
 @dataclass(frozen=True)
 class SkillDiagram:
-    """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station.
+    """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station."""
 
-    Attributes:
-        diagram: Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench,
-            contact_force, held_action, constraint_violation and fallback.
-        control_period: Control period [s].
-        num_steps: Number of control steps of an episode.
-        randomize: As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
-        meshcat: Meshcat page that the diagram publishes to; None if there is none.
-    """
-
+    # Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench, contact_force,
+    # held_action, constraint_violation and fallback.
     diagram: Diagram
-    control_period: float
-    num_steps: int
+    control_period: float  # control period [s]
+    num_steps: int  # number of control steps of an episode
+    # As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]]
-    meshcat: Meshcat | None = None
+    meshcat: Meshcat | None = None  # Meshcat page that the diagram publishes to; None if there is none
 
 
 def build_skill_diagram(

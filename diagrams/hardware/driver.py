@@ -33,17 +33,11 @@ CommandCallback = Callable[[np.ndarray, float], None]
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one pre-flight check.
+    """Result of one pre-flight check."""
 
-    Attributes:
-        name: Name of the check.
-        description: Measured values, or an assumption that the operator has to check.
-        passed: False if the arm must not move; None if nothing is checked.
-    """
-
-    name: str
-    description: str
-    passed: bool | None = None
+    name: str  # name of the check
+    description: str  # measured values, or an assumption that the operator has to check
+    passed: bool | None = None  # False if the arm must not move; None if nothing is checked
 
 
 class Driver(ABC):

@@ -44,21 +44,15 @@ MAX_PAIRS = 31  # number of bits of a contact mask
 
 @dataclass(frozen=True)
 class MujocoContact:
-    """Parameters of MuJoCo's contact and integration, equal for all objects.
+    """Parameters of MuJoCo's contact and integration, equal for all objects."""
 
-    Attributes:
-        time_step: Time step of the engine [s], rounded so that the station's time step is a multiple of it.
-        time_constant: Time constant of a contact [s]; the engine needs at least two time steps.
-        impedance: Constraint impedance of a contact, between 0 and 1.
-        friction_ratio: Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
-        spring_step: Natural frequency of a spring times time step. It determines the mass of the spring's body, which
-            must be heavy enough for explicit integration.
-    """
-
-    time_step: float = 0.001
-    time_constant: float = 0.002
-    impedance: float = 0.95
+    time_step: float = 0.001  # time step of the engine [s], rounded so that the station's time step is a multiple of it
+    time_constant: float = 0.002  # time constant of a contact [s]; the engine needs at least two time steps
+    impedance: float = 0.95  # constraint impedance of a contact, between 0 and 1
+    # Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
     friction_ratio: float = 10.0
+    # Natural frequency of a spring times time step. It determines the mass of the spring's body, which must be heavy
+    # enough for explicit integration.
     spring_step: float = 1.0
 
 

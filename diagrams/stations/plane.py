@@ -36,24 +36,16 @@ class PlaneConfig:
     that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
     mm, is much less than a wall's thickness. Below saturation its position control is critically damped: the robot
     reaches a command within a control step and does not overshoot.
-
-    Attributes:
-        plant_period: Time step of the plant [s].
-        substeps: Plant steps per control step.
-        mass: Mass of the robot [kg].
-        max_force: Largest force of each joint [N].
-        max_speed: Largest speed of each joint [m/s].
-        friction: Friction between robot and walls; high, so that a robot pressed against a wall does not slide.
-        stiffness: Stiffness of the contact [N/m].
     """
 
-    plant_period: float = round_period(0.002)
-    substeps: int = 10
-    mass: float = 0.001
-    max_force: float = 50.0
-    max_speed: float = 10.0
+    plant_period: float = round_period(0.002)  # time step of the plant [s]
+    substeps: int = 10  # plant steps per control step
+    mass: float = 0.001  # mass of the robot [kg]
+    max_force: float = 50.0  # largest force of each joint [N]
+    max_speed: float = 10.0  # largest speed of each joint [m/s]
+    # Friction between robot and walls; high, so that a robot pressed against a wall does not slide.
     friction: float = 10.0
-    stiffness: float = 1e6
+    stiffness: float = 1e6  # stiffness of the contact [N/m]
 
     @property
     def control_period(self) -> float:

@@ -42,33 +42,21 @@ ORANGE = (0.95, 0.55, 0.10, 1.0)
 
 @dataclass(frozen=True)
 class PouringConfig:
-    """Parameters of the scene and its time steps.
+    """Parameters of the scene and its time steps."""
 
-    Attributes:
-        mug: Dimensions of the mug.
-        thermos: Dimensions of the thermos.
-        ball: Parameters of a ball.
-        num_balls: Number of balls.
-        p_WStand: Point of the table's surface under the nominal mug [m].
-        stand_height: Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
-        grip: Distance of the thermos's axis from the flange [m]; the axes of thermos and flange are perpendicular.
-        grip_height: Distance of the grip from the thermos's tip [m].
-        plant_period: Time step of the plant [s].
-        substeps: Plant steps per control step.
-        robot: The arm, or its name; its data need drives and a level posture.
-    """
-
-    mug: Vessel = MUG
-    thermos: Vessel = THERMOS
-    ball: Ball = field(default_factory=Ball)
-    num_balls: int = 2
-    p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)
+    mug: Vessel = MUG  # dimensions of the mug
+    thermos: Vessel = THERMOS  # dimensions of the thermos
+    ball: Ball = field(default_factory=Ball)  # parameters of a ball
+    num_balls: int = 2  # number of balls
+    p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)  # point of the table's surface under the nominal mug [m]
+    # Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
     stand_height: float = 0.06
+    # Distance of the thermos's axis from the flange [m]; the axes of thermos and flange are perpendicular.
     grip: float = 0.08
-    grip_height: float = 0.045
-    plant_period: float = round_period(0.005)
-    substeps: int = 2
-    robot: Robot | str = DEFAULT_ROBOT
+    grip_height: float = 0.045  # distance of the grip from the thermos's tip [m]
+    plant_period: float = round_period(0.005)  # time step of the plant [s]
+    substeps: int = 2  # plant steps per control step
+    robot: Robot | str = DEFAULT_ROBOT  # the arm, or its name; its data need drives and a level posture
 
     @cached_property
     def arm(self) -> Robot:
