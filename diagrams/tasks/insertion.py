@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
-from guiderail.diagrams.envs.options import Numbers, ResetOptions
+from guiderail.diagrams.envs.options import Pair, ResetOptions, satisfies
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE, MIN_CONTACT_FORCE
@@ -41,23 +41,20 @@ EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
 """Scales of a privileged critic's observation: x, y and turn of the fixture, force and torque."""
 
 
+GivenOffset = Annotated[
+    Pair,
+    satisfies(
+        lambda offset: max(map(abs, offset)) <= MAX_GIVEN_OFFSET,
+        f"give x and y in meters, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}",
+    ),
+]
+
+
 class InsertionReset(ResetOptions):
     """Options of a reset of an insertion task."""
 
     new_run: bool = Field(False, description="sample the hidden values of a run again")
-    offset: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="(x, y) of the fixture or the workpiece [m]; default: sampled",
-    )
-
-    @field_validator("offset")
-    @classmethod
-    def _is_near(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and max(map(abs, value)) > MAX_GIVEN_OFFSET:
-            raise ValueError(f"give x and y in meters, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}")
-        return value
+    offset: GivenOffset | None = Field(None, description="(x, y) of the fixture or the workpiece [m]; default: sampled")
 
 
 class InsertionTask(Task):
