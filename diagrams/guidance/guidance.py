@@ -29,6 +29,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 
 from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, GuidanceFunction
@@ -98,9 +99,9 @@ class FunctionGuidance(Guidance):
         builder = DiagramBuilder()
         system = FunctionGuidanceSystem(law, action_size, prior.pose_size, prior.wrench_size, prior.period)
         builder.AddNamedSystem("law", system)
-        violation = builder.AddNamedSystem("violation", ConstraintViolation(prior.constraints, prior.period))
-        builder.Connect(system.get_desired_pose_output_port(), violation.get_pose_input_port())
-        for name in ("action", "pose", "wrench"):
+        violation = ConstraintViolation(prior.constraints, prior.period)
+        add_system(builder, "violation", violation, pose=system.get_desired_pose_output_port())
+        for name in INPUTS:
             builder.ExportInput(system.GetInputPort(name), name)
         for name in ("desired_pose", "held_action", "fallback"):
             builder.ExportOutput(system.GetOutputPort(name), name)

@@ -27,6 +27,7 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
@@ -147,9 +148,8 @@ def add_gripper_control(
     for row, joint in enumerate(joints):
         column = joint.position_start() - first
         actuated[row, column] = actuated[len(joints) + row, num_positions + column] = 1.0
-    state = builder.AddNamedSystem("gripper_state", MatrixGain(actuated))
+    state = add_system(builder, "gripper_state", MatrixGain(actuated), plant.get_state_output_port(arm.tool_model))
     builder.Connect(command.get_desired_state_output_port(), plant.get_desired_state_input_port(arm.tool_model))
-    builder.Connect(plant.get_state_output_port(arm.tool_model), state.get_input_port())
     return command.get_position_input_port(), state.get_output_port()
 
 
@@ -265,7 +265,9 @@ class ArmStation(Station):
         """Add joint torque sensors and the estimate of the wrench; return its port."""
         model, plant, arm = self._controller_plant, self.plant, self.arm
         largest, n = model.plant.GetEffortUpperLimits(), model.plant.num_positions()
-        self._torque_sensor = builder.AddNamedSystem(
+        state = plant.get_state_output_port(arm.model)
+        self._torque_sensor = add_system(
+            builder,
             "torque_sensor",
             ExternalTorqueSensor(
                 model.plant,
@@ -274,8 +276,11 @@ class ArmStation(Station):
                 accuracy.drift * largest,
                 period=plant.time_step(),
             ),
+            state=state,
+            contact_torque=plant.get_generalized_contact_forces_output_port(arm.model),
         )
-        estimate = builder.AddNamedSystem(
+        estimate = add_system(
+            builder,
             "wrench_estimate",
             JointTorqueWrench(
                 model.plant,
@@ -284,19 +289,10 @@ class ArmStation(Station):
                 period=plant.time_step(),
                 time_constant=WRENCH_ESTIMATE_TIME_CONSTANT,
             ),
+            external_torque=self._torque_sensor.get_external_torque_output_port(),
         )
-        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
-        state, contact = (
-            plant.get_state_output_port(arm.model),
-            plant.get_generalized_contact_forces_output_port(arm.model),
-        )
-        builder.Connect(state, self._torque_sensor.get_state_input_port())
-        builder.Connect(contact, self._torque_sensor.get_contact_torque_input_port())
-        builder.Connect(state, positions.get_input_port())
+        positions = add_system(builder, "positions", MatrixGain(np.eye(n, 2 * n)), state)
         builder.Connect(positions.get_output_port(), estimate.get_positions_input_port())
-        builder.Connect(
-            self._torque_sensor.get_external_torque_output_port(), estimate.get_external_torque_input_port()
-        )
         return estimate.get_wrench_output_port()
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:

@@ -26,6 +26,7 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
@@ -230,9 +231,8 @@ class MujocoStation(Station):
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
         surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
-        gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
-        self.gantry = builder.AddNamedSystem("gantry", gantry)
-        builder.Connect(plant.get_body_poses_output_port(), gantry.get_nominal_body_poses_input_port())
+        self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
+        add_system(builder, "gantry", gantry, nominal_body_poses=plant.get_body_poses_output_port())
         desired_pose = add_joint_impedance(
             builder,
             impedance,

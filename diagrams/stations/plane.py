@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, ProximityProperties, Sphere
+from pydrake.geometry import AddContactMaterial, Box, Cylinder, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, SpatialInertia
@@ -19,6 +19,7 @@ from guiderail.diagrams.stations.station import (
     export_station_ports,
     whole_multiple,
 )
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
@@ -114,38 +115,31 @@ class PlaneStation(Station):
 
         # F = clip(k (x_d - x), ±F_max), against the joints' viscous friction.
         one = np.eye(2)
-        pose = builder.AddNamedSystem("pose", MatrixGain(D=np.eye(2, 4)))
-        watchdog = builder.AddNamedSystem(
-            "watchdog", CommandWatchdog(config.control_period, command_timeout(config.control_period), 2)
-        )
-        poses = builder.AddNamedSystem("desired_and_measured_pose", Multiplexer([2, 2]))
-        gain = builder.AddNamedSystem("position_gain", MatrixGain(D=config.position_gain * np.hstack([one, -one])))
+        state = self.plant.get_state_output_port(self._robot)
+        pose = add_system(builder, "pose", MatrixGain(D=np.eye(2, 4)), state).get_output_port()
+        watchdog = CommandWatchdog(config.control_period, command_timeout(config.control_period), 2)
+        add_system(builder, "watchdog", watchdog, pose=pose)
+        both = Multiplexer([2, 2])
+        add_system(builder, "desired_and_measured_pose", both, watchdog.get_safe_pose_output_port(), pose)
+        gain = MatrixGain(D=config.position_gain * np.hstack([one, -one]))
+        force = add_system(builder, "position_gain", gain, both.get_output_port()).get_output_port()
         limit = np.full(2, config.max_force)
-        saturation = builder.AddNamedSystem("force_limit", Saturation(-limit, limit))
-        builder.Connect(self.plant.get_state_output_port(self._robot), pose.get_input_port())
-        builder.Connect(pose.get_output_port(), watchdog.get_pose_input_port())
-        builder.Connect(watchdog.get_safe_pose_output_port(), poses.get_input_port(0))
-        builder.Connect(pose.get_output_port(), poses.get_input_port(1))
-        builder.Connect(poses.get_output_port(), gain.get_input_port())
-        builder.Connect(gain.get_output_port(), saturation.get_input_port())
-        builder.Connect(saturation.get_output_port(), self.plant.get_actuation_input_port(self._robot))
+        applied = add_system(builder, "force_limit", Saturation(-limit, limit), force).get_output_port()
+        builder.Connect(applied, self.plant.get_actuation_input_port(self._robot))
+        negative = add_system(builder, "negative_force", Gain(-1.0, 2), applied).get_output_port()
+        excess = add_system(builder, "excess_force", Adder(2, 2), force, negative)
 
-        applied = builder.AddNamedSystem("negative_force", Gain(-1.0, 2))
-        excess = builder.AddNamedSystem("excess_force", Adder(2, 2))
-        builder.Connect(saturation.get_output_port(), applied.get_input_port())
-        builder.Connect(gain.get_output_port(), excess.get_input_port(0))
-        builder.Connect(applied.get_output_port(), excess.get_input_port(1))
-
-        force_sum = builder.AddNamedSystem("force_sum", LinearSystem(one, one, one, 0 * one, config.plant_period))
-        mean_force = builder.AddNamedSystem("mean_force", MeanForce(2, config.substeps, config.control_period))
-        builder.Connect(self.plant.get_generalized_contact_forces_output_port(self._robot), force_sum.get_input_port())
-        builder.Connect(force_sum.get_output_port(), mean_force.get_force_sum_input_port())
+        contact_force = self.plant.get_generalized_contact_forces_output_port(self._robot)
+        force_sum = LinearSystem(one, one, one, 0 * one, config.plant_period)
+        add_system(builder, "force_sum", force_sum, contact_force)
+        mean_force = MeanForce(2, config.substeps, config.control_period)
+        add_system(builder, "mean_force", mean_force, force_sum=force_sum.get_output_port())
 
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
             watchdog.get_command_time_input_port(),
-            pose=pose.get_output_port(),
+            pose=pose,
             wrench=mean_force.get_force_output_port(),
             contact_force=mean_force.get_magnitude_output_port(),
             saturation=excess.get_output_port(),
@@ -224,8 +218,6 @@ def _obstacle_shape(passage: PassageGeometry) -> Cylinder:
 
 
 def _contact(config: PlaneConfig) -> ProximityProperties:
-    properties = ProximityProperties()
-    properties.AddProperty("material", "coulomb_friction", CoulombFriction(config.friction, config.friction))
-    properties.AddProperty("material", "point_contact_stiffness", config.stiffness)
-    properties.AddProperty("material", "hunt_crossley_dissipation", 0.0)
+    properties, friction = ProximityProperties(), CoulombFriction(config.friction, config.friction)
+    AddContactMaterial(0.0, config.stiffness, friction, properties)
     return properties

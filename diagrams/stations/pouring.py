@@ -13,6 +13,7 @@ from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscrete
 
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import ControllerPlant, Station, export_station_ports
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
@@ -168,18 +169,17 @@ class PouringStation(Station):
         )
         builder.AddNamedSystem("controller", controller)
         # Without a desired velocity the drives' damping delays the arm by centimeters.
-        num_joints = config.arm.num_joints
-        drives = StateInterpolatorWithDiscreteDerivative(
-            num_joints, config.control_period, suppress_initial_transient=True
-        )
-        builder.AddNamedSystem("drives", drives)
-        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
-        measured = MeasuredPose(plant, thermos, config.X_WT)
-        builder.AddNamedSystem("pose", measured)
+        n, body_poses = config.arm.num_joints, plant.get_body_poses_output_port()
+        drives = StateInterpolatorWithDiscreteDerivative(n, config.control_period, suppress_initial_transient=True)
+        add_system(builder, "drives", drives, controller.get_joint_positions_output_port())
+        positions = MatrixGain(np.eye(n, 2 * n))
+        add_system(builder, "positions", positions, plant.get_state_output_port(self.arm))
+        measured = add_system(builder, "pose", MeasuredPose(plant, thermos, config.X_WT), body_poses=body_poses)
         links = [plant.get_body(index) for index in plant.GetBodyIndices(self.arm)]
         period = config.plant_period
         contact_detector = ContactDetector(plant, [*links, thermos], [plant.world_body(), self._mug], period)
-        builder.AddNamedSystem("contact_detector", contact_detector)
+        contact_results = plant.get_contact_results_output_port()
+        add_system(builder, "contact_detector", contact_detector, contact_results=contact_results)
         axes = config.X_WT.rotation()
         sensor = WrenchSensor(plant, wrist, [thermos], self._tip, axes, config.control_period, WRENCH_TIME_CONSTANT)
         builder.AddNamedSystem("wrench_sensor", sensor)
@@ -190,12 +190,8 @@ class PouringStation(Station):
             ("balls_in_thermos", RelativePoses(plant, self._balls, thermos)),
         ]
 
-        builder.Connect(plant.get_state_output_port(self.arm), positions.get_input_port())
         builder.Connect(positions.get_output_port(), controller.get_positions_input_port())
-        builder.Connect(controller.get_joint_positions_output_port(), drives.get_input_port())
         builder.Connect(drives.get_output_port(), plant.get_desired_state_input_port(self.arm))
-        builder.Connect(plant.get_body_poses_output_port(), measured.get_body_poses_input_port())
-        builder.Connect(plant.get_contact_results_output_port(), contact_detector.get_contact_results_input_port())
         export_station_ports(
             builder,
             controller.get_desired_pose_input_port(),
@@ -207,8 +203,7 @@ class PouringStation(Station):
             command_timed_out=controller.get_command_timed_out_output_port(),
         )
         for name, system in relative_poses:
-            builder.AddNamedSystem(name, system)
-            builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
+            add_system(builder, name, system, body_poses=body_poses)
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
         builder.ExportOutput(contact_detector.get_collision_output_port(), "collision")
         builder.ExportOutput(contact_detector.get_has_collided_output_port(), "touched")
