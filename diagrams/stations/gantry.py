@@ -30,6 +30,7 @@ from guiderail.diagrams.stations.station import (
     add_workcell_plant,
     check_pose,
     export_simulation_ports,
+    set_at_rest,
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
@@ -144,9 +145,7 @@ class GantryStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the tool at rest at `pose`, (6,); `context` is the root context."""
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.gantry, check_pose(pose, POSE_SIZE))
-        self.plant.SetVelocities(plant_context, self.gantry, np.zeros(POSE_SIZE))
+        set_at_rest(self.plant, self.gantry, context, check_pose(pose, POSE_SIZE))
 
 
 def moving_mass(plant: MultibodyPlant) -> float:

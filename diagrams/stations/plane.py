@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import AddContactMaterial, Box, Cylinder, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
@@ -14,9 +14,11 @@ from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Mu
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     Station,
+    add_plant,
     check_pose,
     command_timeout,
     export_station_ports,
+    set_at_rest,
     whole_multiple,
 )
 from guiderail.diagrams.wiring import add_system
@@ -99,13 +101,7 @@ class PlaneStation(Station):
         builder = DiagramBuilder()
         self.passage, self.config = passage, config
         self.control_period = config.control_period
-        plant_config = MultibodyPlantConfig(
-            time_step=config.plant_period,
-            discrete_contact_approximation="lagged",
-            contact_model="point",
-            use_sampled_output_ports=False,  # see `TaskDiagram`
-        )
-        self.plant, self.scene_graph = AddMultibodyPlant(plant_config, builder)
+        self.plant, self.scene_graph = add_plant(builder, config.plant_period, contact_model="point")
         self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
         self._robot = _add_robot(self.plant, passage, config)
         _add_walls(self.plant, passage, config)
@@ -150,10 +146,7 @@ class PlaneStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the robot's center at (x, y), at rest; `context` is the root context."""
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositionsAndVelocities(
-            plant_context, self._robot, np.concatenate([check_pose(pose, 2), np.zeros(2)])
-        )
+        set_at_rest(self.plant, self._robot, context, check_pose(pose, 2))
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
         """Put the obstacles at (n, 2) [m], in a workcell with moving obstacles; `context` is the root context."""

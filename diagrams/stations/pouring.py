@@ -6,13 +6,13 @@ from functools import cached_property
 import numpy as np
 from pydrake.geometry import Box, Cylinder
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import ControllerPlant, Station, export_station_ports
+from guiderail.diagrams.stations.station import ControllerPlant, Station, add_plant, export_station_ports
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
@@ -138,14 +138,9 @@ class PouringStation(Station):
         builder = DiagramBuilder()
         self.config = config
         self.control_period = config.control_period
-        plant_config = MultibodyPlantConfig(
-            time_step=config.plant_period,
-            contact_model="point",
-            discrete_contact_approximation="lagged",
-            penetration_allowance=1e-3,
-            use_sampled_output_ports=False,  # see `TaskDiagram`
+        self.plant, self.scene_graph = plant, _ = add_plant(
+            builder, config.plant_period, contact_model="point", penetration_allowance=1e-3
         )
-        self.plant, self.scene_graph = plant, _ = AddMultibodyPlant(plant_config, builder)
         self.arm, self._tip, wrist = add_arm_with_thermos(plant, config)
         self._mount = plant.AddFrame(FixedOffsetFrame("mug_mount", plant.world_frame(), config.X_WT))
         self._mug = add_vessel(plant, "mug", config.mug, CHINA)
