@@ -102,22 +102,18 @@ class Observation(Diagram):
         if not self.size:
             raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
         multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[term.signal] for term in terms]))
-        exported: set[str] = set()
+        ports: dict[str, OutputPort] = {}
         if waits:
             motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
             builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
         for index, term in enumerate(terms):
             if term.signal in CLOCKS:
-                clock = _add_clock(builder, term.signal, duration, motion_time if waits else None)
-                builder.Connect(clock, multiplexer.get_input_port(index))
-                continue
-            if term.signal not in exported:
-                exported.add(term.signal)
+                ports[term.signal] = _add_clock(builder, term.signal, duration, motion_time if waits else None)
+            elif term.signal not in ports:
                 signal = builder.AddNamedSystem(term.signal, PassThrough(sizes[term.signal]))
                 builder.ExportInput(signal.get_input_port(), term.signal)
-            builder.Connect(
-                builder.GetSubsystemByName(term.signal).get_output_port(0), multiplexer.get_input_port(index)
-            )
+                ports[term.signal] = signal.get_output_port()
+            builder.Connect(ports[term.signal], multiplexer.get_input_port(index))
         scale = np.concatenate([scale for _, _, scale in rows])
         center = np.concatenate([center for _, center, _ in rows])
         D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]

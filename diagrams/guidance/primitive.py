@@ -50,7 +50,16 @@ class PrimitiveGuidance(Guidance):
 
         The primitive's progress waits for the robot if the configuration has a progress rule.
         """
-        command, fallback = self._limit_motion(builder, config, kmp, pose)
+        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
+        if config.motion is not None:
+            from guiderail.models.control.motion_constraints import MotionConstraintFilter
+            from guiderail.systems.command_filter import CommandFilter
+
+            motion = CommandFilter(MotionConstraintFilter(config.motion, config.control_period), config.control_period)
+            add_system(builder, "motion_constraints", motion, desired_pose=command, pose=pose)
+            either = add_system(builder, "fallbacks", Adder(2, 1), fallback, motion.get_intervention_output_port())
+            flag = add_system(builder, "fallback", Saturation(np.zeros(1), np.ones(1)), either.get_output_port())
+            command, fallback = motion.get_safe_pose_output_port(), flag.get_output_port()
         if config.progress is not None:
             from guiderail.systems.progress_clock import ProgressClock
 
@@ -60,21 +69,6 @@ class PrimitiveGuidance(Guidance):
             builder.Connect(clock.get_motion_time_output_port(), kmp.get_motion_time_input_port())
             builder.ExportOutput(clock.get_motion_time_output_port(), "motion_time")
         return command, fallback
-
-    def _limit_motion(
-        self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
-    ) -> tuple[OutputPort, OutputPort]:
-        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
-        if config.motion is None:
-            return command, fallback
-        from guiderail.models.control.motion_constraints import MotionConstraintFilter
-        from guiderail.systems.command_filter import CommandFilter
-
-        motion = CommandFilter(MotionConstraintFilter(config.motion, config.control_period), config.control_period)
-        add_system(builder, "motion_constraints", motion, desired_pose=command, pose=pose)
-        either = add_system(builder, "fallbacks", Adder(2, 1), fallback, motion.get_intervention_output_port())
-        flag = add_system(builder, "fallback", Saturation(np.zeros(1), np.ones(1)), either.get_output_port())
-        return motion.get_safe_pose_output_port(), flag.get_output_port()
 
     def _finish(
         self, builder: DiagramBuilder, config: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
