@@ -166,7 +166,7 @@ class DiagramEnv(DrakeGymEnv):
         self._running = False
         self._observation: np.ndarray | None = None  # last valid observation
         self._failure: str | None = None  # message of the failed simulation
-        self._violations = (-np.inf, -np.inf)  # largest commanded and measured violation of the last step
+        self._violations = (-np.inf, -np.inf)
         self._closed = False
         self._release = weakref.finalize(self, release or (lambda: None))
         self._release.atexit = False
@@ -225,7 +225,7 @@ class DiagramEnv(DrakeGymEnv):
                 now = {name: port.Eval(context) for name, port in self._recorded}
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
-        info = self._info(0, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
+        info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
         return self._observation, info | self.sampled
 
     @contextmanager
@@ -305,7 +305,7 @@ class DiagramEnv(DrakeGymEnv):
             # The simulation failed before the first control step ended.
             commanded_violation, measured_violation = self._violations
         self._violations = commanded_violation, measured_violation
-        info = self._info(termination, peak_force, fallback, terms)
+        info = self._info(termination, commanded_violation, measured_violation, peak_force, fallback, terms)
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 
@@ -365,13 +365,21 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
         return observation
 
-    def _info(self, termination: int, force: float, fallback: bool, terms: Mapping[str, float]) -> dict[str, Any]:
+    def _info(
+        self,
+        termination: int,
+        commanded_violation: float,
+        measured_violation: float,
+        force: float,
+        fallback: bool,
+        terms: Mapping[str, float],
+    ) -> dict[str, Any]:
         failure = {} if self._failure is None else {"simulation_failure": self._failure}
         return {
             "is_success": TERMINATIONS[termination] == "success",
             "termination": TERMINATIONS[termination],
-            "constraint_violation": self._violations[0],
-            "measured_violation": self._violations[1],
+            "constraint_violation": commanded_violation,
+            "measured_violation": measured_violation,
             "contact_force": force,
             "fallback": fallback,
             "control_steps": self._control_steps,

@@ -192,12 +192,9 @@ class SkgrlGuidance(PrimitiveGuidance):
         if shorter:
             from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 
-            schedule = builder.AddNamedSystem(
-                "history_length",
-                HistoryLengthSchedule(
-                    (config.history, *config.shorter_histories), config.control_period, wrench_size=config.wrench_size
-                ),
-            )
+            lengths = (config.history, *config.shorter_histories)
+            schedule = HistoryLengthSchedule(lengths, config.control_period, wrench_size=config.wrench_size)
+            builder.AddNamedSystem("history_length", schedule)
             builder.ConnectInput("wrench", schedule.get_wrench_input_port())
             builder.Connect(schedule.get_history_length_output_port(), kmp.get_history_length_input_port())
         # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.

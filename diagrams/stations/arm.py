@@ -131,15 +131,10 @@ def add_gripper_control(
 ) -> tuple[InputPort, OutputPort]:
     """Add the drives of a gripper; return the ports of their desired positions and of their measured state."""
     joints = [actuator.joint() for actuator in arm.gripper]
-    command = builder.AddNamedSystem(
-        "gripper_command",
-        GripperCommand(
-            np.concatenate([joint.position_lower_limits() for joint in joints]),
-            np.concatenate([joint.position_upper_limits() for joint in joints]),
-            np.array([end_effector.opening[joint.name()] for joint in joints]),
-            period=period,
-        ),
-    )
+    lower = np.concatenate([joint.position_lower_limits() for joint in joints])
+    upper = np.concatenate([joint.position_upper_limits() for joint in joints])
+    opening = np.array([end_effector.opening[joint.name()] for joint in joints])
+    command = builder.AddNamedSystem("gripper_command", GripperCommand(lower, upper, opening, period=period))
     # The model's state includes joints that mimic others.
     num_positions = plant.num_positions(arm.tool_model)
     every = [plant.get_joint(index) for index in plant.GetJointIndices(arm.tool_model)]
@@ -264,33 +259,16 @@ class ArmStation(Station):
     def _add_wrench_estimate(self, builder: DiagramBuilder, accuracy: JointTorqueAccuracy) -> OutputPort:
         """Add joint torque sensors and the estimate of the wrench; return its port."""
         model, plant, arm = self._controller_plant, self.plant, self.arm
-        largest, n = model.plant.GetEffortUpperLimits(), model.plant.num_positions()
+        period, largest, n = plant.time_step(), model.plant.GetEffortUpperLimits(), model.plant.num_positions()
+        noise, drift = accuracy.noise * largest, accuracy.drift * largest
         state = plant.get_state_output_port(arm.model)
-        self._torque_sensor = add_system(
-            builder,
-            "torque_sensor",
-            ExternalTorqueSensor(
-                model.plant,
-                model.arm.tool[0],
-                accuracy.noise * largest,
-                accuracy.drift * largest,
-                period=plant.time_step(),
-            ),
-            state=state,
-            contact_torque=plant.get_generalized_contact_forces_output_port(arm.model),
+        contact_torque = plant.get_generalized_contact_forces_output_port(arm.model)
+        self._torque_sensor = sensor = ExternalTorqueSensor(model.plant, model.arm.tool[0], noise, drift, period=period)
+        add_system(builder, "torque_sensor", sensor, state=state, contact_torque=contact_torque)
+        estimate = JointTorqueWrench(
+            model.plant, model.target, model.tool_center, period=period, time_constant=WRENCH_ESTIMATE_TIME_CONSTANT
         )
-        estimate = add_system(
-            builder,
-            "wrench_estimate",
-            JointTorqueWrench(
-                model.plant,
-                model.target,
-                model.tool_center,
-                period=plant.time_step(),
-                time_constant=WRENCH_ESTIMATE_TIME_CONSTANT,
-            ),
-            external_torque=self._torque_sensor.get_external_torque_output_port(),
-        )
+        add_system(builder, "wrench_estimate", estimate, external_torque=sensor.get_external_torque_output_port())
         positions = add_system(builder, "positions", MatrixGain(np.eye(n, 2 * n)), state)
         builder.Connect(positions.get_output_port(), estimate.get_positions_input_port())
         return estimate.get_wrench_output_port()

@@ -20,6 +20,7 @@ from guiderail.diagrams.stations.station import (
     Station,
     export_station_ports,
     tare_steps,
+    whole_multiple,
 )
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
@@ -56,14 +57,13 @@ class DisturbedStation(Station):
         period = self.control_period
         builder = DiagramBuilder()
         self._inner = builder.AddNamedSystem("station", station)
-        self._commands = commands = builder.AddNamedSystem(
-            "commands", CommandDisturbance(POSE_SIZE, period, d.lost_commands, d.late_commands)
-        )
+        self._commands = commands = CommandDisturbance(POSE_SIZE, period, d.lost_commands, d.late_commands)
+        builder.AddNamedSystem("commands", commands)
         e = self._errors = _without_replaced_errors(d, station)
         self._calibration: list[ConstantVectorSource] = []
-        self._pose = pose = builder.AddNamedSystem(
-            "pose", SensorDisturbance(period, np.zeros(POSE_SIZE), resolution=np.repeat(e.pose_resolution, 3))
-        )
+        resolution = np.repeat(e.pose_resolution, 3)
+        self._pose = pose = SensorDisturbance(period, np.zeros(POSE_SIZE), resolution=resolution)
+        builder.AddNamedSystem("pose", pose)
         delivered, measured = commands.get_delivered_command_output_port(), station.get_pose_output_port()
         if any(e.calibration_error):
             delivered = self._add_constant(builder, "calibration_of_commands", delivered)
@@ -253,10 +253,10 @@ def _disturbed_period(d: Disturbances, station: Station) -> float:
     if d.clock_factor == 1.0:
         return station.control_period
     period = d.clock_factor * station.control_period
-    steps = round(period / PLANT_PERIOD)
-    if steps < 1 or abs(steps * PLANT_PERIOD - period) > 1e-6:
+    try:
+        return whole_multiple(period, PLANT_PERIOD)
+    except InputError:
         raise InputError(
             f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole number of the "
             f"plant's {PLANT_PERIOD:g} s"
-        )
-    return steps * PLANT_PERIOD
+        ) from None

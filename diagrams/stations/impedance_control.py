@@ -43,25 +43,25 @@ def add_controller(
 
     There is a tank only if the impedance is bounded; it then receives the desired pose in place of the controller.
     """
-    controller = builder.AddNamedSystem(
-        "controller",
-        CartesianImpedanceController(
-            controller_plant.plant,
-            controller_plant.target,
-            controller_plant.tool_center,
-            ImpedanceGains(
-                stiffness=np.diag(to_wrench_order(impedance.stiffness)),
-                wrench_limits=to_wrench_order(impedance.limits),
-                posture=controller_plant.posture,
-                damping_ratio=impedance.damping_ratio,
-                bound=impedance.bound,
-            ),
-            period=period,
-            compensate_gravity=compensate_gravity,
-            timeout=command_timeout(period),
-        ),
+    limits = to_wrench_order(impedance.limits)
+    gains = ImpedanceGains(
+        stiffness=np.diag(to_wrench_order(impedance.stiffness)),
+        wrench_limits=limits,
+        posture=controller_plant.posture,
+        damping_ratio=impedance.damping_ratio,
+        bound=impedance.bound,
     )
-    monitor = ImpedanceMonitor(to_wrench_order(impedance.limits))
+    controller = CartesianImpedanceController(
+        controller_plant.plant,
+        controller_plant.target,
+        controller_plant.tool_center,
+        gains,
+        period=period,
+        compensate_gravity=compensate_gravity,
+        timeout=command_timeout(period),
+    )
+    builder.AddNamedSystem("controller", controller)
+    monitor = ImpedanceMonitor(limits)
     add_system(builder, "monitor", monitor, impedance_wrench=controller.get_impedance_wrench_output_port())
     tank = add_energy_tank(builder, impedance, period, controller.get_pose_output_port())
     if tank is not None:
