@@ -112,14 +112,12 @@ def _num_steps(task: Task, period: float) -> int:
 
 def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
     """Return a task's motion constraints with the limits from its options, or None if it has neither."""
-    motion, outputs = task.motion_constraints(), constraints.num_outputs
+    motion, options = task.motion_constraints(), task.config.part("primitive")
     limits: dict[str, Any] = {}
-    options = task.config.part("primitive")
     if options.get("joint_margin") is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
-    for name in _LIMITS:
-        if given := options.get(name):
-            limits[name] = limits_per_output(name, given, outputs)
+    outputs = constraints.num_outputs
+    limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options.get(name)}
     if motion is None:
         return MotionConstraints(constraints, **limits) if limits else None
     return replace(motion, **limits)
