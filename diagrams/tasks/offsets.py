@@ -68,7 +68,9 @@ class HiddenOffsets(ABC):
     (x, y) [m] replaces the sample.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kind: str = "per_run"):
+        """Construct the sampler; `kind` is "per_run", "per_episode" or "none", as the option `fixture_offset`."""
+        self.kind = kind
         self._run: Any = None
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
