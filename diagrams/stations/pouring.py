@@ -147,7 +147,9 @@ class PouringStation(Station):
         _add_stand(plant, self._mug, config)
         plant.WeldFrames(self._mount, self._mug.body_frame())
         self._balls = [add_ball(plant, f"ball_{i}", config.ball, ORANGE) for i in range(config.num_balls)]
-        _add_table(plant, config)
+        x, y, z = config.p_WStand
+        X_WTable = RigidTransform([x + 0.1, y - 0.1, z - 0.05])  # the table begins next to the arm's base
+        add_shape(plant, plant.world_body(), "table", X_WTable, Box(1.0, 1.6, 0.1), WOOD)
         plant.Finalize()
         thermos = plant.GetBodyByName("thermos")
 
@@ -224,7 +226,10 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     arm = add_robot(plant, config.arm)
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
     wrist = plant.WeldFrames(arm.flange, thermos.body_frame(), config.X_FlangeP)
-    _add_hand(plant, thermos, config)
+    # The hand is a cylinder from the flange to the thermos's wall; its contact counts as the thermos's.
+    length = config.grip - config.thermos.outer_radius
+    X_PHand = config.X_FlangeP.inverse() @ RigidTransform([0.0, 0.0, length / 2])
+    add_shape(plant, thermos, "hand", X_PHand, Cylinder(0.03, length), METAL)
     for model in (arm.model, thermos.model_instance()):
         # The integrators of a position-controlled arm compensate gravity.
         plant.set_gravity_enabled(model, False)
@@ -233,26 +238,11 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     return arm.model, thermos.body_frame(), wrist
 
 
-def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:
-    """Add a cylinder from the flange to the thermos's wall; its contact counts as the thermos's."""
-    length = config.grip - config.thermos.outer_radius
-    X_PFlange = config.X_FlangeP.inverse()
-    X_PG = X_PFlange @ RigidTransform([0.0, 0.0, length / 2])
-    add_shape(plant, thermos, "hand", X_PG, Cylinder(0.03, length), METAL)
-
-
 def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
     """Add the stand under the mug, which moves with it; its contact counts as the mug's."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
         add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)
-
-
-def _add_table(plant: MultibodyPlant, config: PouringConfig) -> None:
-    x, y, z = config.p_WStand
-    # The table begins next to the arm's base.
-    X_WG = RigidTransform([x + 0.1, y - 0.1, z - 0.05])
-    add_shape(plant, plant.world_body(), "table", X_WG, Box(1.0, 1.6, 0.1), WOOD)
 
 
 def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
