@@ -212,5 +212,5 @@ def _obstacle_shape(passage: PassageGeometry) -> Cylinder:
 
 def _contact(config: PlaneConfig) -> ProximityProperties:
     properties, friction = ProximityProperties(), CoulombFriction(config.friction, config.friction)
-    AddContactMaterial(0.0, config.stiffness, friction, properties)
+    AddContactMaterial(dissipation=0.0, point_stiffness=config.stiffness, friction=friction, properties=properties)
     return properties
