@@ -30,6 +30,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Task
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
@@ -111,14 +112,12 @@ def _num_steps(task: Task, period: float) -> int:
 
 def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
     """Return a task's motion constraints with the limits from its options, or None if it has neither."""
-    motion, outputs = task.motion_constraints(), constraints.num_outputs
+    motion, options = task.motion_constraints(), task.config.part("primitive")
     limits: dict[str, Any] = {}
-    options = task.config.part("primitive")
     if options.get("joint_margin") is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
-    for name in _LIMITS:
-        if given := options.get(name):
-            limits[name] = limits_per_output(name, given, outputs)
+    outputs = constraints.num_outputs
+    limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options.get(name)}
     if motion is None:
         return MotionConstraints(constraints, **limits) if limits else None
     return replace(motion, **limits)
@@ -164,8 +163,7 @@ class Signals:
         held = name.removeprefix("last_")
         if name not in self._ports and held != name and held in self._ports:
             port = self._ports[held]
-            hold = self._builder.AddNamedSystem(name, ZeroOrderHold(self._period, port.size()))
-            self._builder.Connect(port, hold.get_input_port())
+            hold = add_system(self._builder, name, ZeroOrderHold(self._period, port.size()), port)
             self._ports[name] = hold.get_output_port()
         if name not in self._ports:
             raise InputError(
@@ -200,11 +198,10 @@ class Loop:
 
     def __init__(self, task: Task, station: Station, guidance: Diagram):
         self.builder = builder = DiagramBuilder()
-        self.station = builder.AddNamedSystem("station", station)
-        self.guidance = builder.AddNamedSystem("guidance", guidance)
         check_guidance_ports(guidance, station.pose_size, station.wrench_size, task.config.guidance)
-        builder.Connect(station.get_pose_output_port(), guidance.GetInputPort("pose"))
-        builder.Connect(station.get_wrench_output_port(), guidance.GetInputPort("wrench"))
+        self.station = builder.AddNamedSystem("station", station)
+        pose, wrench = station.get_pose_output_port(), station.get_wrench_output_port()
+        self.guidance = add_system(builder, "guidance", guidance, pose=pose, wrench=wrench)
         builder.Connect(guidance.GetOutputPort("desired_pose"), station.get_desired_pose_input_port())
         self.signals = Signals(builder, station.control_period, _vector_ports(station) | _vector_ports(guidance))
         self.signals.add({"action": guidance.GetOutputPort("held_action")})
@@ -224,8 +221,7 @@ class Loop:
             impedance = task.impedance() if self.station.HasInputPort("max_wrench") else None
             limit = make_phase_wrench_limit(task.template().template, impedance, self.station.control_period)
         if limit is not None:
-            self.builder.AddNamedSystem("phase_wrench_limit", limit)
-            self.builder.Connect(self.guidance.GetOutputPort("state"), limit.get_state_input_port())
+            add_system(self.builder, "phase_wrench_limit", limit, state=self.guidance.GetOutputPort("state"))
             if bound is not None:
                 self.builder.Connect(bound, limit.get_max_wrench_input_port())
             bound = limit.get_phase_max_wrench_output_port()
@@ -242,8 +238,8 @@ class Loop:
         if self.observation.get_data_type() != PortDataType.kVectorValued or task.observation_camera() is not None:
             raise InputError(f"a base policy of {task.name} takes no images: choose another observation")
         guidance: Any = self.guidance
-        reference = self.builder.AddNamedSystem("reference", guidance.make_reference(self.observation.size()))
-        self.builder.Connect(self.observation, reference.GetInputPort("observation"))
+        reference = guidance.make_reference(self.observation.size())
+        add_system(self.builder, "reference", reference, observation=self.observation)
         self.builder.Connect(reference.GetOutputPort("reference_window"), guidance.GetInputPort("reference_window"))
 
     def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
@@ -255,9 +251,8 @@ class Loop:
         if isinstance(observed, Camera):
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
         space, state = self.add_terms(task, observed, "state_observation")
-        both = self.builder.AddNamedSystem("observation", ImageObservation(width, height, state.size()))
-        self.builder.Connect(image, both.get_image_input_port())
-        self.builder.Connect(state, both.get_state_input_port())
+        both = ImageObservation(width, height, state.size())
+        add_system(self.builder, "observation", both, image=image, state=state)
         return ImageAndStateSpace((height, width, 3), space), both.get_observation_output_port()
 
     def add_terms(
@@ -273,10 +268,8 @@ class Loop:
         observation = Observation(terms, sizes, duration, task.clip, task.name, waits=waits)
         if waits:
             ports[MOTION_TIME] = self.guidance.GetOutputPort(MOTION_TIME)
-        diagram = self.builder.AddNamedSystem(name, observation)
-        for signal, port in ports.items():
-            self.builder.Connect(port, diagram.GetInputPort(signal))
-        return diagram.space, diagram.get_observation_output_port()
+        add_system(self.builder, name, observation, **ports)
+        return observation.space, observation.get_observation_output_port()
 
 
 def build_task_diagram(
@@ -310,10 +303,8 @@ def build_task_diagram(
     rewarded = {name: size for term in terms for name, size in term.inputs.items()}
     signals.connect(reward, rewarded, f"reward {task.config.reward!r} of {task.name}")
 
-    collision = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
-    builder.Connect(
-        signals.get(task.collision.signal, f"the collision threshold of {task.name}"), collision.get_input_port()
-    )
+    watched_force = signals.get(task.collision.signal, f"the collision threshold of {task.name}")
+    collision = add_system(builder, "collision", affine(np.eye(1), [-task.collision.above]), watched_force)
     force = station.get_contact_force_output_port()
     exported = {
         **violations,
@@ -364,22 +355,16 @@ def build_task_diagram(
 
 @dataclass(frozen=True)
 class SkillDiagram:
-    """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station.
+    """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station."""
 
-    Attributes:
-        diagram: Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench,
-            contact_force, held_action, constraint_violation and fallback.
-        control_period: Control period [s].
-        num_steps: Number of control steps of an episode.
-        randomize: As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
-        meshcat: Meshcat page that the diagram publishes to; None if there is none.
-    """
-
+    # Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench, contact_force,
+    # held_action, constraint_violation and fallback.
     diagram: Diagram
-    control_period: float
-    num_steps: int
+    control_period: float  # control period [s]
+    num_steps: int  # number of control steps of an episode
+    # As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]]
-    meshcat: Meshcat | None = None
+    meshcat: Meshcat | None = None  # Meshcat page that the diagram publishes to; None if there is none
 
 
 def build_skill_diagram(
@@ -411,14 +396,13 @@ def build_skill_diagram(
         from guiderail.systems.policy_system import PolicySystem
 
         policy = PolicySystem(policy, model, action.size(), task.config.action_repeat * station.control_period)
-    builder.AddNamedSystem("policy", policy)
     observation, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
     if observation.size() != loop.observation.size() or acts.size() != action.size():
         raise InputError(
             f"a policy of {task.name} takes {loop.observation.size()} numbers and returns {action.size()}, "
             f"this one {observation.size()} and {acts.size()}: it was trained with other options"
         )
-    builder.Connect(loop.observation, observation)
+    add_system(builder, "policy", policy, observation=loop.observation)
     builder.Connect(acts, action)
     for name in ("pose", "wrench", "contact_force"):
         builder.ExportOutput(station.GetOutputPort(name), name)
@@ -457,8 +441,7 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
     for name, port in poses.items():
         if name not in violations:
             checked = task.motion_constraints() or constraints
-            violation = builder.AddNamedSystem(name, ConstraintViolation(checked, station.control_period))
-            builder.Connect(port, violation.get_pose_input_port())
+            violation = add_system(builder, name, ConstraintViolation(checked, station.control_period), pose=port)
             violations[name] = violation.get_violation_output_port()
     return violations
 

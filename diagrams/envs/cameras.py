@@ -28,6 +28,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from guiderail.diagrams.envs.meshcat_page import MeshcatPage
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 
 _OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
@@ -119,9 +120,7 @@ def add_camera(
         color_camera=ColorRenderCamera(core, show_window=False),
         depth_camera=DepthRenderCamera(core, DepthRange(0.02, 9.0)),
     )
-    builder.AddNamedSystem(name, sensor)
-    builder.Connect(query, sensor.query_object_input_port())
-    return sensor.color_image_output_port()
+    return add_system(builder, name, sensor, query).color_image_output_port()
 
 
 def add_observation_camera(builder: DiagramBuilder, station: Any, camera: Camera) -> OutputPort:
@@ -187,6 +186,5 @@ def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> Meshcat:
         InputError: As `open_meshcat`.
     """
     meshcat, visualizer = open_meshcat()
-    builder.AddNamedSystem("meshcat", visualizer)
-    builder.Connect(query, visualizer.query_object_input_port())
+    add_system(builder, "meshcat", visualizer, query)
     return meshcat

@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.options import (
 )
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.options import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
@@ -28,7 +28,7 @@ def declared_models(task: str) -> list[type[Options]]:
     declared += [PrimitiveOptions, TemplateOptions]
     workcell_kind = TASKS.declared(task, "workcell_kind") if TASKS.declares(task, "workcell_kind") else "insertion"
     declared += [Disturbances] if workcell_kind == "insertion" else []
-    stations = [name for name in STATIONS.names() if STATIONS.declared(name, "workcell_kind") == workcell_kind]
+    stations = stations_for(workcell_kind)
     declared += [STATIONS.declared(name, "options") for name in stations if STATIONS.declares(name, "options")]
     declared += [GUIDANCE.declared(name, "options") for name in GUIDANCE.names() if GUIDANCE.declares(name, "options")]
     return list(dict.fromkeys(model for model in declared if model is not None))

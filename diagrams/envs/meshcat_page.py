@@ -88,6 +88,9 @@ class _Gateway:
         self.token, self._num_browsers, self._rest = secrets.token_urlsafe(24), 0, b""
         program = [sys.executable, "-I", str(Path(__file__).with_name("page_gateway.py"))]
         self._process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._input, self._output = self._process.stdin, self._process.stdout
         html, script = (FindResourceOrThrow(f"drake/geometry/meshcat.{ending}") for ending in ("html", "js"))
         files = {"": html, "index.html": html, "meshcat.js": script}
         try:
@@ -95,36 +98,31 @@ class _Gateway:
             _close_port(meshcat_port, keep=[int(port) for port in self._receive().split()])
             self._send("serve")
             self.port = int(self._receive())
-            assert self._process.stdout is not None
-            os.set_blocking(self._process.stdout.fileno(), False)
+            os.set_blocking(self._output.fileno(), False)
         except BaseException:
             self.close()
             raise
 
     def _send(self, line: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{line}\n".encode())
-        self._process.stdin.flush()
+        self._input.write(f"{line}\n".encode())
+        self._input.flush()
 
     def _receive(self) -> str:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline().decode()
+        line = self._output.readline().decode()
         if not line:
             raise RuntimeError("the gateway of the page has ended")
         return line
 
     def read_browsers(self) -> int:
         """Return the number of connected browsers."""
-        assert self._process.stdout is not None
-        *lines, self._rest = (self._rest + (self._process.stdout.read() or b"")).split(b"\n")
+        *lines, self._rest = (self._rest + (self._output.read() or b"")).split(b"\n")
         if lines:
             self._num_browsers = int(lines[-1])
         return self._num_browsers
 
     def close(self) -> None:
         """End the process."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
+        for pipe in (self._input, self._output):
             with suppress(OSError):
                 pipe.close()
         try:

@@ -13,6 +13,7 @@ from pydrake.systems.primitives import AffineSystem, Multiplexer, PassThrough, S
 from pydrake.trajectories import PiecewisePolynomial
 from scipy.linalg import block_diag
 
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
@@ -101,29 +102,24 @@ class Observation(Diagram):
         if not self.size:
             raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
         multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[term.signal] for term in terms]))
-        exported: set[str] = set()
+        ports: dict[str, OutputPort] = {}
         if waits:
             motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
             builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
         for index, term in enumerate(terms):
             if term.signal in CLOCKS:
-                clock = _add_clock(builder, term.signal, duration, motion_time if waits else None)
-                builder.Connect(clock, multiplexer.get_input_port(index))
-                continue
-            if term.signal not in exported:
-                exported.add(term.signal)
+                ports[term.signal] = _add_clock(builder, term.signal, duration, motion_time if waits else None)
+            elif term.signal not in ports:
                 signal = builder.AddNamedSystem(term.signal, PassThrough(sizes[term.signal]))
                 builder.ExportInput(signal.get_input_port(), term.signal)
-            builder.Connect(
-                builder.GetSubsystemByName(term.signal).get_output_port(0), multiplexer.get_input_port(index)
-            )
+                ports[term.signal] = signal.get_output_port()
+            builder.Connect(ports[term.signal], multiplexer.get_input_port(index))
         scale = np.concatenate([scale for _, _, scale in rows])
         center = np.concatenate([center for _, center, _ in rows])
         D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]
-        scaled = builder.AddNamedSystem("scaled", affine(D, -center / scale))
-        clipped = builder.AddNamedSystem("clipped", Saturation(np.full(self.size, -clip), np.full(self.size, clip)))
-        builder.Connect(multiplexer.get_output_port(), scaled.get_input_port())
-        builder.Connect(scaled.get_output_port(), clipped.get_input_port())
+        scaled = add_system(builder, "scaled", affine(D, -center / scale), multiplexer.get_output_port())
+        limit = np.full(self.size, clip)
+        clipped = add_system(builder, "clipped", Saturation(-limit, limit), scaled.get_output_port())
         builder.ExportOutput(clipped.get_output_port(), "observation")
         builder.BuildInto(self)
         self.space = gymnasium.spaces.Box(-clip, clip, (self.size,), np.float32)
@@ -152,9 +148,8 @@ def _add_clock(
     """Add a clock of simulation time, or of `motion_time` if it is given; return the clock's port."""
     if motion_time is not None:
         scale, offset = (1.0, 0.0) if name == "time" else (2.0 / duration, -1.0)
-        clock = builder.AddNamedSystem(name, affine(np.array([[scale]]), [offset]))
-        builder.Connect(motion_time.get_output_port(), clock.get_input_port())
-        return clock.get_output_port()
+        clock = affine(np.array([[scale]]), [offset])
+        return add_system(builder, name, clock, motion_time.get_output_port()).get_output_port()
     ends = np.array([[0.0, duration]]) if name == "time" else np.array([[-1.0, 1.0]])
     clock = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, duration], ends))
     return builder.AddNamedSystem(name, clock).get_output_port()

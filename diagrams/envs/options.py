@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
+from annotated_types import Len
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -51,14 +52,26 @@ Number = Annotated[float, BeforeValidator(_reject_bool)]
 Integers = Annotated[tuple[Integer, ...], BeforeValidator(_split_list)]
 
 
-def _check_positive(values: tuple[float, ...]) -> tuple[float, ...]:
-    if not all(value > 0.0 for value in values):
-        raise ValueError("give positive numbers")
-    return values
+def satisfies(condition: Callable[[tuple[float, ...]], bool], remedy: str) -> AfterValidator:
+    """Return a validator that refuses numbers that do not satisfy a condition; the message ends with the remedy."""
+
+    def check(numbers: tuple[float, ...]) -> tuple[float, ...]:
+        if not condition(numbers):
+            raise ValueError(remedy)
+        return numbers
+
+    return AfterValidator(check)
+
+
+def increases(lowest: float, highest: float, remedy: str) -> AfterValidator:
+    """Return a validator that refuses a pair of numbers unless lowest ≤ first ≤ second ≤ highest; see `satisfies`."""
+    return satisfies(lambda pair: lowest <= pair[0] <= pair[1] <= highest, remedy)
 
 
 Numbers = Annotated[tuple[Number, ...], BeforeValidator(_split_list)]
-PositiveNumbers = Annotated[Numbers, AfterValidator(_check_positive)]
+Pair = Annotated[Numbers, Len(2, 2)]
+_positive = satisfies(lambda numbers: all(number > 0.0 for number in numbers), "give positive numbers")
+PositiveNumbers = Annotated[Numbers, _positive]
 
 
 class CommonOptions(Options):
@@ -121,10 +134,8 @@ class PrimitiveOptions(Options):
     progress: Literal["clock", "state"] = Field(
         "clock", description="clock: the motion advances with time; state: it waits for a robot that does not follow"
     )
-    progress_tolerance: PositiveNumbers = Field(
+    progress_tolerance: Annotated[Pair, _positive] = Field(
         (0.0025, 0.1),
-        min_length=2,
-        max_length=2,
         description="deviation of position [m] and angles [rad] from the command beyond which the motion waits",
     )
     max_lag: Number = Field(3.0, ge=0, le=60, description="largest time for which the motion waits in total [s]")
@@ -215,13 +226,8 @@ def describe_options(model: type[BaseModel] | None) -> list[dict[str, Any]]:
     return rows
 
 
-_NUMBER_ERRORS = {
-    "int_type": "whole number",
-    "int_parsing": "whole number",
-    "int_from_float": "whole number",
-    "float_type": "number",
-    "float_parsing": "number",
-}
+_NUMBER_ERRORS = dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "whole number")
+_NUMBER_ERRORS |= dict.fromkeys(("float_type", "float_parsing"), "number")
 
 
 def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.recorder import Recorder, Recording
 
@@ -39,13 +40,12 @@ class DrivenStation:
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
         builder.AddNamedSystem("source", source)
-        hold = builder.AddNamedSystem("hold", ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE))
-        self.recorder = builder.AddNamedSystem("recorder", Recorder(SIGNALS, num_samples, CONTROL_PERIOD))
-        builder.Connect(source.get_output_port(0), hold.get_input_port())
-        builder.Connect(hold.get_output_port(), station.get_desired_pose_input_port())
-        builder.Connect(hold.get_output_port(), self.recorder.get_signal_input_port("desired_pose"))
-        for name in list(SIGNALS)[1:]:
-            builder.Connect(station.GetOutputPort(name), self.recorder.get_signal_input_port(name))
+        hold = ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE)
+        desired_pose = add_system(builder, "hold", hold, source.get_output_port(0)).get_output_port()
+        builder.Connect(desired_pose, station.get_desired_pose_input_port())
+        recorder = Recorder(SIGNALS, num_samples, CONTROL_PERIOD)
+        measured = {name: station.GetOutputPort(name) for name in SIGNALS if name != "desired_pose"}
+        self.recorder = add_system(builder, "recorder", recorder, desired_pose=desired_pose, **measured)
         if add_to_builder is not None:
             add_to_builder(builder, station)
         self.diagram: Diagram = builder.Build()

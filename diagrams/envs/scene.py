@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, OutputPort
 
@@ -24,8 +24,6 @@ class View:
         meshcat: Meshcat page.
     """
 
-    meshcat: Meshcat
-
     def __init__(self, query: OutputPort, meshcat: Meshcat | None = None):
         """Open the view of a scene graph's query port, on a new page if none is given.
 
@@ -33,10 +31,8 @@ class View:
             InputError: If the environment forbids Drake to open a network port.
         """
         self._query = query
-        visualizer: MeshcatVisualizer
-        self.meshcat, visualizer = open_meshcat(meshcat)
-        self._visualizer = visualizer
-        self._context = visualizer.CreateDefaultContext()
+        self.meshcat, self._visualizer = open_meshcat(meshcat)
+        self._context = self._visualizer.CreateDefaultContext()
         self._published = -1.0  # time of the last publication [s]
 
     def follow(self, context: Context) -> EventStatus:

@@ -28,10 +28,6 @@ PORTS = (
 """Output ports of every task diagram, in addition to one per reward term."""
 
 
-def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
-    return {}
-
-
 @dataclass(frozen=True)
 class Symmetry:
     """Rotations and reflections under which a task is invariant, except for details such as the demonstrated mean."""
@@ -121,7 +117,7 @@ class TaskDiagram:
     num_steps: int
     observation_space: gymnasium.spaces.Box
     reward_terms: tuple[str, ...]
-    randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = _nothing_to_randomize
+    randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = lambda *_: {}
     push: Callable[[Context, np.ndarray], None] | None = None
     query: OutputPort | None = None
     view: View | None = None

@@ -14,6 +14,7 @@ from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidanc
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.policy import find_base_policy
@@ -82,8 +83,7 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
         if takes_window:
             builder.ExportInput(chunk.get_input_port(), "reference_window")
         else:
-            reference = builder.AddNamedSystem("reference", _chunk_reference(prior, None, outputs))
-            builder.Connect(pose, reference.get_observation_input_port())
+            reference = add_system(builder, "reference", _chunk_reference(prior, None, outputs), observation=pose)
             builder.Connect(reference.get_reference_window_output_port(), chunk.get_input_port())
         if is_guarded:
             velocity, jerk = guard_limits(config, options["max_jerk"])
@@ -95,12 +95,8 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
                 start=config.constraints.nearest(config.reference.means[0]),
                 mode=options["guard"],
             )
-            limiter = builder.AddNamedSystem(
-                "chunk_safety_limiter",
-                ChunkSafetyLimiter(guard, points, options["replan_steps"], config.control_period),
-            )
-            builder.Connect(chunk.get_output_port(), limiter.get_chunk_input_port())
-            builder.Connect(pose, limiter.get_pose_input_port())
+            limiter = ChunkSafetyLimiter(guard, points, options["replan_steps"], config.control_period)
+            add_system(builder, "chunk_safety_limiter", limiter, chunk=chunk.get_output_port(), pose=pose)
             builder.ExportOutput(limiter.get_rate_output_port(), "rate")
             desired, fallback = limiter.get_desired_pose_output_port(), limiter.get_fallback_output_port()
         else:

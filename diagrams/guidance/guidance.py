@@ -29,6 +29,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 
 from guiderail.diagrams.guidance.prior import PriorKnowledge
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, GuidanceFunction
@@ -98,9 +99,9 @@ class FunctionGuidance(Guidance):
         builder = DiagramBuilder()
         system = FunctionGuidanceSystem(law, action_size, prior.pose_size, prior.wrench_size, prior.period)
         builder.AddNamedSystem("law", system)
-        violation = builder.AddNamedSystem("violation", ConstraintViolation(prior.constraints, prior.period))
-        builder.Connect(system.get_desired_pose_output_port(), violation.get_pose_input_port())
-        for name in ("action", "pose", "wrench"):
+        violation = ConstraintViolation(prior.constraints, prior.period)
+        add_system(builder, "violation", violation, pose=system.get_desired_pose_output_port())
+        for name in INPUTS:
             builder.ExportInput(system.GetInputPort(name), name)
         for name in ("desired_pose", "held_action", "fallback"):
             builder.ExportOutput(system.GetOutputPort(name), name)
@@ -122,14 +123,10 @@ def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, ki
     if missing:
         remedy = ", an unused input from a PassThrough of its size" if missing_inputs else ""
         raise InputError(f"{name_of_guidance} lacks the port {', '.join(missing)}: export it{remedy}")
-    sizes = {
-        "pose": (guidance.GetInputPort("pose").size(), pose_size),
-        "wrench": (guidance.GetInputPort("wrench").size(), wrench_size),
-        "desired_pose": (guidance.GetOutputPort("desired_pose").size(), pose_size),
-        "held_action": (guidance.GetOutputPort("held_action").size(), guidance.GetInputPort("action").size()),
-        "constraint_violation": (guidance.GetOutputPort("constraint_violation").size(), 1),
-        "fallback": (guidance.GetOutputPort("fallback").size(), 1),
-    }
-    for name, (size, needed) in sizes.items():
-        if size != needed:
-            raise InputError(f"port {name} of {name_of_guidance} has size {size}, where {needed} is needed")
+    action_size = guidance.GetInputPort("action").size()
+    inputs = {"pose": pose_size, "wrench": wrench_size}
+    outputs = {"desired_pose": pose_size, "held_action": action_size, "constraint_violation": 1, "fallback": 1}
+    for name, needed in (inputs | outputs).items():
+        port = guidance.GetInputPort(name) if name in inputs else guidance.GetOutputPort(name)
+        if port.size() != needed:
+            raise InputError(f"port {name} of {name_of_guidance} has size {port.size()}, where {needed} is needed")

@@ -11,6 +11,7 @@ from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturatio
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
+from guiderail.diagrams.wiring import add_system
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
@@ -33,9 +34,7 @@ class PrimitiveGuidance(Guidance):
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(config.control_period, config.num_actions))
         action = hold.get_output_port()
         if not np.array_equal(config.selection, np.eye(config.num_outputs)):
-            spread = builder.AddNamedSystem("explored_outputs", MatrixGain(D=config.selection))
-            builder.Connect(action, spread.get_input_port())
-            action = spread.get_output_port()
+            action = add_system(builder, "explored_outputs", MatrixGain(D=config.selection), action).get_output_port()
         pose = builder.AddNamedSystem("pose", PassThrough(config.num_outputs))
         wrench = builder.AddNamedSystem("wrench", PassThrough(config.wrench_size))
         builder.ExportInput(hold.get_input_port(), "action")
@@ -51,46 +50,32 @@ class PrimitiveGuidance(Guidance):
 
         The primitive's progress waits for the robot if the configuration has a progress rule.
         """
-        command, fallback = self._limit_motion(builder, config, kmp, pose)
+        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
+        if config.motion is not None:
+            from guiderail.models.control.motion_constraints import MotionConstraintFilter
+            from guiderail.systems.command_filter import CommandFilter
+
+            motion = CommandFilter(MotionConstraintFilter(config.motion, config.control_period), config.control_period)
+            add_system(builder, "motion_constraints", motion, desired_pose=command, pose=pose)
+            either = add_system(builder, "fallbacks", Adder(2, 1), fallback, motion.get_intervention_output_port())
+            flag = add_system(builder, "fallback", Saturation(np.zeros(1), np.ones(1)), either.get_output_port())
+            command, fallback = motion.get_safe_pose_output_port(), flag.get_output_port()
         if config.progress is not None:
             from guiderail.systems.progress_clock import ProgressClock
 
             rule, period = config.progress, config.control_period
-            clock = builder.AddNamedSystem("progress", ProgressClock(rule, config.num_outputs, period))
-            builder.Connect(command, clock.get_command_input_port())
-            builder.Connect(pose, clock.get_pose_input_port())
+            clock = ProgressClock(rule, config.num_outputs, period)
+            add_system(builder, "progress", clock, command=command, pose=pose)
             builder.Connect(clock.get_motion_time_output_port(), kmp.get_motion_time_input_port())
             builder.ExportOutput(clock.get_motion_time_output_port(), "motion_time")
         return command, fallback
-
-    def _limit_motion(
-        self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
-    ) -> tuple[OutputPort, OutputPort]:
-        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
-        if config.motion is None:
-            return command, fallback
-        from guiderail.models.control.motion_constraints import MotionConstraintFilter
-        from guiderail.systems.command_filter import CommandFilter
-
-        law = MotionConstraintFilter(config.motion, config.control_period)
-        motion = builder.AddNamedSystem("motion_constraints", CommandFilter(law, config.control_period))
-        either = builder.AddNamedSystem("fallbacks", Adder(2, 1))
-        flag = builder.AddNamedSystem("fallback", Saturation(np.zeros(1), np.ones(1)))
-        builder.Connect(command, motion.get_desired_pose_input_port())
-        builder.Connect(pose, motion.get_pose_input_port())
-        builder.Connect(fallback, either.get_input_port(0))
-        builder.Connect(motion.get_intervention_output_port(), either.get_input_port(1))
-        builder.Connect(either.get_output_port(), flag.get_input_port())
-        return motion.get_safe_pose_output_port(), flag.get_output_port()
 
     def _finish(
         self, builder: DiagramBuilder, config: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
     ) -> None:
         """Export the outputs and build the diagram."""
-        violation = builder.AddNamedSystem(
-            "constraint_violation", ConstraintViolation(config.motion or config.constraints, config.control_period)
-        )
-        builder.Connect(desired_pose, violation.get_pose_input_port())
+        violation = ConstraintViolation(config.motion or config.constraints, config.control_period)
+        add_system(builder, "constraint_violation", violation, pose=desired_pose)
         builder.ExportOutput(desired_pose, "desired_pose")
         builder.ExportOutput(self._held_action, "held_action")
         builder.ExportOutput(violation.get_violation_output_port(), "constraint_violation")
@@ -111,8 +96,7 @@ def add_demonstration(
         builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
     # Not a ConstantVectorSource: Drake assumes that its output depends on time, so the primitive would be computed
     # again at every step of the plant.
-    zero = builder.AddNamedSystem("no_action", MatrixGain(D=np.zeros((config.num_outputs, config.num_outputs))))
-    builder.Connect(action, zero.get_input_port())
+    zero = add_system(builder, "no_action", MatrixGain(D=np.zeros((config.num_outputs, config.num_outputs))), action)
     builder.Connect(zero.get_output_port(), kmp.get_null_space_action_input_port())
     return kmp
 
@@ -157,11 +141,10 @@ class KgrlGuidance(PrimitiveGuidance):
         config = config if constrained else replace(config, motion=None)
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
-        gains = config.null_space_gains(primitive)
-        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period))
+        kmp = LcNsKmpSystem(primitive, config.null_space_gains(primitive), config.control_period)
+        add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
         if takes_window:
             builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
-        builder.Connect(action, kmp.get_null_space_action_input_port())
         self._finish(builder, config, *self._constrain(builder, config, kmp, pose))
 
 
@@ -204,26 +187,21 @@ class SkgrlGuidance(PrimitiveGuidance):
         shorter = [
             (each, config.null_space_gains(each)) for each in map(config.primitive_of_length, config.shorter_histories)
         ]
-        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, config.control_period, shorter))
+        kmp = LcNsKmpSystem(primitive, gains, config.control_period, shorter)
+        add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
         if shorter:
             from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 
-            schedule = builder.AddNamedSystem(
-                "history_length",
-                HistoryLengthSchedule(
-                    (config.history, *config.shorter_histories), config.control_period, wrench_size=config.wrench_size
-                ),
-            )
+            lengths = (config.history, *config.shorter_histories)
+            schedule = HistoryLengthSchedule(lengths, config.control_period, wrench_size=config.wrench_size)
+            builder.AddNamedSystem("history_length", schedule)
             builder.ConnectInput("wrench", schedule.get_wrench_input_port())
             builder.Connect(schedule.get_history_length_output_port(), kmp.get_history_length_input_port())
-        history = builder.AddNamedSystem(
-            "history", HistoryBuffer(config.num_outputs, config.history, config.control_period)
-        )
+        # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.
+        history = HistoryBuffer(config.num_outputs, config.history, config.control_period)
+        add_system(builder, "history", history, initial_output=pose)
         command, fallback = self._constrain(builder, config, kmp, pose)
         past = command if config.history_source == "commanded" else pose
-        builder.Connect(action, kmp.get_null_space_action_input_port())
         builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
         builder.Connect(past, history.get_output_input_port())
-        # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.
-        builder.Connect(pose, history.get_initial_output_input_port())
         self._finish(builder, config, command, fallback)

@@ -16,6 +16,7 @@ from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonst
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
@@ -48,16 +49,13 @@ class ResidualDescent(Guidance):
         corners[2] = approach.heights
         line = builder.AddNamedSystem("descent", TrajectorySource(PiecewisePolynomial.FirstOrderHold(times, corners)))
         # Without this hold, all systems after it would be computed again at every step of the plant.
-        held = builder.AddNamedSystem("descent_hold", ZeroOrderHold(period, POSE_SIZE))
-        spread = builder.AddNamedSystem("spread", MatrixGain(D=np.eye(POSE_SIZE, 3)))
-        residual = builder.AddNamedSystem("residual", Residual(np.array([approach.reach] * 3 + [0.0] * 3)))
+        held = add_system(builder, "descent_hold", ZeroOrderHold(period, POSE_SIZE), line.get_output_port())
+        spread = add_system(builder, "spread", MatrixGain(D=np.eye(POSE_SIZE, 3)), hold.get_output_port())
+        residual = Residual(np.array([approach.reach] * 3 + [0.0] * 3))
+        add_system(builder, "residual", residual, reference=held.get_output_port(), action=spread.get_output_port())
         constraints = ActiveConstraintFilter(template, placed.frames, period)
-        builder.AddNamedSystem("active_constraints", constraints)
-        builder.Connect(line.get_output_port(), held.get_input_port())
-        builder.Connect(held.get_output_port(), residual.get_reference_input_port())
-        builder.Connect(hold.get_output_port(), spread.get_input_port())
-        builder.Connect(spread.get_output_port(), residual.get_action_input_port())
-        builder.Connect(residual.get_desired_pose_output_port(), constraints.GetInputPort("requested_pose"))
+        requested_pose = residual.get_desired_pose_output_port()
+        add_system(builder, "active_constraints", constraints, requested_pose=requested_pose)
         constraints.export_ports(builder, hold)
         builder.BuildInto(self)
 
@@ -86,15 +84,13 @@ class ResidualGuidance(PrimitiveGuidance):
             raise InputError("residual guidance is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
         action, pose = self._export_inputs(builder, config)
         kmp = add_demonstration(builder, config, action, takes_window=takes_window)
-        residual = builder.AddNamedSystem("residual", Residual(config.residual_gains()))
-        builder.Connect(kmp.get_command_output_port(), residual.get_reference_input_port())
-        builder.Connect(action, residual.get_action_input_port())
+        residual = Residual(config.residual_gains())
+        add_system(builder, "residual", residual, reference=kmp.get_command_output_port(), action=action)
         desired, fallback = residual.get_desired_pose_output_port(), kmp.get_fallback_output_port()
         if make_filter is not None:
             assert config.keep_out is not None
-            safety = builder.AddNamedSystem("safety_filter", make_filter(config, config.keep_out))
-            builder.Connect(desired, safety.get_desired_pose_input_port())
-            builder.Connect(pose, safety.get_pose_input_port())
+            safety = make_filter(config, config.keep_out)
+            add_system(builder, "safety_filter", safety, desired_pose=desired, pose=pose)
             desired, fallback = safety.get_safe_pose_output_port(), safety.get_intervention_output_port()
         self._finish(builder, config, desired, fallback)
 

@@ -12,6 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOr
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
@@ -56,10 +57,9 @@ class ActiveConstraintFilter(Diagram):
         self._projector = ActiveConstraintProjector(template, frames, period, max_tracking_error)
         builder.AddNamedSystem("projector", self._projector)
         self._machine = SctStateMachine(template, frames, period)
-        builder.AddNamedSystem("state_machine", self._machine)
         # The state follows the command, not the measured pose. The command is then always inside the constraints of its
         # state, and a transition does not depend on how well the robot tracks.
-        builder.Connect(self._projector.get_desired_pose_output_port(), self._machine.get_pose_input_port())
+        add_system(builder, "state_machine", self._machine, pose=self._projector.get_desired_pose_output_port())
         builder.Connect(self._machine.get_state_output_port(), self._projector.get_state_input_port())
         builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
         builder.ExportInput(self._projector.get_pose_input_port(), "pose")
@@ -125,20 +125,19 @@ class SctGuidance(Guidance):
         builder = DiagramBuilder()
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, (input_mapping or template).inputs))
         self._mapping = SctInputMapping(input_mapping or template, frames, period)
-        builder.AddNamedSystem("input_mapping", self._mapping)
+        add_system(builder, "input_mapping", self._mapping, action=hold.get_output_port())
         constrained = template if active_constraints else template.without_active_constraints()
         self._filter = ActiveConstraintFilter(constrained, frames, period, max_tracking_error)
-        builder.AddNamedSystem("active_constraints", self._filter)
+        requested_pose = self._mapping.get_requested_pose_output_port()
+        add_system(builder, "active_constraints", self._filter, requested_pose=requested_pose)
         if input_mapping is None:
             state = self._filter.GetOutputPort("state")
         else:
             free = np.array([float(input_mapping.initial_state)])
             source = builder.AddNamedSystem("state", ConstantVectorSource(free))
             state = source.get_output_port()
-        builder.Connect(hold.get_output_port(), self._mapping.get_action_input_port())
         builder.Connect(state, self._mapping.get_state_input_port())
         builder.Connect(self._filter.GetOutputPort("last_desired_pose"), self._mapping.get_pose_input_port())
-        builder.Connect(self._mapping.get_requested_pose_output_port(), self._filter.GetInputPort("requested_pose"))
         self._filter.export_ports(builder, hold)
         builder.BuildInto(self)
 

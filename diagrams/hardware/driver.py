@@ -33,17 +33,11 @@ CommandCallback = Callable[[np.ndarray, float], None]
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one pre-flight check.
+    """Result of one pre-flight check."""
 
-    Attributes:
-        name: Name of the check.
-        description: Measured values, or an assumption that the operator has to check.
-        passed: False if the arm must not move; None if nothing is checked.
-    """
-
-    name: str
-    description: str
-    passed: bool | None = None
+    name: str  # name of the check
+    description: str  # measured values, or an assumption that the operator has to check
+    passed: bool | None = None  # False if the arm must not move; None if nothing is checked
 
 
 class Driver(ABC):
@@ -55,24 +49,21 @@ class Driver(ABC):
     its position by itself sets `can_hold` and implements `hold`.
 
     Attributes:
-        name: Prefix of the joint ports of a hardware station, as in Drake's own stations.
-        torque_reflex_limits: External torques at which the driver stops by itself under torque control, (n,) [Nm].
-        has_command_timeout: True if the driver brings the arm to rest when commands stop.
-        can_hold: True if `hold` is implemented: the driver then holds the arm without status or torques.
-        hold_off: Time after its first status during which the driver must not receive commands [s].
-        period: Period of statuses and commands [s].
         url: Address that the connection was opened with; empty for the default.
         num_statuses: Number of different statuses received; a repeated one counts once.
         num_foreign_commands: Number of commands received by the robot from other programs, without those of a safety
             monitor that stops the arm.
     """
 
-    name: ClassVar[str]
+    name: ClassVar[str]  # prefix of the joint ports of a hardware station, as in Drake's own stations
+    # External torques at which the driver stops by itself under torque control, (n,) [Nm].
     torque_reflex_limits: ClassVar[tuple[float, ...]]
-    has_command_timeout: ClassVar[bool]
+    has_command_timeout: ClassVar[bool]  # True if the driver brings the arm to rest when commands stop
+    # True if `hold` is implemented: the driver then holds the arm without status or torques.
     can_hold: ClassVar[bool] = False
+    # Time after its first status during which the driver must not receive commands [s].
     hold_off: ClassVar[float] = 0.25
-    period: ClassVar[float] = STATUS_PERIOD
+    period: ClassVar[float] = STATUS_PERIOD  # period of statuses and commands [s]
 
     def __init__(self, url: str = ""):
         self.url = url
@@ -166,12 +157,9 @@ class PoseDriver(Driver):
     """Connection to a robot whose own program runs the impedance controller and follows desired poses.
 
     A driver implements `read`, `configure`, `write_pose` and `stop`, and `recover` if its robot has errors.
-
-    Attributes:
-        motion_limits: Limits of the desired poses that the robot accepts.
     """
 
-    motion_limits: ClassVar[MotionLimits]
+    motion_limits: ClassVar[MotionLimits]  # limits of the desired poses that the robot accepts
 
     @abstractmethod
     def configure(self, impedance: RobotImpedance) -> None:

@@ -91,7 +91,7 @@ class FciDriver(PoseDriver):
         force, torque = _collision_thresholds(impedance)
         try:
             X_NP = RigidTransform(robot.state.F_T_NE.matrix).InvertAndCompose(impedance.X_FlangeTool)
-            robot.set_ee(_flat(X_NP))
+            robot.set_ee(X_NP.GetAsMatrix4().ravel(order="F").tolist())
             robot.set_load(impedance.mass, impedance.center_of_mass.tolist(), impedance.inertia.ravel("F").tolist())
             robot.set_collision_behavior(list(TORQUE_THRESHOLD), [force] * 3 + [torque] * 3)
         except (franky.NetworkException, RuntimeError):
@@ -244,7 +244,3 @@ def _collision_thresholds(impedance: RobotImpedance) -> tuple[float, float]:
     """Return the external force [N] and torque [Nm] along an axis at which the robot stops by a reflex."""
     force, torque = (FORCE_THRESHOLD_SHARE * float(np.max(part)) for part in np.split(impedance.max_wrench, 2))
     return max(force, MIN_FORCE_THRESHOLD), torque
-
-
-def _flat(X: RigidTransform) -> list[float]:
-    return X.GetAsMatrix4().ravel(order="F").tolist()

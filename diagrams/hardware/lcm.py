@@ -105,22 +105,16 @@ class LcmDriver(Driver):
     """Driver with LCM messages as statuses and commands.
 
     Attributes:
-        status_channel: Channel of the statuses.
-        command_channel: Channel of the commands.
-        status_type: Message class of the statuses.
-        status_fields: Fields of `status_type` with position, velocity and external torque.
-        external_torque_sign: Sign that converts the external torque to that of the surroundings on the arm.
-        command_type: Message class of the commands, with the field ``joint_torque``.
         lcm: The bus.
         statuses: Counter of the statuses.
     """
 
-    status_channel: ClassVar[str]
-    command_channel: ClassVar[str]
-    status_type: ClassVar[Any]
-    status_fields: ClassVar[tuple[str, str, str]]
-    external_torque_sign: ClassVar[float]
-    command_type: ClassVar[Any]
+    status_channel: ClassVar[str]  # channel of the statuses
+    command_channel: ClassVar[str]  # channel of the commands
+    status_type: ClassVar[Any]  # message class of the statuses
+    status_fields: ClassVar[tuple[str, str, str]]  # fields of `status_type`: position, velocity and external torque
+    external_torque_sign: ClassVar[float]  # sign that converts external torques to those of the surroundings on the arm
+    command_type: ClassVar[Any]  # message class of the commands, with the field `joint_torque`
 
     def __init__(self, lcm: DrakeLcmInterface | str = ""):
         """Open the connection on a bus, or on its URL.

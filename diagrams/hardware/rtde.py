@@ -77,7 +77,11 @@ class RtdeDriver(PoseDriver):
         super().__init__(url)
         if not url:
             raise InputError("the driver rtde needs the robot's host: give --robot-url")
-        self._client = client or _import_client()
+        self._client = client or SimpleNamespace(
+            RTDEControlInterface=import_extra("rtde_control").RTDEControlInterface,
+            RTDEReceiveInterface=import_extra("rtde_receive").RTDEReceiveInterface,
+            DashboardClient=import_extra("dashboard_client").DashboardClient,
+        )
         self._receiver: Any = None
         self._control: Any = None
         self._impedance: RobotImpedance | None = None
@@ -285,14 +289,6 @@ class RtdeDriver(PoseDriver):
             self._context, JacobianWrtVariable.kV, self._flange, self._X_FlangeTool.translation(), world, world
         )
         return J[[3, 4, 5, 0, 1, 2]]
-
-
-def _import_client() -> Any:
-    return SimpleNamespace(
-        RTDEControlInterface=import_extra("rtde_control").RTDEControlInterface,
-        RTDEReceiveInterface=import_extra("rtde_receive").RTDEReceiveInterface,
-        DashboardClient=import_extra("dashboard_client").DashboardClient,
-    )
 
 
 def _turn(wrench: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.multibody.tree import JacobianWrtVariable, SpatialInertia
+from pydrake.multibody.tree import Frame, JacobianWrtVariable, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
@@ -26,6 +26,7 @@ from guiderail.diagrams.stations.options import HardwareOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
+    ControllerPlant,
     Impedance,
     Station,
     command_timeout,
@@ -35,6 +36,7 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import damping_matrix
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, StatusLimits
@@ -154,84 +156,69 @@ class HardwareStation(Station):
     def _build(self) -> None:
         period, model, builder = self.period, self.controller_plant, DiagramBuilder()
         n = model.plant.num_positions()
-        self._status = builder.AddNamedSystem(
-            "status",
-            StatusWatchdog(model.plant, self.status_limits, torque_tolerance(self.limits), period=period),
-        )
+        status = StatusWatchdog(model.plant, self.status_limits, torque_tolerance(self.limits), period=period)
+        self._status = builder.AddNamedSystem("status", status)
+        state, external_torque = status.get_estimated_state_output_port(), status.get_external_torque_output_port()
         # Heartbeats are sent with the statuses, and may be twice as late.
-        self._heartbeat = builder.AddNamedSystem(
-            "heartbeat", HeartbeatMonitor(period=period, timeout=2.0 * MAX_MISSED_MESSAGES * period)
+        heartbeat = HeartbeatMonitor(period=period, timeout=2.0 * MAX_MISSED_MESSAGES * period)
+        self._heartbeat = add_system(builder, "heartbeat", heartbeat, status_fault=status.get_fault_output_port())
+        positions = add_system(builder, "positions", MatrixGain(np.eye(n, 2 * n)), state).get_output_port()
+        velocities = add_system(builder, "velocities", MatrixGain(np.eye(n, 2 * n, n)), state).get_output_port()
+        wrench = JointTorqueWrench(
+            model.plant, model.target, model.tool_center, period=period, time_constant=self._wrench_time_constant
         )
-        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
-        velocities = builder.AddNamedSystem("velocities", MatrixGain(np.eye(n, 2 * n, n)))
-        wrench = builder.AddNamedSystem(
-            "wrench",
-            JointTorqueWrench(
-                model.plant,
-                model.target,
-                model.tool_center,
-                period=period,
-                time_constant=self._wrench_time_constant,
-            ),
-        )
+        add_system(builder, "wrench", wrench, positions=positions, external_torque=external_torque)
+        measured_wrench = wrench.get_wrench_output_port()
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period, command_timeout(self.control_period)))
-        rate_limiter = builder.AddNamedSystem("rate_limiter", make_rate_limiter(self.driver, period))
+        safe_pose = watchdog.get_safe_pose_output_port()
+        rate_limiter = make_rate_limiter(self.driver, period)
+        add_system(builder, "rate_limiter", rate_limiter, desired_pose=safe_pose)
+        limited_pose = rate_limiter.get_limited_pose_output_port()
         controller, impedance_monitor, tank = add_controller(
             builder, model, self.impedance, period, compensate_gravity=False
         )
-        self._limiter = builder.AddNamedSystem(
-            "limiter", TorqueSafetyLimiter(model.plant, self.limits, period=period, can_hold=self.driver.can_hold)
+        pose = controller.get_pose_output_port()
+        self._limiter = limiter = add_system(
+            builder,
+            "limiter",
+            TorqueSafetyLimiter(model.plant, self.limits, period=period, can_hold=self.driver.can_hold),
+            torque=controller.get_generalized_force_output_port(),
+            estimated_state=state,
+            external_torque=external_torque,
+            wrench=measured_wrench,
+            pose=pose,
+            desired_pose=safe_pose,
+            status_fault=heartbeat.get_fault_output_port(),
+            status_age=status.get_age_output_port(),
+            velocity=status.get_velocity_output_port(),
+            command_timed_out=watchdog.get_command_timed_out_output_port(),
         )
-
-        status, heartbeat, limiter = self._status, self._heartbeat, self._limiter
-        state, external_torque = status.get_estimated_state_output_port(), status.get_external_torque_output_port()
-        pose, safe_pose = controller.get_pose_output_port(), watchdog.get_safe_pose_output_port()
-        for source, target in (
-            (state, positions.get_input_port()),
-            (state, velocities.get_input_port()),
-            (state, controller.get_estimated_state_input_port()),
-            (positions.get_output_port(), wrench.get_positions_input_port()),
-            (external_torque, wrench.get_external_torque_input_port()),
-            (pose, watchdog.get_pose_input_port()),
-            (safe_pose, rate_limiter.get_desired_pose_input_port()),
-            (pose, rate_limiter.get_pose_input_port()),
-            (limiter.get_blend_factor_output_port(), rate_limiter.get_blend_factor_input_port()),
-            (rate_limiter.get_limited_pose_output_port(), (tank or controller).get_desired_pose_input_port()),
-            (controller.get_generalized_force_output_port(), limiter.get_torque_input_port()),
-            (state, limiter.get_estimated_state_input_port()),
-            (external_torque, limiter.get_external_torque_input_port()),
-            (wrench.get_wrench_output_port(), limiter.get_wrench_input_port()),
-            (pose, limiter.get_pose_input_port()),
-            (safe_pose, limiter.get_desired_pose_input_port()),
-            (status.get_fault_output_port(), heartbeat.get_status_fault_input_port()),
-            (heartbeat.get_fault_output_port(), limiter.get_status_fault_input_port()),
-            (status.get_age_output_port(), limiter.get_status_age_input_port()),
-            (status.get_velocity_output_port(), limiter.get_velocity_input_port()),
-            (watchdog.get_command_timed_out_output_port(), limiter.get_command_timed_out_input_port()),
-        ):
-            builder.Connect(source, target)
+        builder.Connect(state, controller.get_estimated_state_input_port())
+        builder.Connect(limited_pose, (tank or controller).get_desired_pose_input_port())
+        builder.Connect(pose, watchdog.get_pose_input_port())
+        builder.Connect(pose, rate_limiter.get_pose_input_port())
+        builder.Connect(limiter.get_blend_factor_output_port(), rate_limiter.get_blend_factor_input_port())
+        safe_torque, arm_state = limiter.get_safe_torque_output_port(), limiter.get_arm_state_output_port()
         if isinstance(self.driver, PoseDriver):
             X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
-            poses = builder.AddNamedSystem(
-                "publisher", PosePublisher(self.driver.write_pose, self.driver.stop, X_BaseTarget, period=period)
-            )
-            builder.Connect(rate_limiter.get_limited_pose_output_port(), poses.get_pose_input_port())
-            builder.Connect(limiter.get_arm_state_output_port(), poses.get_arm_state_input_port())
+            poses = PosePublisher(self.driver.write_pose, self.driver.stop, X_BaseTarget, period=period)
+            add_system(builder, "publisher", poses, pose=limited_pose, arm_state=arm_state)
             # The torques of the robot's own controller are unknown: velocities are compared with positions only.
             no_torque = builder.AddSystem(ConstantVectorSource(np.zeros(n)))
             builder.Connect(no_torque.get_output_port(), status.get_torque_input_port())
         else:
-            publisher = builder.AddNamedSystem(
-                "publisher", TorquePublisher(self.driver.write, n, period=period, hold=self.driver.hold)
+            add_system(
+                builder,
+                "publisher",
+                TorquePublisher(self.driver.write, n, period=period, hold=self.driver.hold),
+                torque=safe_torque,
+                is_sending=limiter.get_is_sending_output_port(),
+                is_holding=limiter.get_is_holding_output_port(),
             )
-            builder.Connect(limiter.get_safe_torque_output_port(), publisher.get_torque_input_port())
-            builder.Connect(limiter.get_is_sending_output_port(), publisher.get_is_sending_input_port())
-            builder.Connect(limiter.get_is_holding_output_port(), publisher.get_is_holding_input_port())
-            builder.Connect(limiter.get_safe_torque_output_port(), status.get_torque_input_port())
-        measured_wrench = wrench.get_wrench_output_port()
+            builder.Connect(safe_torque, status.get_torque_input_port())
         if self._tare:
-            tare = builder.AddNamedSystem("tare", WrenchTare(period, *tare_steps(period)))
-            builder.Connect(measured_wrench, tare.get_measured_wrench_input_port())
+            tare = WrenchTare(period, *tare_steps(period))
+            add_system(builder, "tare", tare, measured_wrench=measured_wrench)
             measured_wrench = tare.get_tared_wrench_output_port()
         export_station_ports(
             builder,
@@ -245,13 +232,13 @@ class HardwareStation(Station):
             max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
         )
         builder.ExportOutput(limiter.get_fault_output_port(), "fault")
-        builder.ExportOutput(limiter.get_arm_state_output_port(), "arm_state")
+        builder.ExportOutput(arm_state, "arm_state")
         for name, port in (
-            ("position_measured", positions.get_output_port()),
-            ("velocity_estimated", velocities.get_output_port()),
+            ("position_measured", positions),
+            ("velocity_estimated", velocities),
             ("state_estimated", state),
             ("torque_external", external_torque),
-            ("torque_commanded", limiter.get_safe_torque_output_port()),
+            ("torque_commanded", safe_torque),
         ):
             builder.ExportOutput(port, f"{self.driver.name}.{name}")
         builder.BuildInto(self)
@@ -341,7 +328,7 @@ class HardwareStation(Station):
 
     def estimate_force(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:
         """Return the force (3,) [N] on the tool at rest, from joint positions and external torques (n,) [rad, Nm]."""
-        J = self._jacobian(positions)
+        J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 
     def max_torque_shares(self, positions: np.ndarray) -> np.ndarray:
@@ -351,17 +338,18 @@ class HardwareStation(Station):
         the worst corner of that box counts. The torque limiter clips at 1; without it, the driver's reflex would stop
         the arm at 1 / `TORQUE_SHARE`.
         """
-        J, limits = self._jacobian(positions), to_wrench_order(self.impedance.limits)
+        J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
+        limits = to_wrench_order(self.impedance.limits)
         return (limits[:3] @ np.abs(J[3:]) + limits[3:] @ np.abs(J[:3])) / np.array(self.limits.torque)
 
-    def _jacobian(self, positions: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the tool center in the target's axes, (6, n), rotational part first."""
-        plant, arm = self.controller_plant.plant, self.controller_plant.arm
-        context = plant.CreateDefaultContext()
-        plant.SetPositions(context, positions)
-        return plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), arm.target, arm.target
-        )
+
+def tool_jacobian(model: ControllerPlant, positions: np.ndarray, frame: Frame) -> np.ndarray:
+    """Return the Jacobian of the tool center at positions (n,) in the axes of a frame, (6, n), rotation first."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, positions)
+    return model.plant.CalcJacobianSpatialVelocity(
+        context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), frame, frame
+    )
 
 
 def make_rate_limiter(driver: Driver, period: float) -> PoseRateLimiter:
@@ -389,13 +377,10 @@ def make_robot_impedance(model: ArmControllerPlant, impedance: Impedance) -> Rob
     plant, arm = model.plant, model.arm
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, model.posture)
-    base = plant.world_frame()
     if not model.target.CalcPoseInWorld(context).rotation().IsNearlyIdentity(1e-6):
         raise InputError("a robot with an impedance of its own needs a target with the axes of its base")
     K = np.diag(to_wrench_order(impedance.stiffness))
-    J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), base, base)[
-        [3, 4, 5, 0, 1, 2]
-    ]
+    J = tool_jacobian(model, model.posture, plant.world_frame())[[3, 4, 5, 0, 1, 2]]
     Lambda_inverse = J @ np.linalg.solve(plant.CalcMassMatrix(context), J.T)
     flange, payload = arm.wrist.frame_on_parent(), payload_on_flange(model)
     about_center = payload.Shift(payload.get_com()).CalcRotationalInertia()

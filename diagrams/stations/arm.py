@@ -27,6 +27,7 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
@@ -130,15 +131,10 @@ def add_gripper_control(
 ) -> tuple[InputPort, OutputPort]:
     """Add the drives of a gripper; return the ports of their desired positions and of their measured state."""
     joints = [actuator.joint() for actuator in arm.gripper]
-    command = builder.AddNamedSystem(
-        "gripper_command",
-        GripperCommand(
-            np.concatenate([joint.position_lower_limits() for joint in joints]),
-            np.concatenate([joint.position_upper_limits() for joint in joints]),
-            np.array([end_effector.opening[joint.name()] for joint in joints]),
-            period=period,
-        ),
-    )
+    lower = np.concatenate([joint.position_lower_limits() for joint in joints])
+    upper = np.concatenate([joint.position_upper_limits() for joint in joints])
+    opening = np.array([end_effector.opening[joint.name()] for joint in joints])
+    command = builder.AddNamedSystem("gripper_command", GripperCommand(lower, upper, opening, period=period))
     # The model's state includes joints that mimic others.
     num_positions = plant.num_positions(arm.tool_model)
     every = [plant.get_joint(index) for index in plant.GetJointIndices(arm.tool_model)]
@@ -147,9 +143,8 @@ def add_gripper_control(
     for row, joint in enumerate(joints):
         column = joint.position_start() - first
         actuated[row, column] = actuated[len(joints) + row, num_positions + column] = 1.0
-    state = builder.AddNamedSystem("gripper_state", MatrixGain(actuated))
+    state = add_system(builder, "gripper_state", MatrixGain(actuated), plant.get_state_output_port(arm.tool_model))
     builder.Connect(command.get_desired_state_output_port(), plant.get_desired_state_input_port(arm.tool_model))
-    builder.Connect(plant.get_state_output_port(arm.tool_model), state.get_input_port())
     return command.get_position_input_port(), state.get_output_port()
 
 
@@ -264,39 +259,18 @@ class ArmStation(Station):
     def _add_wrench_estimate(self, builder: DiagramBuilder, accuracy: JointTorqueAccuracy) -> OutputPort:
         """Add joint torque sensors and the estimate of the wrench; return its port."""
         model, plant, arm = self._controller_plant, self.plant, self.arm
-        largest, n = model.plant.GetEffortUpperLimits(), model.plant.num_positions()
-        self._torque_sensor = builder.AddNamedSystem(
-            "torque_sensor",
-            ExternalTorqueSensor(
-                model.plant,
-                model.arm.tool[0],
-                accuracy.noise * largest,
-                accuracy.drift * largest,
-                period=plant.time_step(),
-            ),
+        period, largest, n = plant.time_step(), model.plant.GetEffortUpperLimits(), model.plant.num_positions()
+        noise, drift = accuracy.noise * largest, accuracy.drift * largest
+        state = plant.get_state_output_port(arm.model)
+        contact_torque = plant.get_generalized_contact_forces_output_port(arm.model)
+        self._torque_sensor = sensor = ExternalTorqueSensor(model.plant, model.arm.tool[0], noise, drift, period=period)
+        add_system(builder, "torque_sensor", sensor, state=state, contact_torque=contact_torque)
+        estimate = JointTorqueWrench(
+            model.plant, model.target, model.tool_center, period=period, time_constant=WRENCH_ESTIMATE_TIME_CONSTANT
         )
-        estimate = builder.AddNamedSystem(
-            "wrench_estimate",
-            JointTorqueWrench(
-                model.plant,
-                model.target,
-                model.tool_center,
-                period=plant.time_step(),
-                time_constant=WRENCH_ESTIMATE_TIME_CONSTANT,
-            ),
-        )
-        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
-        state, contact = (
-            plant.get_state_output_port(arm.model),
-            plant.get_generalized_contact_forces_output_port(arm.model),
-        )
-        builder.Connect(state, self._torque_sensor.get_state_input_port())
-        builder.Connect(contact, self._torque_sensor.get_contact_torque_input_port())
-        builder.Connect(state, positions.get_input_port())
+        add_system(builder, "wrench_estimate", estimate, external_torque=sensor.get_external_torque_output_port())
+        positions = add_system(builder, "positions", MatrixGain(np.eye(n, 2 * n)), state)
         builder.Connect(positions.get_output_port(), estimate.get_positions_input_port())
-        builder.Connect(
-            self._torque_sensor.get_external_torque_output_port(), estimate.get_external_torque_input_port()
-        )
         return estimate.get_wrench_output_port()
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:

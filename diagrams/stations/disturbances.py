@@ -20,7 +20,9 @@ from guiderail.diagrams.stations.station import (
     Station,
     export_station_ports,
     tare_steps,
+    whole_multiple,
 )
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.control.motion_constraints import StateConstraints
@@ -55,14 +57,13 @@ class DisturbedStation(Station):
         period = self.control_period
         builder = DiagramBuilder()
         self._inner = builder.AddNamedSystem("station", station)
-        self._commands = commands = builder.AddNamedSystem(
-            "commands", CommandDisturbance(POSE_SIZE, period, d.lost_commands, d.late_commands)
-        )
+        self._commands = commands = CommandDisturbance(POSE_SIZE, period, d.lost_commands, d.late_commands)
+        builder.AddNamedSystem("commands", commands)
         e = self._errors = _without_replaced_errors(d, station)
         self._calibration: list[ConstantVectorSource] = []
-        self._pose = pose = builder.AddNamedSystem(
-            "pose", SensorDisturbance(period, np.zeros(POSE_SIZE), resolution=np.repeat(e.pose_resolution, 3))
-        )
+        resolution = np.repeat(e.pose_resolution, 3)
+        self._pose = pose = SensorDisturbance(period, np.zeros(POSE_SIZE), resolution=resolution)
+        builder.AddNamedSystem("pose", pose)
         delivered, measured = commands.get_delivered_command_output_port(), station.get_pose_output_port()
         if any(e.calibration_error):
             delivered = self._add_constant(builder, "calibration_of_commands", delivered)
@@ -89,9 +90,7 @@ class DisturbedStation(Station):
     def _add_constant(self, builder: DiagramBuilder, name: str, port: OutputPort) -> OutputPort:
         """Add a pose to `port` that a reset sets; return the port of the sum."""
         source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(POSE_SIZE)))
-        total = builder.AddNamedSystem(f"{name}_added", Adder(2, POSE_SIZE))
-        builder.Connect(port, total.get_input_port(0))
-        builder.Connect(source.get_output_port(), total.get_input_port(1))
+        total = add_system(builder, f"{name}_added", Adder(2, POSE_SIZE), port, source.get_output_port())
         self._calibration.append(source)
         return total.get_output_port()
 
@@ -102,31 +101,24 @@ class DisturbedStation(Station):
         """
         e, period = self._errors, self.control_period
         delay, has_gradient = e.wrench_delay[1], any(e.wrench_gradient)
-        self._wrench = builder.AddNamedSystem(
-            "wrench",
-            SensorDisturbance(
-                period,
-                np.repeat(e.wrench_noise, 3),
-                0 if e.tare else delay,
-                drift=np.repeat(e.wrench_drift, 3),
-                configuration_size=POSE_SIZE if has_gradient else 0,
-            ),
+        self._wrench = SensorDisturbance(
+            period,
+            np.repeat(e.wrench_noise, 3),
+            0 if e.tare else delay,
+            drift=np.repeat(e.wrench_drift, 3),
+            configuration_size=POSE_SIZE if has_gradient else 0,
         )
-        builder.Connect(wrench, self._wrench.get_measurement_input_port())
+        add_system(builder, "wrench", self._wrench, measurement=wrench)
         if has_gradient:
             builder.Connect(pose, self._wrench.get_configuration_input_port())
         self._delay = self._wrench if delay and not e.tare else None
         measured: OutputPort = self._wrench.get_disturbed_measurement_output_port()
         if e.tare:
-            steps = tare_steps(self._inner.control_period)
-            tare = builder.AddNamedSystem("tare", WrenchTare(period, *steps))
-            builder.Connect(measured, tare.get_measured_wrench_input_port())
-            measured = tare.get_tared_wrench_output_port()
+            tare = WrenchTare(period, *tare_steps(self._inner.control_period))
+            measured = add_system(builder, "tare", tare, measured_wrench=measured).get_tared_wrench_output_port()
             if delay:
-                self._delay = builder.AddNamedSystem(
-                    "wrench_delay", SensorDisturbance(period, np.zeros(WRENCH_SIZE), delay)
-                )
-                builder.Connect(measured, self._delay.get_measurement_input_port())
+                self._delay = SensorDisturbance(period, np.zeros(WRENCH_SIZE), delay)
+                add_system(builder, "wrench_delay", self._delay, measurement=measured)
                 measured = self._delay.get_disturbed_measurement_output_port()
         return measured
 
@@ -261,10 +253,10 @@ def _disturbed_period(d: Disturbances, station: Station) -> float:
     if d.clock_factor == 1.0:
         return station.control_period
     period = d.clock_factor * station.control_period
-    steps = round(period / PLANT_PERIOD)
-    if steps < 1 or abs(steps * PLANT_PERIOD - period) > 1e-6:
+    try:
+        return whole_multiple(period, PLANT_PERIOD)
+    except InputError:
         raise InputError(
             f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole number of the "
             f"plant's {PLANT_PERIOD:g} s"
-        )
-    return steps * PLANT_PERIOD
+        ) from None

@@ -30,9 +30,11 @@ from guiderail.diagrams.stations.station import (
     add_workcell_plant,
     check_pose,
     export_simulation_ports,
+    set_at_rest,
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.pose_wrench import PoseWrench
@@ -108,9 +110,9 @@ class GantryStation(Station):
             builder, workcell, time_step, lambda plant: _add_gantry(plant, workcell, impedance, with_gains=is_joint)
         )
         plant, gantry = self.plant, self.gantry
-        pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))
-        builder.Connect(plant.get_state_output_port(gantry), pose.get_input_port())
-        wrench = _add_wrench(builder, plant, gantry, pose.get_output_port(), wrench_time_constant)
+        state = plant.get_state_output_port(gantry)
+        pose = add_system(builder, "pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)), state).get_output_port()
+        wrench = _add_wrench(builder, plant, gantry, pose, wrench_time_constant)
         if is_joint:
             desired = add_joint_impedance(
                 builder,
@@ -118,23 +120,22 @@ class GantryStation(Station):
                 damping=joint_damping(impedance),
                 mass=moving_mass(plant),
                 time_step=time_step,
-                pose=pose.get_output_port(),
-                state=plant.get_state_output_port(gantry),
+                pose=pose,
+                state=state,
                 wrench=wrench,
                 impedance_wrench=plant.get_net_actuation_output_port(gantry),
                 control_period=control_period,
             )
             # The desired pose is the first half of the desired state; the desired velocity is zero.
-            state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
-            builder.Connect(desired, state.get_input_port())
-            builder.Connect(state.get_output_port(), plant.get_desired_state_input_port(gantry))
+            desired_state = add_system(builder, "desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)), desired)
+            builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(gantry))
         else:
             torque = add_impedance_control(
                 builder,
                 _controller_plant(workcell, impedance),
                 impedance,
                 control_period,
-                state=plant.get_state_output_port(gantry),
+                state=state,
                 wrench=wrench,
                 compensate_gravity=False,
             )
@@ -144,9 +145,7 @@ class GantryStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the tool at rest at `pose`, (6,); `context` is the root context."""
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.gantry, check_pose(pose, POSE_SIZE))
-        self.plant.SetVelocities(plant_context, self.gantry, np.zeros(POSE_SIZE))
+        set_at_rest(self.plant, self.gantry, context, check_pose(pose, POSE_SIZE))
 
 
 def moving_mass(plant: MultibodyPlant) -> float:
@@ -218,9 +217,7 @@ def _add_wrench(
     period = plant.time_step()
     decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
     one, zero = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
-    low_pass = builder.AddNamedSystem("low_pass", LinearSystem(decay * one, (1.0 - decay) * one, one, zero, period))
-    wrench = builder.AddNamedSystem("wrench", PoseWrench())
-    builder.Connect(plant.get_generalized_contact_forces_output_port(gantry), low_pass.get_input_port())
-    builder.Connect(low_pass.get_output_port(), wrench.get_generalized_force_input_port())
-    builder.Connect(pose, wrench.get_pose_input_port())
+    low_pass = LinearSystem(decay * one, (1.0 - decay) * one, one, zero, period)
+    add_system(builder, "low_pass", low_pass, plant.get_generalized_contact_forces_output_port(gantry))
+    wrench = add_system(builder, "wrench", PoseWrench(), pose=pose, generalized_force=low_pass.get_output_port())
     return wrench.get_wrench_output_port()

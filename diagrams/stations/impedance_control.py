@@ -13,6 +13,7 @@ from guiderail.diagrams.stations.station import (
     max_wrench,
     to_wrench_order,
 )
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.templates import SharedControlTemplate
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
@@ -42,26 +43,26 @@ def add_controller(
 
     There is a tank only if the impedance is bounded; it then receives the desired pose in place of the controller.
     """
-    controller = builder.AddNamedSystem(
-        "controller",
-        CartesianImpedanceController(
-            controller_plant.plant,
-            controller_plant.target,
-            controller_plant.tool_center,
-            ImpedanceGains(
-                stiffness=np.diag(to_wrench_order(impedance.stiffness)),
-                wrench_limits=to_wrench_order(impedance.limits),
-                posture=controller_plant.posture,
-                damping_ratio=impedance.damping_ratio,
-                bound=impedance.bound,
-            ),
-            period=period,
-            compensate_gravity=compensate_gravity,
-            timeout=command_timeout(period),
-        ),
+    limits = to_wrench_order(impedance.limits)
+    gains = ImpedanceGains(
+        stiffness=np.diag(to_wrench_order(impedance.stiffness)),
+        wrench_limits=limits,
+        posture=controller_plant.posture,
+        damping_ratio=impedance.damping_ratio,
+        bound=impedance.bound,
     )
-    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(to_wrench_order(impedance.limits)))
-    builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+    controller = CartesianImpedanceController(
+        controller_plant.plant,
+        controller_plant.target,
+        controller_plant.tool_center,
+        gains,
+        period=period,
+        compensate_gravity=compensate_gravity,
+        timeout=command_timeout(period),
+    )
+    builder.AddNamedSystem("controller", controller)
+    monitor = ImpedanceMonitor(limits)
+    add_system(builder, "monitor", monitor, impedance_wrench=controller.get_impedance_wrench_output_port())
     tank = add_energy_tank(builder, impedance, period, controller.get_pose_output_port())
     if tank is not None:
         builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
@@ -78,9 +79,7 @@ def add_energy_tank(
     stiffness, masses = np.array(impedance.stiffness), np.repeat([MIN_MASS, MIN_INERTIA], 3)
     damping = 2.0 * impedance.damping_ratio * np.sqrt(stiffness * masses)
     tank = EnergyTank(stiffness, damping, impedance.bound, capacity=TANK_CAPACITY, period=period)
-    builder.AddNamedSystem("tank", tank)
-    builder.Connect(pose, tank.get_pose_input_port())
-    return tank
+    return add_system(builder, "tank", tank, pose=pose)
 
 
 def make_phase_wrench_limit(
@@ -175,17 +174,11 @@ def add_joint_impedance(
     Returns:
         Port of the desired positions, (6,).
     """
-    watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(control_period, command_timeout(control_period)))
-    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
-    governor = None
+    watchdog = CommandWatchdog(control_period, command_timeout(control_period))
+    monitor = ImpedanceMonitor(np.array(impedance.limits))
+    add_system(builder, "watchdog", watchdog, pose=pose)
+    add_system(builder, "monitor", monitor, impedance_wrench=impedance_wrench)
     tank = add_energy_tank(builder, impedance, time_step, pose)
-    if impedance.bound is not None:
-        stiffness = np.array(impedance.stiffness)
-        governor = builder.AddNamedSystem(
-            "governor", ReferenceGovernor(stiffness, damping, mass, time_step, impedance.bound)
-        )
-    builder.Connect(pose, watchdog.get_pose_input_port())
-    builder.Connect(impedance_wrench, monitor.get_impedance_wrench_input_port())
     export_station_ports(
         builder,
         watchdog.get_desired_pose_input_port(),
@@ -197,10 +190,15 @@ def add_joint_impedance(
         command_timed_out=watchdog.get_command_timed_out_output_port(),
         max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
     )
-    if governor is None or tank is None:
+    if impedance.bound is None or tank is None:
         return watchdog.get_safe_pose_output_port()
     builder.Connect(watchdog.get_safe_pose_output_port(), tank.get_desired_pose_input_port())
-    builder.Connect(tank.get_reference_pose_output_port(), governor.get_desired_pose_input_port())
-    builder.Connect(tank.get_admitted_wrench_output_port(), governor.get_max_wrench_input_port())
-    builder.Connect(state, governor.get_state_input_port())
+    governor = add_system(
+        builder,
+        "governor",
+        ReferenceGovernor(np.array(impedance.stiffness), damping, mass, time_step, impedance.bound),
+        desired_pose=tank.get_reference_pose_output_port(),
+        max_wrench=tank.get_admitted_wrench_output_port(),
+        state=state,
+    )
     return governor.get_reference_pose_output_port()

@@ -26,6 +26,7 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
@@ -44,21 +45,15 @@ MAX_PAIRS = 31  # number of bits of a contact mask
 
 @dataclass(frozen=True)
 class MujocoContact:
-    """Parameters of MuJoCo's contact and integration, equal for all objects.
+    """Parameters of MuJoCo's contact and integration, equal for all objects."""
 
-    Attributes:
-        time_step: Time step of the engine [s], rounded so that the station's time step is a multiple of it.
-        time_constant: Time constant of a contact [s]; the engine needs at least two time steps.
-        impedance: Constraint impedance of a contact, between 0 and 1.
-        friction_ratio: Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
-        spring_step: Natural frequency of a spring times time step. It determines the mass of the spring's body, which
-            must be heavy enough for explicit integration.
-    """
-
-    time_step: float = 0.001
-    time_constant: float = 0.002
-    impedance: float = 0.95
+    time_step: float = 0.001  # time step of the engine [s], rounded so that the station's time step is a multiple of it
+    time_constant: float = 0.002  # time constant of a contact [s]; the engine needs at least two time steps
+    impedance: float = 0.95  # constraint impedance of a contact, between 0 and 1
+    # Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
     friction_ratio: float = 10.0
+    # Natural frequency of a spring times time step. It determines the mass of the spring's body, which must be heavy
+    # enough for explicit integration.
     spring_step: float = 1.0
 
 
@@ -236,9 +231,8 @@ class MujocoStation(Station):
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
         surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
-        gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
-        self.gantry = builder.AddNamedSystem("gantry", gantry)
-        builder.Connect(plant.get_body_poses_output_port(), gantry.get_nominal_body_poses_input_port())
+        self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
+        add_system(builder, "gantry", gantry, nominal_body_poses=plant.get_body_poses_output_port())
         desired_pose = add_joint_impedance(
             builder,
             impedance,

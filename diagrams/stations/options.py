@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
+from guiderail.diagrams.envs.options import Integer, Number, Options, Pair, increases, satisfies
 from guiderail.diagrams.stations.sensing import SENSING, Sensing, SensorErrors
 from guiderail.models.common.arrays import round_period
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
@@ -70,12 +70,24 @@ class HardwareOptions(Options):
     robot_timeout: Number = Field(10.0, gt=0, description="longest wait for the robot's first status [s]")
 
 
-def _factors(quantity: str) -> Any:
-    return Field((1.0, 1.0), min_length=2, max_length=2, description=f"smallest and largest factor of {quantity}")
+Factors = Annotated[
+    Pair,
+    increases(
+        1.0 / MAX_FACTOR, MAX_FACTOR, f"give two factors from {1.0 / MAX_FACTOR} to {MAX_FACTOR}, the smaller one first"
+    ),
+]
+Magnitudes = Annotated[Pair, satisfies(lambda pair: min(pair) >= 0.0, "give two numbers, none negative")]
+CalibrationError = Annotated[
+    Magnitudes,
+    satisfies(
+        lambda pair: max(pair) <= MAX_CALIBRATION_ERROR,
+        f"give a position in meters and an angle in radians, at most {MAX_CALIBRATION_ERROR}",
+    ),
+]
 
 
-def _magnitudes(description: str) -> Any:
-    return Field(None, min_length=2, max_length=2, description=f"{description}; default: that of sensing")
+def _sensor_error(description: str) -> Any:
+    return Field(None, description=f"{description}; default: that of sensing")
 
 
 class Disturbances(Options):
@@ -90,31 +102,29 @@ class Disturbances(Options):
         description="errors of the sensors: exact has none, wrist is a force-torque sensor at the wrist, robot "
         "estimates the wrench from joint torques; both are tared",
     )
-    friction_factor: Numbers = _factors("all friction, sampled every episode")
-    modulus_factor: Numbers = _factors("the contact's stiffness, sampled every episode")
-    wrench_scale: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="smallest and largest factor of the measured wrench, sampled every episode; default: that of "
-        "sensing",
+    friction_factor: Factors = Field(
+        (1.0, 1.0), description="smallest and largest factor of all friction, sampled every episode"
     )
-    wrench_bias: Numbers | None = _magnitudes(
+    modulus_factor: Factors = Field(
+        (1.0, 1.0), description="smallest and largest factor of the contact's stiffness, sampled every episode"
+    )
+    wrench_scale: Factors | None = _sensor_error(
+        "smallest and largest factor of the measured wrench, sampled every episode"
+    )
+    wrench_bias: Magnitudes | None = _sensor_error(
         "largest offset of the measured wrench, sampled every episode: force [N], torque [Nm]"
     )
-    wrench_drift: Numbers | None = _magnitudes(
+    wrench_drift: Magnitudes | None = _sensor_error(
         "standard deviation after 10 s of a random walk of the measured wrench: force [N], torque [Nm]"
     )
-    wrench_noise: Numbers | None = _magnitudes("standard deviation of the measured wrench: force [N], torque [Nm]")
+    wrench_noise: Magnitudes | None = _sensor_error("standard deviation of the measured wrench: force [N], torque [Nm]")
     wrench_delay: Integer | None = Field(
         None, ge=0, le=50, description="delay of the measured wrench in control steps; default: that of sensing"
     )
-    calibration_error: Numbers | None = _magnitudes(
+    calibration_error: CalibrationError | None = _sensor_error(
         "largest error of the robot's kinematics, sampled every episode: position [m], orientation [rad]"
     )
-    tare: bool | None = Field(
-        None, description="subtract the wrench measured at the start, in free motion; default: that of sensing"
-    )
+    tare: bool | None = _sensor_error("subtract the wrench measured at the start, in free motion")
     pose_bias: Number = Field(
         0.0, ge=0, le=0.01, description="largest offset of measured x, y, z, sampled every episode [m]"
     )
@@ -127,27 +137,6 @@ class Disturbances(Options):
     payload: Number = Field(
         0.0, ge=0, le=5, description="mass at an arm's tool that its controller does not model [kg]"
     )
-
-    @field_validator("friction_factor", "modulus_factor", "wrench_scale")
-    @classmethod
-    def _check_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not 1.0 / MAX_FACTOR <= value[0] <= value[1] <= MAX_FACTOR:
-            raise ValueError(f"give two factors from {1.0 / MAX_FACTOR} to {MAX_FACTOR}, the smaller one first")
-        return value
-
-    @field_validator("wrench_bias", "wrench_drift", "wrench_noise", "calibration_error")
-    @classmethod
-    def _check_magnitudes(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and min(value) < 0.0:
-            raise ValueError("give two numbers, none negative")
-        return value
-
-    @field_validator("calibration_error")
-    @classmethod
-    def _check_calibration(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and max(value) > MAX_CALIBRATION_ERROR:
-            raise ValueError(f"give a position in meters and an angle in radians, at most {MAX_CALIBRATION_ERROR}")
-        return value
 
     @property
     def errors(self) -> SensorErrors:

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, ProximityProperties, Sphere
+from pydrake.geometry import AddContactMaterial, Box, Cylinder, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
@@ -14,11 +14,14 @@ from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Mu
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     Station,
+    add_plant,
     check_pose,
     command_timeout,
     export_station_ports,
+    set_at_rest,
     whole_multiple,
 )
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
@@ -36,24 +39,16 @@ class PlaneConfig:
     that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
     mm, is much less than a wall's thickness. Below saturation its position control is critically damped: the robot
     reaches a command within a control step and does not overshoot.
-
-    Attributes:
-        plant_period: Time step of the plant [s].
-        substeps: Plant steps per control step.
-        mass: Mass of the robot [kg].
-        max_force: Largest force of each joint [N].
-        max_speed: Largest speed of each joint [m/s].
-        friction: Friction between robot and walls; high, so that a robot pressed against a wall does not slide.
-        stiffness: Stiffness of the contact [N/m].
     """
 
-    plant_period: float = round_period(0.002)
-    substeps: int = 10
-    mass: float = 0.001
-    max_force: float = 50.0
-    max_speed: float = 10.0
+    plant_period: float = round_period(0.002)  # time step of the plant [s]
+    substeps: int = 10  # plant steps per control step
+    mass: float = 0.001  # mass of the robot [kg]
+    max_force: float = 50.0  # largest force of each joint [N]
+    max_speed: float = 10.0  # largest speed of each joint [m/s]
+    # Friction between robot and walls; high, so that a robot pressed against a wall does not slide.
     friction: float = 10.0
-    stiffness: float = 1e6
+    stiffness: float = 1e6  # stiffness of the contact [N/m]
 
     @property
     def control_period(self) -> float:
@@ -106,13 +101,7 @@ class PlaneStation(Station):
         builder = DiagramBuilder()
         self.passage, self.config = passage, config
         self.control_period = config.control_period
-        plant_config = MultibodyPlantConfig(
-            time_step=config.plant_period,
-            discrete_contact_approximation="lagged",
-            contact_model="point",
-            use_sampled_output_ports=False,  # see `TaskDiagram`
-        )
-        self.plant, self.scene_graph = AddMultibodyPlant(plant_config, builder)
+        self.plant, self.scene_graph = add_plant(builder, config.plant_period, contact_model="point")
         self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
         self._robot = _add_robot(self.plant, passage, config)
         _add_walls(self.plant, passage, config)
@@ -122,38 +111,31 @@ class PlaneStation(Station):
 
         # F = clip(k (x_d - x), ±F_max), against the joints' viscous friction.
         one = np.eye(2)
-        pose = builder.AddNamedSystem("pose", MatrixGain(D=np.eye(2, 4)))
-        watchdog = builder.AddNamedSystem(
-            "watchdog", CommandWatchdog(config.control_period, command_timeout(config.control_period), 2)
-        )
-        poses = builder.AddNamedSystem("desired_and_measured_pose", Multiplexer([2, 2]))
-        gain = builder.AddNamedSystem("position_gain", MatrixGain(D=config.position_gain * np.hstack([one, -one])))
+        state = self.plant.get_state_output_port(self._robot)
+        pose = add_system(builder, "pose", MatrixGain(D=np.eye(2, 4)), state).get_output_port()
+        watchdog = CommandWatchdog(config.control_period, command_timeout(config.control_period), 2)
+        add_system(builder, "watchdog", watchdog, pose=pose)
+        both = Multiplexer([2, 2])
+        add_system(builder, "desired_and_measured_pose", both, watchdog.get_safe_pose_output_port(), pose)
+        gain = MatrixGain(D=config.position_gain * np.hstack([one, -one]))
+        force = add_system(builder, "position_gain", gain, both.get_output_port()).get_output_port()
         limit = np.full(2, config.max_force)
-        saturation = builder.AddNamedSystem("force_limit", Saturation(-limit, limit))
-        builder.Connect(self.plant.get_state_output_port(self._robot), pose.get_input_port())
-        builder.Connect(pose.get_output_port(), watchdog.get_pose_input_port())
-        builder.Connect(watchdog.get_safe_pose_output_port(), poses.get_input_port(0))
-        builder.Connect(pose.get_output_port(), poses.get_input_port(1))
-        builder.Connect(poses.get_output_port(), gain.get_input_port())
-        builder.Connect(gain.get_output_port(), saturation.get_input_port())
-        builder.Connect(saturation.get_output_port(), self.plant.get_actuation_input_port(self._robot))
+        applied = add_system(builder, "force_limit", Saturation(-limit, limit), force).get_output_port()
+        builder.Connect(applied, self.plant.get_actuation_input_port(self._robot))
+        negative = add_system(builder, "negative_force", Gain(-1.0, 2), applied).get_output_port()
+        excess = add_system(builder, "excess_force", Adder(2, 2), force, negative)
 
-        applied = builder.AddNamedSystem("negative_force", Gain(-1.0, 2))
-        excess = builder.AddNamedSystem("excess_force", Adder(2, 2))
-        builder.Connect(saturation.get_output_port(), applied.get_input_port())
-        builder.Connect(gain.get_output_port(), excess.get_input_port(0))
-        builder.Connect(applied.get_output_port(), excess.get_input_port(1))
-
-        force_sum = builder.AddNamedSystem("force_sum", LinearSystem(one, one, one, 0 * one, config.plant_period))
-        mean_force = builder.AddNamedSystem("mean_force", MeanForce(2, config.substeps, config.control_period))
-        builder.Connect(self.plant.get_generalized_contact_forces_output_port(self._robot), force_sum.get_input_port())
-        builder.Connect(force_sum.get_output_port(), mean_force.get_force_sum_input_port())
+        contact_force = self.plant.get_generalized_contact_forces_output_port(self._robot)
+        force_sum = LinearSystem(one, one, one, 0 * one, config.plant_period)
+        add_system(builder, "force_sum", force_sum, contact_force)
+        mean_force = MeanForce(2, config.substeps, config.control_period)
+        add_system(builder, "mean_force", mean_force, force_sum=force_sum.get_output_port())
 
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
             watchdog.get_command_time_input_port(),
-            pose=pose.get_output_port(),
+            pose=pose,
             wrench=mean_force.get_force_output_port(),
             contact_force=mean_force.get_magnitude_output_port(),
             saturation=excess.get_output_port(),
@@ -164,10 +146,7 @@ class PlaneStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the robot's center at (x, y), at rest; `context` is the root context."""
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositionsAndVelocities(
-            plant_context, self._robot, np.concatenate([check_pose(pose, 2), np.zeros(2)])
-        )
+        set_at_rest(self.plant, self._robot, context, check_pose(pose, 2))
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
         """Put the obstacles at (n, 2) [m], in a workcell with moving obstacles; `context` is the root context."""
@@ -232,8 +211,6 @@ def _obstacle_shape(passage: PassageGeometry) -> Cylinder:
 
 
 def _contact(config: PlaneConfig) -> ProximityProperties:
-    properties = ProximityProperties()
-    properties.AddProperty("material", "coulomb_friction", CoulombFriction(config.friction, config.friction))
-    properties.AddProperty("material", "point_contact_stiffness", config.stiffness)
-    properties.AddProperty("material", "hunt_crossley_dissipation", 0.0)
+    properties, friction = ProximityProperties(), CoulombFriction(config.friction, config.friction)
+    AddContactMaterial(dissipation=0.0, point_stiffness=config.stiffness, friction=friction, properties=properties)
     return properties

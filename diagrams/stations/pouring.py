@@ -6,13 +6,14 @@ from functools import cached_property
 import numpy as np
 from pydrake.geometry import Box, Cylinder
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import ControllerPlant, Station, export_station_ports
+from guiderail.diagrams.stations.station import ControllerPlant, Station, add_plant, export_station_ports
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
@@ -42,33 +43,21 @@ ORANGE = (0.95, 0.55, 0.10, 1.0)
 
 @dataclass(frozen=True)
 class PouringConfig:
-    """Parameters of the scene and its time steps.
+    """Parameters of the scene and its time steps."""
 
-    Attributes:
-        mug: Dimensions of the mug.
-        thermos: Dimensions of the thermos.
-        ball: Parameters of a ball.
-        num_balls: Number of balls.
-        p_WStand: Point of the table's surface under the nominal mug [m].
-        stand_height: Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
-        grip: Distance of the thermos's axis from the flange [m]; the axes of thermos and flange are perpendicular.
-        grip_height: Distance of the grip from the thermos's tip [m].
-        plant_period: Time step of the plant [s].
-        substeps: Plant steps per control step.
-        robot: The arm, or its name; its data need drives and a level posture.
-    """
-
-    mug: Vessel = MUG
-    thermos: Vessel = THERMOS
-    ball: Ball = field(default_factory=Ball)
-    num_balls: int = 2
-    p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)
+    mug: Vessel = MUG  # dimensions of the mug
+    thermos: Vessel = THERMOS  # dimensions of the thermos
+    ball: Ball = field(default_factory=Ball)  # parameters of a ball
+    num_balls: int = 2  # number of balls
+    p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)  # point of the table's surface under the nominal mug [m]
+    # Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
     stand_height: float = 0.06
+    # Distance of the thermos's axis from the flange [m]; the axes of thermos and flange are perpendicular.
     grip: float = 0.08
-    grip_height: float = 0.045
-    plant_period: float = round_period(0.005)
-    substeps: int = 2
-    robot: Robot | str = DEFAULT_ROBOT
+    grip_height: float = 0.045  # distance of the grip from the thermos's tip [m]
+    plant_period: float = round_period(0.005)  # time step of the plant [s]
+    substeps: int = 2  # plant steps per control step
+    robot: Robot | str = DEFAULT_ROBOT  # the arm, or its name; its data need drives and a level posture
 
     @cached_property
     def arm(self) -> Robot:
@@ -149,21 +138,18 @@ class PouringStation(Station):
         builder = DiagramBuilder()
         self.config = config
         self.control_period = config.control_period
-        plant_config = MultibodyPlantConfig(
-            time_step=config.plant_period,
-            contact_model="point",
-            discrete_contact_approximation="lagged",
-            penetration_allowance=1e-3,
-            use_sampled_output_ports=False,  # see `TaskDiagram`
+        self.plant, self.scene_graph = plant, _ = add_plant(
+            builder, config.plant_period, contact_model="point", penetration_allowance=1e-3
         )
-        self.plant, self.scene_graph = plant, _ = AddMultibodyPlant(plant_config, builder)
         self.arm, self._tip, wrist = add_arm_with_thermos(plant, config)
         self._mount = plant.AddFrame(FixedOffsetFrame("mug_mount", plant.world_frame(), config.X_WT))
         self._mug = add_vessel(plant, "mug", config.mug, CHINA)
         _add_stand(plant, self._mug, config)
         plant.WeldFrames(self._mount, self._mug.body_frame())
         self._balls = [add_ball(plant, f"ball_{i}", config.ball, ORANGE) for i in range(config.num_balls)]
-        _add_table(plant, config)
+        x, y, z = config.p_WStand
+        X_WTable = RigidTransform([x + 0.1, y - 0.1, z - 0.05])  # the table begins next to the arm's base
+        add_shape(plant, plant.world_body(), "table", X_WTable, Box(1.0, 1.6, 0.1), WOOD)
         plant.Finalize()
         thermos = plant.GetBodyByName("thermos")
 
@@ -180,18 +166,17 @@ class PouringStation(Station):
         )
         builder.AddNamedSystem("controller", controller)
         # Without a desired velocity the drives' damping delays the arm by centimeters.
-        num_joints = config.arm.num_joints
-        drives = StateInterpolatorWithDiscreteDerivative(
-            num_joints, config.control_period, suppress_initial_transient=True
-        )
-        builder.AddNamedSystem("drives", drives)
-        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
-        measured = MeasuredPose(plant, thermos, config.X_WT)
-        builder.AddNamedSystem("pose", measured)
+        n, body_poses = config.arm.num_joints, plant.get_body_poses_output_port()
+        drives = StateInterpolatorWithDiscreteDerivative(n, config.control_period, suppress_initial_transient=True)
+        add_system(builder, "drives", drives, controller.get_joint_positions_output_port())
+        positions = MatrixGain(np.eye(n, 2 * n))
+        add_system(builder, "positions", positions, plant.get_state_output_port(self.arm))
+        measured = add_system(builder, "pose", MeasuredPose(plant, thermos, config.X_WT), body_poses=body_poses)
         links = [plant.get_body(index) for index in plant.GetBodyIndices(self.arm)]
         period = config.plant_period
         contact_detector = ContactDetector(plant, [*links, thermos], [plant.world_body(), self._mug], period)
-        builder.AddNamedSystem("contact_detector", contact_detector)
+        contact_results = plant.get_contact_results_output_port()
+        add_system(builder, "contact_detector", contact_detector, contact_results=contact_results)
         axes = config.X_WT.rotation()
         sensor = WrenchSensor(plant, wrist, [thermos], self._tip, axes, config.control_period, WRENCH_TIME_CONSTANT)
         builder.AddNamedSystem("wrench_sensor", sensor)
@@ -202,12 +187,8 @@ class PouringStation(Station):
             ("balls_in_thermos", RelativePoses(plant, self._balls, thermos)),
         ]
 
-        builder.Connect(plant.get_state_output_port(self.arm), positions.get_input_port())
         builder.Connect(positions.get_output_port(), controller.get_positions_input_port())
-        builder.Connect(controller.get_joint_positions_output_port(), drives.get_input_port())
         builder.Connect(drives.get_output_port(), plant.get_desired_state_input_port(self.arm))
-        builder.Connect(plant.get_body_poses_output_port(), measured.get_body_poses_input_port())
-        builder.Connect(plant.get_contact_results_output_port(), contact_detector.get_contact_results_input_port())
         export_station_ports(
             builder,
             controller.get_desired_pose_input_port(),
@@ -219,8 +200,7 @@ class PouringStation(Station):
             command_timed_out=controller.get_command_timed_out_output_port(),
         )
         for name, system in relative_poses:
-            builder.AddNamedSystem(name, system)
-            builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
+            add_system(builder, name, system, body_poses=body_poses)
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
         builder.ExportOutput(contact_detector.get_collision_output_port(), "collision")
         builder.ExportOutput(contact_detector.get_has_collided_output_port(), "touched")
@@ -246,7 +226,10 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     arm = add_robot(plant, config.arm)
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
     wrist = plant.WeldFrames(arm.flange, thermos.body_frame(), config.X_FlangeP)
-    _add_hand(plant, thermos, config)
+    # The hand is a cylinder from the flange to the thermos's wall; its contact counts as the thermos's.
+    length = config.grip - config.thermos.outer_radius
+    X_PHand = config.X_FlangeP.inverse() @ RigidTransform([0.0, 0.0, length / 2])
+    add_shape(plant, thermos, "hand", X_PHand, Cylinder(0.03, length), METAL)
     for model in (arm.model, thermos.model_instance()):
         # The integrators of a position-controlled arm compensate gravity.
         plant.set_gravity_enabled(model, False)
@@ -255,26 +238,11 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     return arm.model, thermos.body_frame(), wrist
 
 
-def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:
-    """Add a cylinder from the flange to the thermos's wall; its contact counts as the thermos's."""
-    length = config.grip - config.thermos.outer_radius
-    X_PFlange = config.X_FlangeP.inverse()
-    X_PG = X_PFlange @ RigidTransform([0.0, 0.0, length / 2])
-    add_shape(plant, thermos, "hand", X_PG, Cylinder(0.03, length), METAL)
-
-
 def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
     """Add the stand under the mug, which moves with it; its contact counts as the mug's."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
         add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)
-
-
-def _add_table(plant: MultibodyPlant, config: PouringConfig) -> None:
-    x, y, z = config.p_WStand
-    # The table begins next to the arm's base.
-    X_WG = RigidTransform([x + 0.1, y - 0.1, z - 0.05])
-    add_shape(plant, plant.world_body(), "table", X_WG, Box(1.0, 1.6, 0.1), WOOD)
 
 
 def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:

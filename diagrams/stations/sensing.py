@@ -47,32 +47,24 @@ class JointTorqueAccuracy:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of the measured wrench and pose, in pairs of force [N] and torque [Nm], or length [m] and angle [rad].
+    """Errors of the measured wrench and pose, in pairs of force [N] and torque [Nm], or length [m] and angle [rad]."""
 
-    Attributes:
-        wrench_scale: Smallest and largest factor of the measured wrench, sampled every episode.
-        wrench_bias: Largest offset of each component, sampled every episode.
-        wrench_drift: Standard deviation of the wrench's random walk after `DRIFT_TIME`.
-        wrench_gradient: Largest change of the bias per radian that the tool turns about each axis.
-        wrench_noise: Standard deviation of white noise.
-        wrench_delay: Smallest and largest delay in control steps, sampled every episode.
-        calibration_error: Largest constant error of the arm's kinematics, sampled every episode. It affects commands
-            and measurements alike, so that the actual pose of the tool differs from the measured pose.
-        pose_resolution: Resolution of a measured pose, which follows from the encoders' resolution.
-        tare: Subtract the wrench of the episode's first control steps, which are free motion.
-        joint_torque: Errors of an arm's joint torque sensors, which replace the scale, bias, drift, gradient and noise
-            of the wrench on an arm; None if the wrench is measured at the wrist.
-    """
-
+    # Smallest and largest factor of the measured wrench, sampled every episode.
     wrench_scale: tuple[float, float] = (1.0, 1.0)
-    wrench_bias: tuple[float, float] = (0.0, 0.0)
-    wrench_drift: tuple[float, float] = (0.0, 0.0)
+    wrench_bias: tuple[float, float] = (0.0, 0.0)  # largest offset of each component, sampled every episode
+    wrench_drift: tuple[float, float] = (0.0, 0.0)  # standard deviation of the wrench's random walk after `DRIFT_TIME`
+    # Largest change of the bias per radian that the tool turns about each axis.
     wrench_gradient: tuple[float, float] = (0.0, 0.0)
-    wrench_noise: tuple[float, float] = (0.0, 0.0)
-    wrench_delay: tuple[int, int] = (0, 0)
+    wrench_noise: tuple[float, float] = (0.0, 0.0)  # standard deviation of white noise
+    wrench_delay: tuple[int, int] = (0, 0)  # smallest and largest delay in control steps, sampled every episode
+    # Largest constant error of the arm's kinematics, sampled every episode. It affects commands and measurements alike,
+    # so that the actual pose of the tool differs from the measured pose.
     calibration_error: tuple[float, float] = (0.0, 0.0)
+    # Resolution of a measured pose, which follows from the encoders' resolution.
     pose_resolution: tuple[float, float] = (0.0, 0.0)
-    tare: bool = False
+    tare: bool = False  # subtract the wrench of the episode's first control steps, which are free motion
+    # Errors of an arm's joint torque sensors, which replace the scale, bias, drift, gradient and noise of the wrench on
+    # an arm; None if the wrench is measured at the wrist.
     joint_torque: JointTorqueAccuracy | None = None
 
 

@@ -244,9 +244,14 @@ class ControllerPlant:
 
     def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
         """Put the robot of a station's plant at rest with its tool center at `pose`, (6,), in the root context."""
-        plant_context = plant.GetMyMutableContextFromRoot(context)
-        plant.SetPositions(plant_context, model, self.solve(check_pose(pose, POSE_SIZE), self.posture))
-        plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
+        set_at_rest(plant, model, context, self.solve(check_pose(pose, POSE_SIZE), self.posture))
+
+
+def set_at_rest(plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, positions: np.ndarray) -> None:
+    """Set joint positions (n,) and zero velocities of a model in the root context."""
+    plant_context = plant.GetMyMutableContextFromRoot(context)
+    plant.SetPositions(plant_context, model, positions)
+    plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
 
 
 def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
@@ -264,6 +269,12 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
     return numbers
 
 
+def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple[MultibodyPlant, SceneGraph]:
+    """Add a plant with the settings that all stations share; others are those of `MultibodyPlantConfig`."""
+    shared = {"discrete_contact_approximation": "lagged", "use_sampled_output_ports": False}  # see `TaskDiagram`
+    return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared, **config), builder)
+
+
 def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:
     """Add a plant with hydroelastic contact that falls back to point contact.
 
@@ -272,14 +283,8 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
     """
     if not time_step > 0.0:
         raise InputError(f"the plant's time step must be positive, not {time_step} s")
-    config = MultibodyPlantConfig(
-        time_step=time_step,
-        contact_model="hydroelastic_with_fallback",
-        discrete_contact_approximation="lagged",
-        contact_surface_representation="polygon",
-        use_sampled_output_ports=False,  # see `TaskDiagram`
-    )
-    return AddMultibodyPlant(config, builder)
+    contact = {"contact_model": "hydroelastic_with_fallback", "contact_surface_representation": "polygon"}
+    return add_plant(builder, time_step, **contact)
 
 
 def add_workcell_plant(

@@ -50,15 +50,10 @@ class ConvexWorkcell(Protocol):
 
 
 class MovableWorkcell(ABC):
-    """Workcell with a fixture and a workpiece on frames, which a reset moves in the context.
+    """Workcell with a fixture and a workpiece on frames, which a reset moves in the context."""
 
-    Attributes:
-        fixture: Name of the fixture's body.
-        workpiece: Name of the workpiece's body.
-    """
-
-    fixture: ClassVar[str]
-    workpiece: ClassVar[str]
+    fixture: ClassVar[str]  # name of the fixture's body
+    workpiece: ClassVar[str]  # name of the workpiece's body
 
     @property
     @abstractmethod

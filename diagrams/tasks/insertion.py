@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
-from guiderail.diagrams.envs.options import Numbers, ResetOptions
+from guiderail.diagrams.envs.options import Pair, ResetOptions, satisfies
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE, MIN_CONTACT_FORCE
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task, terminal_reward
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
@@ -41,23 +42,20 @@ EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
 """Scales of a privileged critic's observation: x, y and turn of the fixture, force and torque."""
 
 
+GivenOffset = Annotated[
+    Pair,
+    satisfies(
+        lambda offset: max(map(abs, offset)) <= MAX_GIVEN_OFFSET,
+        f"give x and y in meters, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}",
+    ),
+]
+
+
 class InsertionReset(ResetOptions):
     """Options of a reset of an insertion task."""
 
     new_run: bool = Field(False, description="sample the hidden values of a run again")
-    offset: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="(x, y) of the fixture or the workpiece [m]; default: sampled",
-    )
-
-    @field_validator("offset")
-    @classmethod
-    def _is_near(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and max(map(abs, value)) > MAX_GIVEN_OFFSET:
-            raise ValueError(f"give x and y in meters, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}")
-        return value
+    offset: GivenOffset | None = Field(None, description="(x, y) of the fixture or the workpiece [m]; default: sampled")
 
 
 class InsertionTask(Task):
@@ -115,14 +113,13 @@ class InsertionTask(Task):
             observable = self.observable_success()
             if observable is None:
                 return {}
-            estimate = builder.AddNamedSystem(f"{self.workpiece}_estimate", affine(*observable))
-            builder.Connect(station.get_pose_output_port(), estimate.get_input_port())
-            return {self.workpiece: estimate.get_output_port()}
+            name, pose = f"{self.workpiece}_estimate", station.get_pose_output_port()
+            return {self.workpiece: add_system(builder, name, affine(*observable), pose).get_output_port()}
         self.episode_constants["hidden_offset"] = EpisodeConstant(builder, "hidden_offset", 3)
         plant = station.plant
         relative = RelativePoses(plant, [plant.GetBodyByName(self.workpiece)], plant.GetBodyByName(self.fixture))
-        builder.AddNamedSystem(f"{self.workpiece}_in_{self.fixture}", relative)
-        builder.Connect(station.GetOutputPort("body_poses"), relative.get_body_poses_input_port())
+        name, body_poses = f"{self.workpiece}_in_{self.fixture}", station.GetOutputPort("body_poses")
+        add_system(builder, name, relative, body_poses=body_poses)
         return {
             self.workpiece: relative.get_relative_poses_output_port(),
             "hidden_offset": self.episode_constants["hidden_offset"].port,
@@ -291,8 +288,8 @@ class DemonstratedInsertion(InsertionTask):
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's pose in the fixture and the center of pressure."""
-        system = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
-        builder.Connect(station.get_wrench_output_port(), system.get_wrench_input_port())
+        system = CenterOfPressure(MIN_CONTACT_FORCE)
+        add_system(builder, "center_of_pressure", system, wrench=station.get_wrench_output_port())
         return {**super().signals(builder, station), "center_of_pressure": system.get_center_of_pressure_output_port()}
 
     def scaled_terms(

@@ -38,22 +38,8 @@ def reference_of_file(
         raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
     with path.open("rb") as file:
         key = hashlib.file_digest(file, "sha256").digest(), components, floor, count, *sorted(fit.items())
-    if key not in _REFERENCES:
-        _REFERENCES[key] = _fit(path, components, floor, count, fit)
-    return _REFERENCES[key]
-
-
-# Fitted trajectories, because a fit takes seconds. A key has the file's digest, as `create-task` moves the folder.
-_REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
-
-
-def _fit(
-    path: Path,
-    components: int | None,
-    floor: tuple[float, ...],
-    count: int | None,
-    fit: dict[str, Any],
-) -> ReferenceTrajectory:
+    if key in _REFERENCES:
+        return _REFERENCES[key]
     demonstrations = Demonstrations.load(path).first(count)
     if demonstrations.num_outputs != POSE_SIZE:
         raise InputError(
@@ -65,7 +51,13 @@ def _fit(
     fitted = ReferenceTrajectory.from_demonstrations(
         demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), **fit
     )
-    return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
+    times = CONTROL_PERIOD * np.arange(num_steps)
+    _REFERENCES[key] = ReferenceTrajectory(times, fitted.means, fitted.covariances)
+    return _REFERENCES[key]
+
+
+# Fitted trajectories, because a fit takes seconds. A key has the file's digest, as `create-task` moves the folder.
+_REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 
 
 class HiddenOffsets(ABC):
@@ -76,7 +68,9 @@ class HiddenOffsets(ABC):
     (x, y) [m] replaces the sample.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kind: str = "per_run"):
+        """Construct the sampler; `kind` is "per_run", "per_episode" or "none", as the option `fixture_offset`."""
+        self.kind = kind
         self._run: Any = None
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:

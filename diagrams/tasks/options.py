@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from guiderail.diagrams.envs.options import Number, Numbers, Options
+from guiderail.diagrams.envs.options import Number, Numbers, Options, Pair, increases, satisfies
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.primitives.reference import interpolate_prior
 
@@ -33,25 +33,34 @@ MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # larger ones are p
 FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]
 
 
+OffsetRange = Annotated[
+    Pair,
+    increases(0.0, LARGEST_OFFSET, f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first"),
+]
+PriorStd = Annotated[
+    Numbers,
+    satisfies(
+        lambda std: not (interpolate_prior(std, 101, POSE_SIZE) > MAX_PRIOR_STD).any(),
+        f"give meters and radians, at most {MAX_PRIOR_STD[0]:g} m and {MAX_PRIOR_STD[-1]:g} rad",
+    ),
+]
+ForceRange = Annotated[
+    Pair,
+    increases(
+        *FORCE_LIMITS, f"give two forces from {FORCE_LIMITS[0]:g} to {FORCE_LIMITS[1]:g} N, the smaller one first"
+    ),
+]
+
+
 class FixtureOffsetOptions(Options):
     """Options of a task with a fixture that is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offset of the fixture: sampled per run, per episode, or none"
     )
-    offset_range: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="least and greatest offset of the fixture [m]; default: that of fixture_offset",
+    offset_range: OffsetRange | None = Field(
+        None, description="least and greatest offset of the fixture [m]; default: that of fixture_offset"
     )
-
-    @field_validator("offset_range")
-    @classmethod
-    def _check_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
-            raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
-        return value
 
 
 class ReferenceOptions(Options):
@@ -82,19 +91,12 @@ class PriorOptions(ReferenceOptions):
         "below 1 it stops exploration there, above 1 it widens it",
     )
 
-    prior_std: Numbers | None = Field(
+    prior_std: PriorStd | None = Field(
         None,
         description="standard deviation x y z Rz Ry Rx [m], [rad] around a single demonstration, whose square is added "
         "to its fitted variance; or rows of a phase from 0 to 1 and these six; required for one demonstration",
         examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
     )
-
-    @field_validator("prior_std")
-    @classmethod
-    def _check_prior(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and (interpolate_prior(value, 101, POSE_SIZE) > MAX_PRIOR_STD).any():
-            raise ValueError(f"give meters and radians, at most {MAX_PRIOR_STD[0]:g} m and {MAX_PRIOR_STD[-1]:g} rad")
-        return value
 
 
 class ForceOptions(Options):
@@ -106,25 +108,14 @@ class ForceOptions(Options):
         le=FORCE_LIMITS[1],
         description="force that ends an episode as a collision [N]",
     )
-    force_limit_range: Numbers | None = Field(
+    force_limit_range: ForceRange | None = Field(
         None,
-        min_length=2,
-        max_length=2,
         description="sample the force limit of every episode between these two, and let the policy observe it [N]; "
         "default: force_limit",
     )
     bounded_force: bool = Field(
         True, description="limit the impedance, so that its force cannot pass force_limit; without it: 40 N per axis"
     )
-
-    @field_validator("force_limit_range")
-    @classmethod
-    def _check_limits(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not FORCE_LIMITS[0] <= value[0] <= value[1] <= FORCE_LIMITS[1]:
-            raise ValueError(
-                f"give two forces from {FORCE_LIMITS[0]:g} to {FORCE_LIMITS[1]:g} N, the smaller one first"
-            )
-        return value
 
     @property
     def largest_force_limit(self) -> float:

@@ -63,8 +63,7 @@ class BncUncertainty(HiddenOffsets):
         `grasp_angle` and `jack_turn` are the largest tilt of the plug and turn of the jack [degrees]. `offset_range`
         is the smallest and largest offset of the jack [m]; by default that of the kind.
         """
-        super().__init__()
-        self.kind = kind
+        super().__init__(kind)
         self.grasp_angle = grasp_angle * DEGREE
         self.jack_turn = jack_turn * DEGREE
         self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from guiderail.diagrams.envs.options import Number, Numbers
+from guiderail.diagrams.envs.options import Number, Pair, increases
 from guiderail.diagrams.tasks.options import FORCE_LIMITS, ForceOptions
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
@@ -24,6 +24,9 @@ START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the 
 HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
 REWARDS = ("shaped", "no_force", "sparse", "aligned")
 NOMINAL = GridClampDimensions()
+StartHeight = Annotated[
+    Pair, increases(*HEIGHTS, f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
+]
 
 
 class GridClampOptions(ForceOptions):
@@ -32,9 +35,7 @@ class GridClampOptions(ForceOptions):
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offsets of table and clamp: sampled per run, per episode, or none"
     )
-    start_height: Numbers = Field(
-        START_HEIGHT, min_length=2, max_length=2, description="least and greatest start height [m]"
-    )
+    start_height: StartHeight = Field(START_HEIGHT, description="least and greatest start height [m]")
     force_limit: Number = Field(
         COLLISION_FORCE, ge=8, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
     )
@@ -50,13 +51,6 @@ class GridClampOptions(ForceOptions):
         description="clearance between a peg and its hole on each side [m]",
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of pegs, holes and table")
-
-    @field_validator("start_height")
-    @classmethod
-    def _check_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if not HEIGHTS[0] <= value[0] <= value[1] <= HEIGHTS[1]:
-            raise ValueError(f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
-        return value
 
     def workcell(self) -> GridClampWorkcell:
         """Return the workcell with these options."""

@@ -144,11 +144,6 @@ class GridClampUncertainty(HiddenOffsets):
     The option `offset` sets the clamp's position in the tool, with the table at its nominal position.
     """
 
-    def __init__(self, kind: str):
-        """Construct the sampler of "per_run", "per_episode" or "none"."""
-        super().__init__()
-        self.kind = kind
-
     def _draw_run(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Sample the table's offset (2,) and the places' grasp offsets (6, 2)."""
         step = 2 * ALONG_JAWS / NUM_PLACES

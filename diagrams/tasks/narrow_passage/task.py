@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.envs.options import STANDARD, Numbers, ResetOptions
+from guiderail.diagrams.envs.options import STANDARD, Pair, ResetOptions
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
@@ -49,9 +49,7 @@ def avoids_obstacle_from(rows: Any) -> int | None:
 class NarrowPassageReset(ResetOptions):
     """Options of a reset of NarrowPassage."""
 
-    start: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) of the start [m]; default: that of the demonstrations"
-    )
+    start: Pair | None = Field(None, description="(x, y) of the start [m]; default: that of the demonstrations")
 
 
 SUCCESS_REWARD = 200.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Len
 from pydantic import Field
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options, ResetOptions
+from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options, Pair, ResetOptions
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, Ball
@@ -138,18 +139,10 @@ class PouringOptions(Options):
 class PouringReset(ResetOptions):
     """Options of a reset of Pouring."""
 
-    start: Numbers | None = Field(
-        None,
-        min_length=3,
-        max_length=3,
-        description="(x, y, z) of the upright thermos's tip in the frame of the estimated mug [m]",
+    start: Annotated[Numbers, Len(3, 3)] | None = Field(
+        None, description="(x, y, z) of the upright thermos's tip in the frame of the estimated mug [m]"
     )
-    mug_position: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="(x, y) of the estimated mug position from its nominal position [m]",
+    mug_position: Pair | None = Field(
+        None, description="(x, y) of the estimated mug position from its nominal position [m]"
     )
-    mug_error: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) from the actual to the estimated mug position [m]"
-    )
+    mug_error: Pair | None = Field(None, description="(x, y) from the actual to the estimated mug position [m]")

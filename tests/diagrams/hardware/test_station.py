@@ -18,7 +18,7 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail.diagrams.hardware.driver import find_driver, safety_limits
 from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.hardware.lcm_simulated import LockstepClock, SimulatedIiwa
-from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.hardware.station import HardwareStation, tool_jacobian
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
@@ -305,7 +305,9 @@ def test_max_torque_shares_bound_all_wrenches():
         WORKCELL, IiwaDriver(DrakeLcm("memq://")), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1))
     )
     positions = station.controller_plant.solve(START, station.controller_plant.posture)
-    J = np.roll(station._jacobian(positions), 3, axis=0)  # force first
+    J = np.roll(
+        tool_jacobian(station.controller_plant, positions, station.controller_plant.target), 3, axis=0
+    )  # force first
     corners = np.array(list(itertools.product(*((-limit, limit) for limit in (40.0, 30.0, 20.0, 1, 2, 3)))))
     worst = np.abs(corners @ J).max(axis=0) / np.array(station.limits.torque)
     np.testing.assert_allclose(station.max_torque_shares(positions), worst)

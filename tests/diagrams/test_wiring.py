@@ -1,0 +1,35 @@
+"""Addition of a system together with its connections."""
+
+import numpy as np
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import Adder, ConstantVectorSource, PassThrough
+
+from guiderail.diagrams.envs.observation import Observation, ObservationTerm
+from guiderail.diagrams.wiring import add_system
+
+
+def test_ports_are_connected_in_order_and_the_system_is_returned():
+    builder = DiagramBuilder()
+    first, second = (add_system(builder, name, ConstantVectorSource([x])) for name, x in (("one", 1.0), ("two", 2.0)))
+    adder = Adder(2, 1)
+    assert add_system(builder, "sum", adder, first.get_output_port(), second.get_output_port()) is adder
+    diagram = builder.Build()
+    context = adder.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    assert [adder.get_input_port(index).Eval(context) for index in range(2)] == [1.0, 2.0]
+    assert diagram.GetSubsystemByName("sum") is adder
+
+
+def test_ports_are_connected_by_any_name():
+    """A signal of a task may have the name of an argument of the function."""
+    builder = DiagramBuilder()
+    terms = [ObservationTerm(name) for name in ("name", "system", "builder")]
+    observation = Observation(terms, dict.fromkeys(("name", "system", "builder"), 1), duration=1.0, clip=10.0)
+    ports = {
+        term.signal: add_system(builder, f"source_{index}", ConstantVectorSource([float(index)])).get_output_port()
+        for index, term in enumerate(terms)
+    }
+    add_system(builder, "observation", observation, **ports)
+    copy = add_system(builder, "copy", PassThrough(3), observation.get_observation_output_port())
+    diagram = builder.Build()
+    context = copy.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    np.testing.assert_array_equal(copy.get_output_port().Eval(context), [0.0, 1.0, 2.0])
