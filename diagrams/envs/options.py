@@ -91,7 +91,9 @@ class CommonOptions(Options):
 class PrimitiveOptions(Options):
     """Options of every guidance built from demonstrations; see `PrimitiveConfig`."""
 
-    action_scale: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
+    action_scale: Number = Field(
+        1.0, gt=0, description="κ: a constant action of ±1 moves the outputs by √3 κ standard deviations"
+    )
     action_dims: Integers | None = Field(
         None, description="indices of the outputs that an action moves; default: all", examples=[(0, 1)]
     )
@@ -113,7 +115,7 @@ class PrimitiveOptions(Options):
         {}, validate_default=True, description="further parameters of a kernel that has more than a length scale"
     )
     via_points: Numbers = Field(
-        (), description="points of the mean: a control step and an output each, one after another"
+        (), description="via-points of the mean: control step and output of each, one via-point after another"
     )
     max_speed: PositiveNumbers = Field(
         (),
@@ -138,7 +140,7 @@ class PrimitiveOptions(Options):
         (0.0025, 0.1),
         description="deviation of position [m] and angles [rad] from the command beyond which the motion waits",
     )
-    max_lag: Number = Field(3.0, ge=0, le=60, description="largest time for which the motion waits in total [s]")
+    max_lag: Number = Field(3.0, ge=0, le=60, description="largest total time for which the motion waits [s]")
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
 
     @field_validator("kernel_parameters")
@@ -153,7 +155,7 @@ KERNEL_OPTIONS = ("kernel", "length_scale", "kernel_parameters")
 
 
 def kernel_from_options(options: Mapping[str, Any]) -> Kernel:
-    """Build the kernel that `PrimitiveOptions` name; a missing option has its default.
+    """Build the kernel given by `KERNEL_OPTIONS`; a missing option has its default.
 
     Raises:
         InputError: As `make_kernel`.

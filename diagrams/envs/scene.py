@@ -38,7 +38,7 @@ class View:
     def follow(self, context: Context) -> EventStatus:
         """Publish every `PUBLISH_PERIOD`; a `Simulator` calls this function as its monitor, with the root context."""
         elapsed = context.get_time() - self._published
-        # The time of a new episode restarts at zero. The tolerance covers rounding, far below a simulation step.
+        # The time of a new episode restarts at zero. The tolerance for rounding is far below a simulation step.
         if elapsed < 0 or elapsed > PUBLISH_PERIOD - 1e-6:
             self.publish(context)
         return EventStatus.DidNothing()

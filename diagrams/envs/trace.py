@@ -20,13 +20,13 @@ class Metric:
 
 
 class EpisodeTrace:
-    """Record of an episode: one row for every control step, taken at its end.
+    """Record of an episode, with one row taken at the end of every control step.
 
     The arrays are views of storage that the next episode overwrites: copy data that are needed after a reset.
     """
 
     def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
-        """Construct an empty trace of at most `num_steps` control steps, with signals of given sizes by name."""
+        """Construct an empty trace of at most `num_steps` control steps; `signals` maps signal names to sizes."""
         self.period = period
         self._length = 0
         self._commanded = np.empty((num_steps, num_outputs))
@@ -93,7 +93,7 @@ class EpisodeTrace:
                 values[n] = signals[name] if signals is not None else np.nan
         except KeyError as error:
             has = sorted(signals or {})
-            raise InputError(f"a control step lacks the signal {error} of its trace, and has {has}") from None
+            raise InputError(f"a control step lacks the signal {error} of the trace: its signals are {has}") from None
         self._length = n + 1
 
     def statistics(self) -> dict[str, float]:
@@ -101,7 +101,7 @@ class EpisodeTrace:
 
         Before the first control step, the largest violations are −∞ and the peak force is 0. The maximum of values that
         contain NaN is NaN. `collisions` counts uninterrupted sequences of control steps in collision, `collision_steps`
-        counts these control steps. If the trace lacks its signal, a violation is −∞ and a count is 0.
+        counts these control steps. Without its signal, a violation is −∞ and a count is 0.
         """
         collision = self._is_positive("collision")
         return {
@@ -123,7 +123,7 @@ class EpisodeTrace:
         return float(self.signals[name].max(initial=-np.inf)) if name in self._signals else -np.inf
 
     def _is_positive(self, name: str) -> np.ndarray:
-        """Return for each control step whether a signal of one number is positive, (n,); False without the signal."""
+        """Return whether a scalar signal is positive at each control step, (n,); False without the signal."""
         return self.signals[name][:, 0] > 0.0 if name in self._signals else np.zeros(len(self), bool)
 
 

@@ -29,8 +29,8 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
 
     Args:
         config: Configuration with the demonstrations, for the default limits, and the speed limits.
-        max_jerk: Jerk limits: one for the position (angles have the default), one for position and one for angles, or
-            O; () for the default.
+        max_jerk: Jerk limits: one (positions; angles have the default), two (positions, angles), or O; () for the
+            default.
 
     Raises:
         InputError: If the motion has constraints other than linear bounds and speed limits, or `max_jerk` has another

@@ -30,7 +30,7 @@ class PrimitiveGuidance(Guidance):
     """
 
     def _export_inputs(self, builder: DiagramBuilder, config: PrimitiveConfig) -> tuple[OutputPort, OutputPort]:
-        """Export the inputs; return the ports of the held action, spread over all outputs (O,), and of the pose."""
+        """Export the inputs; return the ports of the held action, mapped to all outputs (O,), and of the pose."""
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(config.control_period, config.num_actions))
         action = hold.get_output_port()
         if not np.array_equal(config.selection, np.eye(config.num_outputs)):
@@ -173,7 +173,7 @@ class SkgrlGuidance(PrimitiveGuidance):
     """Guidance by sKGRL: null-space actions with a history of outputs, so that exploration is smooth.
 
     With an adaptive history, the motion passes through fewer past outputs during contact, so that it reacts to forces
-    as quickly as KGRL. The shortest history is the last output, so every motion begins there.
+    as quickly as KGRL. The shortest history is the last output, so every motion begins at this output.
     """
 
     def __init__(self, prior: PriorKnowledge):

@@ -51,7 +51,7 @@ class GuidanceKind:
     options: type[Options] | None = None
 
     def missing_requirements(self, provided: Collection[str]) -> tuple[str, ...]:
-        """Return the missing requirements of the alternative with the fewest; empty if an alternative is complete.
+        """Return the missing requirements of the alternative that lacks the fewest; empty if one is complete.
 
         `provided` are the requirements that the task provides.
         """
@@ -110,7 +110,7 @@ def check_guidance(name: str, provided: Collection[str], task: str = "this task"
     """Return the kind of guidance with a name, after a check that its requirements are `provided`.
 
     Raises:
-        InputError: If there is no such kind, or a requirement is missing, which the message names.
+        InputError: If there is no such kind, or a requirement is missing; the message names it.
     """
     kind = GUIDANCE.get(name)
     missing = kind.missing_requirements(provided)

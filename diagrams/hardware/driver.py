@@ -92,7 +92,7 @@ class Driver(ABC):
         return ""
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive the messages that have arrived; if no new status has, wait for one at most `timeout` [s]."""
+        """Receive the messages that have arrived; without a new status, wait for one at most `timeout` [s]."""
         end = time.monotonic() + timeout
         while True:
             status = self.read()

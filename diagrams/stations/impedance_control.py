@@ -103,7 +103,7 @@ def make_phase_wrench_limit(
             f"state {limited[0]!r} of template {template.name!r} limits force or torque, and the impedance of this "
             "station has no bound: choose another station or bounded_force=true, or remove the limit"
         )
-    # A state without limits has the station's bound, from which the limits of other states are approached.
+    # A state without limits has the station's bound, from which changes to the limits of other states start.
     bounds = [impedance.bound.numbers] * len(template.states)
     for number, state in enumerate(template.states):
         given = [np.inf if limit is None else limit for limit in (state.max_force_n, state.max_torque_nm)]

@@ -69,7 +69,7 @@ class PouringConfig:
 
     @property
     def control_period(self) -> float:
-        """Time of a control step [s]."""
+        """Duration of a control step [s]."""
         return self.substeps * self.plant_period
 
     def stack(self) -> np.ndarray:

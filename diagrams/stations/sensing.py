@@ -9,8 +9,8 @@ Data sheets and papers that the numbers come from, by their number in docs/bibli
 - A wrist sensor [28]: resolution of 0.0125 N and 0.00075 Nm, uncertainty of about 1 % of the range.
 - An identified dynamic model of the first arm, with friction [29].
 
-Noise of 0.01 % of a joint's largest torque gives the first arm's tool the noise of its data sheet; friction of 0.02 %
-stays within its repeatability. Offsets and errors of the model are much larger before the tare: newtons at the tool.
+Noise of 0.01 % of a joint's largest torque gives the tool noise in the first arm's data sheet; friction of 0.02 % stays
+within the arm's repeatability. Before the tare, offsets and model errors are much larger: newtons at the tool.
 Strain gauges drift with temperature, but hardly within one episode. docs/concepts/sensors.md has the resulting
 errors of each arm.
 """

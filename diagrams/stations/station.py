@@ -270,7 +270,7 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
 
 
 def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple[MultibodyPlant, SceneGraph]:
-    """Add a plant with the settings that all stations share; others are those of `MultibodyPlantConfig`."""
+    """Add a plant with the settings that all stations share; `config` holds others of `MultibodyPlantConfig`."""
     shared = {"discrete_contact_approximation": "lagged", "use_sampled_output_ports": False}  # see `TaskDiagram`
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared, **config), builder)
 
@@ -312,7 +312,7 @@ def export_station_ports(
     max_wrench: InputPort | None = None,
     **outputs: OutputPort,
 ) -> None:
-    """Export the ports of every station, `OUTPUTS` by name, and `max_wrench` if it has a bounded impedance."""
+    """Export the `INPUTS` and `OUTPUTS` of a station, and `max_wrench` if its impedance is bounded."""
     if max_wrench is not None:
         builder.ExportInput(max_wrench, "max_wrench")
     builder.ExportInput(desired_pose, "desired_pose")

@@ -192,7 +192,7 @@ class InsertionTask(Task):
 
 
 def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransform, RigidTransform]:
-    """Return the actual target frame in the nominal one, and the workpiece in the tool, of a task's sampled offsets.
+    """Return the poses of the actual target frame in the nominal one, and of the workpiece in the tool, from offsets.
 
     Args:
         fixture: (x, y) of the fixture [m], and its turn about z [rad] if it has one.
@@ -232,8 +232,8 @@ def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
 def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
 
-    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components along and about
-    the axis of pose and wrench are unchanged.
+    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components of pose and
+    wrench along and about the axis are unchanged.
 
     Returns:
         Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if

@@ -61,7 +61,7 @@ class PipelinedLearner(Learner):
             waits: Start an episode only when the weights that it should have are learned.
             excluded: Terminations of episodes that are not learned from.
             niceness: Niceness of the training process.
-            imports: Modules or files (.py) that register what is not installed, such as the learner.
+            imports: Modules or files (.py) that register entries of no installed package, such as a learner.
 
         Raises:
             InputError: If the learner is not an `OffPolicyLearner`.
@@ -238,7 +238,7 @@ def _serve(
     # Requests are read at once: two processes that write into full pipes would deadlock, and a robot must not wait.
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     if imports:
-        from guiderail.tools.imports import import_modules  # Drake takes a second
+        from guiderail.tools.imports import import_modules  # imports Drake, which takes a second
 
         import_modules(imports)
     learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)

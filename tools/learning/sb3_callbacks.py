@@ -24,7 +24,7 @@ class Sb3Callbacks(Callback):
         """Construct the callback for one or several callbacks of Stable-Baselines3.
 
         Raises:
-            InputError: If the learner has no model of Stable-Baselines3, or a callback is another object.
+            InputError: If the learner has no model of Stable-Baselines3, or a callback is not a `BaseCallback`.
         """
         model = getattr(learner, "model", None)
         if model is None:

@@ -39,7 +39,7 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """Training run, read from its folder; where a function takes the folder, it takes the run.
+    """Training run, read from its folder; functions that take the folder also take the run.
 
     Attributes:
         path: Folder of the run.
@@ -205,8 +205,8 @@ def configure(
 ) -> RunConfig:
     """Return a checked configuration with everything resolved.
 
-    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. By default, the
-    algorithm is that of the preset, and the preset that of the algorithm; `with_defaults` supplies those of the task.
+    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. The algorithm
+    defaults to the preset's, and the preset to the algorithm's; `with_defaults` supplies the task's.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.
@@ -224,7 +224,7 @@ def configure(
 def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Complete the arguments of `configure` with the learner that the task declares.
 
-    The task's learner is used if neither `algorithm` nor `preset` is given; given `settings` replace single ones of it.
+    The task's learner is used if neither `algorithm` nor `preset` is given; `settings` override its settings by name.
     """
     has_learner = given.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     learner: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)

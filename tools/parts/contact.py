@@ -24,7 +24,7 @@ MAX_MODULUS = 5e10
 SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded depth below the target; the first that seats the plug is used
 MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug
-MIN_SPEED = 2.0  # smallest real-time factor at which penetration is reduced further
+MIN_SPEED = 2.0  # smallest desired real-time factor
 MAX_TRIALS = 5  # settings tried for each compliant part
 MIN_TIME_STEP = 0.0025  # time step that is not halved further [s]
 TRIAL_SECONDS = 20.0  # CPU time of a part's trials after which no further trial starts [s]
@@ -82,7 +82,7 @@ class Choice:
 
     @property
     def deepest(self) -> float:
-        """Largest penetration in all trials, those with the plug on the rim included [m]."""
+        """Largest penetration in all trials, including those with the plug on the rim [m]."""
         return max(trial.penetration for trial in self.trials)
 
     @property
@@ -157,7 +157,7 @@ def choose_contact(
 def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
     """Return a sort key, larger is better: seated plug, allowed penetration, and at least `MIN_SPEED`, in this order.
 
-    If these agree, the faster contact is better if its penetration is allowed, and otherwise the one with less.
+    Ties are broken by the larger speed if the penetration is allowed, otherwise by the smaller penetration.
     `allowed` is the largest allowed penetration [m].
     """
     seats = bool(choice.aligned.success)
@@ -184,7 +184,7 @@ def _make_station(folder: Path, file: Any) -> None:
 def _adapt_settings(
     folder: Path, contact: Contact, make_file: MakeFile, allowed: float, log: Callable[[str], None]
 ) -> list[Choice]:
-    """Return the choices tried, each with settings derived from the penetration measured with the previous ones.
+    """Return the choices tried; the settings of each follow from the penetration of the previous one.
 
     Penetration that remains while the plug is pushed at rest needs a larger modulus. Transient penetration is an
     overshoot proportional to the time step. The dissipation is that of `Piece`, because less would eject the plug.
@@ -230,7 +230,7 @@ def _try_contact(folder: Path, contact: Contact, make_file: MakeFile) -> Choice:
             file = make_file(contact, push)
             aligned = insert(folder, file, snapping=contact.snapping_pieces)
             if aligned.success and aligned.lowest < -file.tolerance.height:
-                # Nothing stops the plug at the target, and a push would move it on.
+                # Nothing stops the plug at the target: a push would move it past the target.
                 alternative = make_file(contact, 0.0)
                 unpushed = insert(folder, alternative, snapping=contact.snapping_pieces)
                 if unpushed.success:

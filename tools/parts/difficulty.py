@@ -23,7 +23,7 @@ from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.rollout import rollout
 
 MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates of random actions and of the search in a hard setting
-SEED = 3_000_000  # seed of the first episode, with conditions of training
+SEED = 3_000_000  # seed of the first episode; conditions are sampled as in training
 REACH = 1.9 * MM  # displacement of the command by an action of 1 at action_scale 1 [m]
 MARGIN = 0.75 * MM  # distance from the offset to the bound of commands [m]
 MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # least force limit [N]; force limit over the peak force of an aligned insertion
@@ -101,8 +101,8 @@ def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, b
     """Return one of `SETTINGS` with its score, and whether it has the required success rates.
 
     Starting at the index `FIRST`, settings are tried in the direction of the required success rates until one has them,
-    the direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned,
-    and the easiest of several.
+    the direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned;
+    of several, the easiest.
     """
     tried: dict[int, Score] = {}
     number = FIRST
@@ -200,7 +200,7 @@ def calibrate(
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = turn_of(None if clearance is None else clearance * MM, radius)
     try:
-        read_task_file(folder).demonstrations.reference(folder)  # as rounded in the file; cached for the child
+        read_task_file(folder).demonstrations.reference(folder)  # with the file's rounded numbers; cached for the child
         setting, score, is_hard = run_isolated(
             _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
         )
@@ -223,7 +223,7 @@ def calibrate(
     log(
         f"difficulty=hard: socket {nearest / MM:.2f} to {farthest / MM:.2f} mm off, turned by up to {turn:g}°, force "
         f"limit {force_limit:g} N, {seconds:.1f} s: {score}"
-        + ("" if is_hard else f"; no setting has at most {MAX_RANDOM:.0%} and at least {MIN_SCRIPTED:.0%}")
+        + ("" if is_hard else f"; no setting has ≤ {MAX_RANDOM:.0%} random and ≥ {MIN_SCRIPTED:.0%} scripted successes")
     )
     return file.model_copy(update={"hard": options, "measured": {**file.measured, "hard": result}})
 

@@ -170,7 +170,7 @@ class MeshcatSupervisor(Supervisor):
         return values if values.any() else None
 
     def label(self) -> str | None:
-        """Return the last label that was clicked since the last call."""
+        """Return a label that was clicked since the last call, the last one in `LABELS` of several, or None."""
         label, self._is_stop_pending = "stop" if self._is_stop_pending else None, False
         for button, clicked in LABELS.items():
             if self.panel.take_clicks(button):

@@ -36,7 +36,7 @@ def curve(data: ReportData, task: str, column: str, label: str) -> str:
 
 
 def survival_curve(data: ReportData, task: str) -> str:
-    """Return the fraction of runs that have not converged over the training episodes (Kaplan and Meier)."""
+    """Return the Kaplan-Meier curve: fraction of runs not yet converged, over the training episodes."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, SIZE)
         axis = axes[0, 0]
@@ -94,7 +94,7 @@ def _label(name: str, runs: list[Run]) -> str:
 
 
 def _svg(figure: Any, description: str) -> str:
-    """Return the SVG element of a figure, which scales with its width."""
+    """Return a figure as an SVG element, which keeps its aspect ratio at any width."""
     content = io.StringIO()
     figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     text = content.getvalue()

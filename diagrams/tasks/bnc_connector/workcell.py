@@ -73,7 +73,7 @@ class BncWorkcell(MovableWorkcell):
         plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOR)
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Allow contacts of barrel and bore, lugs and slots, and pad and seat only."""
+        """Allow only contacts of barrel with bore, lugs with slots, and pad with seat."""
         exclude_contacts(plant, scene_graph, "jack", "plug", FILTERED_PAIRS)
 
     def fixture_surfaces(self) -> list[Surface]:
@@ -97,7 +97,7 @@ class BncWorkcell(MovableWorkcell):
 
     @staticmethod
     def is_locked(X_LockedPlug: RigidTransform) -> bool:
-        """Return True if a plug is within 0.6 mm along and 4 degrees about the axis of the locked pose.
+        """Return True if a plug is within 0.6 mm of the locked pose along its axis, and 4 degrees about it.
 
         The lugs are then past the apex of the slots, and only a torque unlocks the plug.
         """

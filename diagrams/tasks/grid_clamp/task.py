@@ -39,15 +39,15 @@ if TYPE_CHECKING:
 STICTION_TOLERANCE = 1e-5
 """Largest creep of a sticking contact [m/s].
 
-A clamp that stands next to its holes, pressed with 27 N and pushed sideways with 2 N, a third of the friction limit,
-drifts at 0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s this drift
-decides whether the clamp slips in by itself or stands still.
+A clamp next to its holes is pressed with 27 N and pushed sideways with 2 N, a third of the friction limit. It drifts at
+0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s this drift decides
+whether the clamp slips in by itself or stands still.
 """
 SEATED_HEIGHT = 0.5e-3  # [m] height below which a clamp has snapped in
 SEATED_OFFSET = 1.0e-3  # [m] largest lateral offset of a seated clamp
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
-# All pairs of surfaces except a peg and its own hole, bead and lip, and pad and slab.
+# All pairs of surfaces except each peg with its own hole, bead with lip, and pad with slab.
 FILTERED_PAIRS = [
     *(((hole,), tuple(peg for peg in PEGS if peg[-1] != hole[-1])) for hole in HOLES),
     (HOLES, ("bead", "pad")),
@@ -86,7 +86,7 @@ class GridClampWorkcell(MovableWorkcell):
         super().add_fixture(plant)
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Allow contacts of each peg and its hole, bead and lip, and pad and slab only."""
+        """Allow only contacts of each peg with its hole, bead with lip, and pad with slab."""
         exclude_contacts(plant, scene_graph, "table", "clamp", FILTERED_PAIRS)
 
     def fixture_surfaces(self) -> list[Surface]:
@@ -106,8 +106,8 @@ class GridClampWorkcell(MovableWorkcell):
 
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
-# Reward per distance gained towards the holes' axis [1/m], large because steps are fractions of a millimeter; and
-# terminal reward of a collision: ending an episode at once must not cost less than pressing gently for long.
+# Reward per distance gained towards the holes' axis [1/m], large because steps are fractions of a millimeter.
+# Terminal reward of a collision, so that ending an episode at once does not cost less than pressing gently for long.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
 
@@ -242,9 +242,9 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 class GridClamp(InsertionTask):
     """Insert the clamp.
 
-    Rewards: "shaped" is the thesis's reward (3.11, 3.12); "no_force" omits its cost of force, and "sparse" its distance
-    gained downwards. "aligned" adds to "shaped" a cost of collisions and the distance gained towards the holes' axis, a
-    privileged value that the policy does not observe.
+    Rewards: "shaped" is the thesis's reward (3.11, 3.12). "no_force" omits its cost of force, and "sparse" omits its
+    reward for descending. "aligned" adds to "shaped" a cost of collisions and the distance gained towards the holes'
+    axis, a privileged value that the policy does not observe.
     Without `active_constraints`, only the impedance limits the forces of a policy.
     """
 
@@ -324,7 +324,7 @@ class GridClamp(InsertionTask):
         return terms
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Return success when seated, and collision above the force limit."""
+        """Return success of a seated clamp, and collision above the force limit."""
         seated = TerminationTerm(
             "success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=self.steps_of(SEATED_STEPS)
         )
@@ -348,7 +348,7 @@ class GridClamp(InsertionTask):
         return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.17, height=0.075))
 
     def scene(self) -> Scene:
-        """Return the cuboid of commands, up to the start height."""
+        """Return the drawing of the cuboid that bounds commands, up to the start height."""
         to_world, parameters = in_frame(self._workcell.X_WT), make_template().parameters
         half = 0.5 * parameters["width_m"]
         edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))

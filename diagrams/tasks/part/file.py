@@ -1,4 +1,4 @@
-"""File `task.yaml` of a task folder: every number of a task of two meshes, to be read and edited by users."""
+"""File `task.yaml` of a task folder: all numbers of a task with two parts, which users can read and edit."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class MotionNumbers(Options):
     rim: Number = Field(gt=0, le=0.5, description="height at which the plug stands on the rim [m]")
     turn: Number = Field(0.0, ge=-180, le=180, description="turn about z at the bottom [degrees]")
     push: Number = Field(
-        4.0 * MM, ge=0, le=30 * MM, description="depth of the command below the target while it is inserted [m]"
+        4.0 * MM, ge=0, le=30 * MM, description="depth of the command below the target during the insertion [m]"
     )
     press: Number = Field(
         2.5 * MM, ge=0, le=10 * MM, description="depth of the command below the rim during a search [m]"
@@ -160,7 +160,7 @@ class Bounds(Options):
         return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
 
     def constraints(self, num_steps: int) -> LinearConstraints:
-        """Return the bounds as G y ≥ c, constant or for each of `num_steps` steps by its phase."""
+        """Return the bounds as G y ≥ c: constant, or those of the phase of each of `num_steps` steps."""
         lower, upper = self.arrays()
         if self.phases is None:
             return LinearConstraints.box(lower, upper)
@@ -178,7 +178,7 @@ def _is_row(row: Any) -> bool:
 
 
 def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
-    numbers = np.array(rows, dtype=float)  # None becomes NaN, which no bound is
+    numbers = np.array(rows, dtype=float)  # None becomes NaN; no bound is NaN
     return np.where(np.isnan(numbers), missing, numbers)
 
 
@@ -207,7 +207,7 @@ class Recommended(Options):
     environment: dict[str, Any] = Field(
         {
             "fixture_offset": "per_episode",
-            "offset_range": (1.5 * MM, 2.0 * MM),  # a straight insertion must fail, and the bounds must allow it
+            "offset_range": (1.5 * MM, 2.0 * MM),  # a straight insertion must fail; the bounds must allow the offsets
             "observation": "center_of_pressure",
             "reward": "aligned",
             "action_repeat": 5,
@@ -300,7 +300,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
     """
     path = folder / FILE_NAME
     if not folder.is_dir():
-        raise InputError(f"there is no task folder {folder}: restore it, or make it by guiderail create-task")
+        raise InputError(f"there is no task folder {folder}: restore it, or create it with guiderail create-task")
     if not path.is_file():
         raise InputError(f"{folder} is no task: it has no {FILE_NAME}; guiderail create-task makes one")
     data = load_yaml(path, "task")
