@@ -13,7 +13,7 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.parts.solids import to_arrays
 
-MAX_PIECES = 150
+MAX_PIECES = 300  # the base of two gears with a third between them has 282
 _SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding error
 _CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its hull
 _FLAT = 1e-2  # angle below which an edge does not count as concave [rad]

@@ -17,6 +17,7 @@ SEARCH = 1.8  # time on the rim [s]
 PAUSE = 0.3  # time after each part of the motion [s]
 NUM_DEMONSTRATIONS = 10  # with five, the variance changes by a factor of four along the search
 SPREAD = 1.7 * MM  # distance from the nominal place at which the sockets of the demonstrations are, on a circle [m]
+_ANGLES = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS  # of the sockets on the circle [rad]
 
 # Standard deviations of the hand [m, rad]: wide on the rim, narrow where the parts guide the motion.
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
@@ -74,13 +75,14 @@ def plan_search(travel: float, rim: float, turn: float, push: float, press: floa
 
 
 def demonstrator_motions(
-    seed: int, script: tuple[np.ndarray, np.ndarray], press_from: float, times: np.ndarray
+    seed: int, script: tuple[np.ndarray, np.ndarray], press_from: float, times: np.ndarray, search_turn: float = 0.0
 ) -> np.ndarray:
     """Return different searches (D, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
     The random deviations are wide while the command is above the height `press_from` [m]. Below it, each search ends at
     a socket of its own (`socket_offsets`), so that the variance of the demonstrations is that of the socket's place,
-    and actions can follow a displaced socket down to the target.
+    and actions can follow a displaced socket down to the target. With a `search_turn` [rad] the sockets are also turned
+    (`socket_turns`), and each motion has its socket's turn from the start.
     """
     rng = np.random.default_rng(seed)
     script_times, poses = script
@@ -94,13 +96,21 @@ def demonstrator_motions(
     nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
     motions = nominal + scale * wander
     motions[:, :, :2] += (1.0 - wide) * socket_offsets()[:, None, :]
+    motions[:, :, 3] += socket_turns(search_turn)[:, None]
     return motions
 
 
 def socket_offsets() -> np.ndarray:
     """Return the offsets (x, y) of the sockets of the demonstrations, (D, 2) [m]; their mean is zero."""
-    angles = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS
-    return SPREAD * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return SPREAD * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+
+
+def socket_turns(largest: float) -> np.ndarray:
+    """Return the turns (D,) [rad] of the sockets of the demonstrations, up to the `largest` one either way.
+
+    Their mean is zero, and they are not correlated with the offsets.
+    """
+    return largest * np.cos(3.0 * _ANGLES)
 
 
 def _poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray]:

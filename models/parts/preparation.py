@@ -22,7 +22,7 @@ MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decima
 NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at without walls that face each other [m]
 MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [m]
 _THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
-MAX_YAW = 0.1  # largest rotation of the plug about its axis in a search, which widens the margin [rad]
+MAX_YAW = 0.1  # rotation of the plug about its axis in a search, if it is small, which widens the margin [rad]
 CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
 _FIRST_FRACTION = 0.7  # fraction of the remaining tolerance at the first attempt; `manifold3d` may exceed its bound
@@ -64,7 +64,13 @@ def decimate(part: Part, tolerance: float) -> tuple[Part, float]:
 
 
 def prepare_surfaces(
-    plug: Part, socket: Part, motion: InsertionMotion, tolerance: float, moved: float, snapping: frozenset[int]
+    plug: Part,
+    socket: Part,
+    motion: InsertionMotion,
+    tolerance: float,
+    moved: float,
+    snapping: frozenset[int],
+    yaw: float = MAX_YAW,
 ) -> tuple[ContactSurface, ContactSurface]:
     """Return the contact surfaces of both parts.
 
@@ -75,12 +81,13 @@ def prepare_surfaces(
         tolerance: Largest deviation of the result from the drawing [m].
         moved: Deviation of the given parts from the drawing [m].
         snapping: Indices of bodies of the plug that deflect; they are neither united nor cropped.
+        yaw: Largest rotation of the plug in the socket about its axis in a search [rad].
     """
     plug_solids, socket_solids = make_solids(plug), make_solids(socket)
     rigid = _unite([solid for number, solid in enumerate(plug_solids) if number not in snapping])
     fixed = _unite(socket_solids)
     radius = float(np.hypot(*plug.corners[:, :2].T).max())
-    margin = 1e3 * (MARGIN + MAX_YAW * radius)
+    margin = 1e3 * (MARGIN + yaw * radius)
     remaining = 1e3 * (tolerance - moved)  # [mm]
     surfaces = []
     for part, whole, other, extra in (

@@ -127,6 +127,9 @@ def create_task(
     turn: Annotated[
         float, option("Rotation of the plug at the bottom [degrees]; its mesh must be in the rotated pose.")
     ] = 0.0,
+    search_turn: Annotated[
+        float, option("Largest unknown turn of the socket [degrees]; actions then turn the plug, too.")
+    ] = 0.0,
     shrink: Annotated[float, option("Distance by which the plug's surface is moved inwards [mm].")] = 0.0,
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,
     friction: Annotated[float, option("Friction coefficient of all surfaces.")] = 0.2,
@@ -154,6 +157,7 @@ def create_task(
         axis=axis,
         center=None if center is None else cli.parse_floats(center, 3, "--center"),
         turn=turn,
+        search_turn=search_turn,
         shrink=1e-3 * shrink,
         force_limit=force_limit,
         friction=friction,

@@ -30,7 +30,7 @@ from guiderail.models.parts.assembly_check import (
 from guiderail.models.parts.assembly_check import shrink as shrink_part
 from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
-from guiderail.models.parts.preparation import ContactSurface, choose_tolerance, decimate, prepare_surfaces
+from guiderail.models.parts.preparation import MAX_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact, cpu_time
@@ -43,6 +43,8 @@ DENSITY = 2700.0  # density of a part, that of aluminum [kg/m³]; a gantry is we
 CLEAR = 3.0 * MM  # height of the start above the rim
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
+MAX_SEARCH_TURN = 10.0  # largest unknown turn of the socket [degrees]
+COMMANDED_TURN = 1.5  # bound of the commanded turn, as a multiple of the unknown turn of the socket
 MAX_FORCE = 1e4  # largest force limit [N]
 MAX_SEATED_TURN = 20.0  # largest turn of a seated plug if the insertion has no turn [degrees]
 MAX_EPISODES = 100  # largest number of episodes of a calibration
@@ -112,6 +114,7 @@ def create_task(
     axis: str = "+z",
     center: Sequence[float] | None = None,
     turn: float = 0.0,
+    search_turn: float = 0.0,
     shrink: float = 0.0,
     force_limit: float = COLLISION_FORCE,
     friction: float = 0.2,
@@ -132,6 +135,8 @@ def create_task(
         out: Folder; it must not exist.
         turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; the files show
             the plug after it.
+        search_turn: Largest unknown turn of the socket [degrees]; if positive, actions also turn the plug, for example
+            to find the teeth of gears.
         shrink: Distance by which the plug's surface is moved inwards [m].
         force_limit: Contact force that ends an episode as a collision [N].
         friction: Friction coefficient of all surfaces.
@@ -145,7 +150,7 @@ def create_task(
         InputError: If the parts cannot be used; no folder is left then.
     """
     check_new(out, "folder with --out, or remove it")
-    _check_arguments(plug_pose, turn, shrink, force_limit, friction, scenario, hard_episodes)
+    _check_arguments(plug_pose, turn, search_turn, shrink, force_limit, friction, scenario, hard_episodes)
     start = cpu_time()
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     for part in parts:
@@ -162,11 +167,13 @@ def create_task(
     tolerance = choose_tolerance(clearance)
     (lean_plug, first), (lean_socket, second) = (decimate(part, tolerance) for part in parts)
     snapping = _snapping(lean_plug, lean_socket, path, first + second)
-    both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, max(first, second), snapping)
+    yaw = max(MAX_YAW, (1.0 + COMMANDED_TURN) * search_turn * DEGREE)
+    both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, max(first, second), snapping, yaw)
     surfaces = dict(zip(("plug", "socket"), both, strict=True))
     deviation = max(surface.deviation for surface in both)
     log(_describe_surfaces(parts, both, deviation, clearance))
-    sides = find_symmetries(lean_plug, lean_socket, path)
+    # Symmetries leave a turn unchanged, but a reflection would reverse the one that a policy searches.
+    sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path)
     log(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
     prepared = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
@@ -176,7 +183,7 @@ def create_task(
         "preparation_s": _seconds_since(start),
     }
     values = {"name": out.name, "force_limit": force_limit, "friction": friction, "path": path, "sides": sides}
-    values["scenario"] = tuple(file.name for file in scenario)
+    values.update(scenario=tuple(file.name for file in scenario), search_turn=search_turn)
     with atomic_folder(out) as folder:
         for file in scenario:
             shutil.copy(file, folder / file.name)
@@ -220,6 +227,7 @@ def _describe_surfaces(
 def _check_arguments(
     plug_pose: Sequence[float],
     turn: float,
+    search_turn: float,
     shrink: float,
     force_limit: float,
     friction: float,
@@ -231,6 +239,8 @@ def _check_arguments(
         raise InputError(f"--plug-pose is finite, not {list(plug_pose)}")
     if not abs(turn) <= MAX_TURN:
         raise InputError(f"--turn is at most {MAX_TURN:g} degrees either way, not {turn:g}")
+    if not 0.0 <= search_turn <= MAX_SEARCH_TURN:
+        raise InputError(f"--search-turn is from 0 to {MAX_SEARCH_TURN:g} degrees, not {search_turn:g}")
     if not 0.0 < force_limit <= MAX_FORCE:
         raise InputError(f"--force-limit is positive and at most {MAX_FORCE:g} N, not {force_limit:g}")
     if not 0.0 <= shrink <= MAX_SHRINK:
@@ -377,7 +387,13 @@ def _task_file(
         scenario=values["scenario"],
         motion=validate_options(
             MotionNumbers,
-            {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push},
+            {
+                "travel": path.travel,
+                "rim": path.rim,
+                "turn": float(path.turn / DEGREE),
+                "search_turn": values["search_turn"],
+                "push": push,
+            },
             "a motion",
         ),
         # Without a turn at the end, the walls accept the orientation of a plug at full depth, or any orientation fits.
@@ -386,8 +402,20 @@ def _task_file(
         time_step=contact.time_step,
         sides=values["sides"][0],
         rim_sides=values["sides"][1],
+        **_turning(values["search_turn"]),
     )
     return validate_options(PartTaskFile, content, "a task of parts")
+
+
+def _turning(search_turn: float) -> dict[str, Any]:
+    """Return the values of a task file for actions that also turn the plug; empty without an unknown turn."""
+    if not search_turn:
+        return {}
+    from guiderail.diagrams.tasks.part.file import PartTaskFile
+
+    lateral, turn = PartTaskFile.model_fields["bounds"].default, COMMANDED_TURN * search_turn * DEGREE
+    lower, upper = ((*row[:3], sign * turn, *row[4:]) for row, sign in ((lateral.lower, -1.0), (lateral.upper, 1.0)))
+    return {"action_dims": (0, 1, 3), "bounds": {"lower": lower, "upper": upper}}
 
 
 def _size(part: Part) -> str:

@@ -198,7 +198,7 @@ def calibrate(
     """
     clearance = file.measured.get("clearance_mm")
     force_limit = force_limit_of(file, float(file.measured["force"]))
-    turn = turn_of(None if clearance is None else clearance * MM, radius)
+    turn = file.motion.search_turn or turn_of(None if clearance is None else clearance * MM, radius)
     try:
         read_task_file(folder).demonstrations.reference(folder)  # with the file's rounded numbers; cached for the child
         setting, score, is_hard = run_isolated(

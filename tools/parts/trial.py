@@ -23,10 +23,11 @@ from guiderail.diagrams.tasks.part.file import PartModel, PartTaskFile
 from guiderail.diagrams.tasks.part.task import PLUG, SOCKET, write_workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.common.transforms import DEGREE
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.objects.sdf import TriangleMesh
-from guiderail.models.parts.demonstrator import demonstrator_motions, socket_offsets
+from guiderail.models.parts.demonstrator import demonstrator_motions, socket_offsets, socket_turns
 from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
 from guiderail.models.parts.solids import SurfaceLocator
@@ -243,14 +244,16 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
     numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
     press_from = numbers.rim - numbers.press - 1e-3
-    sessions = [demonstrator_motions(seed, script, press_from, times) for seed in range(MAX_SESSIONS)]
+    search_turn = numbers.search_turn * DEGREE
+    sessions = [demonstrator_motions(seed, script, press_from, times, search_turn) for seed in range(MAX_SESSIONS)]
+    sockets = np.column_stack([socket_offsets(), socket_turns(search_turn)])
     start = time.process_time()
     chosen: list[np.ndarray] = []
     seated = 0
-    for attempts, offset in zip(zip(*sessions, strict=True), socket_offsets(), strict=True):
+    for attempts, socket in zip(zip(*sessions, strict=True), sockets, strict=True):
         for motion in attempts:
             in_time = time.process_time() - start < DEMONSTRATION_SECONDS
-            if in_time and _seats(folder, file, times, motion, offset):
+            if in_time and _seats(folder, file, times, motion, socket):
                 chosen.append(motion)
                 seated += 1
                 break
@@ -260,9 +263,12 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
     return seated
 
 
-def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, offset: np.ndarray) -> bool:
-    """Return whether a motion seats the plug in a socket that is displaced by `offset` (x, y) [m]."""
-    in_socket = motion - np.pad(offset, (0, motion.shape[1] - 2))  # on a gantry the same as displacing the socket
+def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, socket: np.ndarray) -> bool:
+    """Return whether a motion seats the plug in a socket at (x, y, Rz) [m, rad]."""
+    in_socket = motion.copy()  # on a gantry, the motion in the socket's frame is the same as displacing the socket
+    cosine, sine = np.cos(socket[2]), np.sin(socket[2])
+    in_socket[:, :2] = (motion[:, :2] - socket[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
+    in_socket[:, 3] -= socket[2]
     driven, _ = drive_along(GantryStation(write_workcell(folder, file), time_step=file.time_step), times, in_socket)
     return file.tolerance.accepts(_plug_pose(driven))
 

@@ -87,6 +87,9 @@ class MotionNumbers(Options):
     travel: Number = Field(gt=0, le=0.5, description="height of the start above the target [m]")
     rim: Number = Field(gt=0, le=0.5, description="height at which the plug stands on the rim [m]")
     turn: Number = Field(0.0, ge=-180, le=180, description="turn about z at the bottom [degrees]")
+    search_turn: Number = Field(
+        0.0, ge=0, le=10, description="largest unknown turn of the socket, which a search must find [degrees]"
+    )
     push: Number = Field(
         4.0 * MM, ge=0, le=30 * MM, description="depth of the command below the target during the insertion [m]"
     )
@@ -230,6 +233,7 @@ class SearchNumbers(Options):
         description="1 if the center of pressure lies towards the socket's axis, -1 if away from it, as measured",
     )
     speed: Number = Field(2.0, gt=0, le=10, description="change of the action [1/s]")
+    turn_speed: Number = Field(0.5, gt=0, le=10, description="change of the action that turns the plug [1/s]")
 
 
 class PartTaskFile(Options):

@@ -166,9 +166,11 @@ class ScriptedSearch:
     """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
 
     Below the rim, while it is not blocked, the command follows the plug sideways, so that it does not push it against a
-    wall. An episode starts where the observed time does not increase; the action is then zero. The search integrates
-    the action and not the displacement, because the displacement per action depends on the guidance and changes during
-    the motion.
+    wall. If the task has a `search_turn`, a third action turns a blocked plug to and fro.
+
+    An episode starts where the observed time does not increase; the action is then zero. The search integrates the
+    action and not the displacement, because the displacement per action depends on the guidance and changes during the
+    motion.
     """
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
@@ -176,10 +178,11 @@ class ScriptedSearch:
         self._file, self._duration = file, duration
         self._times, poses = file.motion.plan_search()
         self._heights = poses[:, 2]
-        self._time, self._action = np.inf, np.zeros(2)
+        self._time, self._size, self._direction = np.inf, 3 if file.motion.search_turn else 2, 1.0
+        self._action = np.zeros(self._size)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return an action (2,) for an observation with the center of pressure.
+        """Return an action, (2,) or (3,) with a `search_turn`, for an observation with the center of pressure.
 
         Raises:
             InputError: If the observation has no center of pressure.
@@ -189,16 +192,19 @@ class ScriptedSearch:
         time = 0.5 * (float(observation[TIME]) + 1.0) * self._duration()
         passed = time - self._time
         if passed <= 0.0:
-            self._action, passed = np.zeros(2), 0.0
+            self._action, self._direction, passed = np.zeros(self._size), 1.0, 0.0
         self._time = time
         lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
         height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
         on_rim, search = height > self._file.motion.rim - IN_SOCKET, self._file.search
-        change = np.zeros(2)
+        change = np.zeros(self._size)
         if length > 0.0 and (on_rim or height - np.interp(time, self._times, self._heights) > BLOCKED):
-            change = search.lever_sign * search.speed * lever / max(length, MM)
+            change[:2] = search.lever_sign * search.speed * lever / max(length, MM)
+            if abs(self._action[-1]) >= 1.0:
+                self._direction = -np.sign(self._action[-1])
+            change[2:] = self._direction * search.turn_speed
         elif not on_rim:
-            change = FOLLOWING * (observation[POSITION] - observation[COMMAND])
+            change[:2] = FOLLOWING * (observation[POSITION] - observation[COMMAND])
         self._action = np.clip(self._action + passed * change, -1.0, 1.0)
         return self._action.copy()
 
@@ -270,7 +276,8 @@ class PartInsertion(DemonstratedInsertion):
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
-        scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
+        scale_of_turn = max(abs(turn), 3 * DEGREE, self.file.motion.search_turn * DEGREE)
+        scale = np.array([2 * MM, 2 * MM, height, scale_of_turn, 1.5 * DEGREE, 1.5 * DEGREE])
         return self.scaled_terms(center, scale, WRENCH_SCALE)
 
     def termination_terms(self) -> list[TerminationTerm]:

@@ -7,6 +7,7 @@ from guiderail.models.parts.demonstrator import (
     demonstrator_motions,
     plan_search,
     socket_offsets,
+    socket_turns,
 )
 
 RIM, PRESS = 20.0 * MM, 2.5 * MM
@@ -34,3 +35,16 @@ def test_motions_depend_on_the_seed_alone():
     first, again, other = (demonstrator_motions(seed, script, RIM, times) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0.1 * MM
+
+
+def test_sockets_are_turned_evenly_and_independently_of_their_offsets():
+    turns = socket_turns(0.08)
+    assert np.abs(turns).max() == 0.08
+    assert turns.std() > 0.7 * 0.08  # an action reaches far
+    np.testing.assert_allclose(np.column_stack([np.ones(len(turns)), socket_offsets()]).T @ turns, 0.0, atol=1e-12)
+    script = plan_search(30.0 * MM, RIM, 0.0, 4.0 * MM, PRESS)
+    times = np.arange(0.0, script[0][-1], 0.02)
+    straight, turned = (demonstrator_motions(0, script, RIM, times, turn) for turn in (0.0, 0.08))
+    expected = np.zeros((NUM_DEMONSTRATIONS, 1, 6))
+    expected[:, 0, 3] = turns
+    np.testing.assert_allclose(turned - straight, np.broadcast_to(expected, straight.shape), atol=1e-12)

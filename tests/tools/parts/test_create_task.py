@@ -268,6 +268,56 @@ def test_scripted_search_below_the_rim(folder):
     assert act(time + 0.05, inserted + BLOCKED + 1e-3) - start == pytest.approx(-0.05 * file.search.speed)  # blocked
 
 
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory):
+    """Task folder of the same part whose socket is turned by up to 4.5°."""
+    where = tmp_path_factory.mktemp("turning")
+    plug, socket = PARTS["square_peg"]().write(where)
+    create_task(plug, socket, where / "turning_peg", unit="mm", search_turn=4.5, hard_episodes=1)
+    return where / "turning_peg"
+
+
+def test_unknown_turn_of_the_socket_is_demonstrated_and_within_reach_of_actions(turning):
+    from guiderail.diagrams.envs.config import EnvConfig
+    from guiderail.models.primitives import Demonstrations
+
+    task = EnvConfig.resolve(str(turning), {"difficulty": "hard"}).make_task()
+    options = SimpleNamespace(held_out=False, new_run=False, offset=None)
+    rng = np.random.default_rng(0)
+    turns = np.rad2deg([task.offsets.draw(rng, options)[0][2] for _ in range(200)])
+    assert 4.3 < np.abs(turns).max() <= 4.5
+    assert list(task.action_dims()) == [0, 1, 3]
+    limit = np.rad2deg(task.constraints().nearest(np.full(6, 1.0))[3])
+    assert limit == pytest.approx(6.75)  # beyond the turn, because the grip is elastic
+    outputs = np.array(Demonstrations.load(turning / "demonstrations.npz").outputs)
+    assert np.rad2deg(outputs[:, -1, 3].std()) > 2.5
+    assert task.symmetry() is None  # a reflection would reverse the turn
+
+
+def test_scripted_search_turns_a_blocked_plug_to_and_fro(turning):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.diagrams.tasks.part.task import CENTER_OF_PRESSURE, TIME, ScriptedSearch, Z
+
+    file = read_task_file(turning)
+    search, observation = ScriptedSearch(file, lambda: 20.0), np.zeros(17)
+    observation[CENTER_OF_PRESSURE] = 1.0, 0.0
+    observation[Z] = file.motion.rim / (0.5 * file.motion.travel) - 1.0
+    turns = []
+    for time in np.arange(0.0, 20.0, 0.1):
+        observation[TIME] = 0.1 * time - 1.0
+        turns.append(search(observation)[2])
+    assert (min(turns), max(turns)) == (-1.0, 1.0)
+    assert np.abs(np.diff(turns)).max() <= 0.1 * file.search.turn_speed + 1e-9
+    observation[TIME] = -1.0
+    np.testing.assert_array_equal(search(observation), np.zeros(3))  # another episode
+
+
+def test_unknown_turn_beyond_the_range_is_refused(tmp_path):
+    for turn in (-1.0, 10.1, np.nan):
+        with pytest.raises(InputError, match="--search-turn is from 0 to 10 degrees"):
+            create_task(tmp_path / "a.stl", tmp_path / "b.stl", tmp_path / "peg", unit="mm", search_turn=turn)
+
+
 def test_options_of_a_created_task_are_listed(folder, capsys):
     call("list", folder)
     assert "offset_range" in capsys.readouterr().out

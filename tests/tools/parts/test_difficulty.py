@@ -120,7 +120,8 @@ def test_episode_ends_when_the_plug_stays_on_the_rim():
 
 def test_failed_calibration_keeps_the_default(monkeypatch, tmp_path):
     sentences = []
-    file = SimpleNamespace(measured={"force": 5.0, "clearance_mm": None}, force_limit=35.0)
+    motion = MotionNumbers(travel=0.010, rim=0.007)
+    file = SimpleNamespace(measured={"force": 5.0, "clearance_mm": None}, force_limit=35.0, motion=motion)
     assert calibrate(tmp_path / "missing", file, 1e-2, 2, sentences.append) is file
     assert sentences[0].startswith("difficulty=hard is not calibrated: there is no task folder")
 
