@@ -22,6 +22,7 @@ from pydantic import (
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
+from guiderail.tools.environments import task_named
 from guiderail.tools.evaluation.metrics import statistics_of
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 
@@ -119,7 +120,7 @@ class Study(_Strict):
     """Methods × seeds × numbers of training episodes × evaluation sets."""
 
     name: FolderName  # name of the tables
-    task: str  # task of every method
+    task: str  # task of every method: its name, or in a file also the path of a task folder
     env: dict[str, Any] = {}  # options of the environment of every method
     learner: LearnerChoice = LearnerChoice()  # learner of every method that learns
     methods: dict[FolderName, Method] = Field(min_length=1)  # by name, used in folders and legends
@@ -184,7 +185,13 @@ class Study(_Strict):
 
 
 def load_study(file: Path | str) -> Study:
-    """Read a study's YAML file; raise an InputError if it does not exist or is not a valid study."""
+    """Read a study's YAML file.
+
+    A task may be the path of a task folder, from the working directory, as in `guiderail train`.
+
+    Raises:
+        InputError: If the file does not exist or is not a valid study, or if the task folder is not valid.
+    """
     path = Path(file)
     if not path.is_file():
         raise InputError(f"there is no file {path}: name a study's YAML file")
@@ -192,9 +199,11 @@ def load_study(file: Path | str) -> Study:
     if not isinstance(data, dict):
         raise InputError(f"{path} is no study: it needs at least name, task, methods and seeds")
     try:
-        return Study.model_validate(data)
+        study = Study.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{path}: {_sentence(error)}") from error
+    task, folders = task_named(study.task)
+    return study.model_copy(update={"task": task, "imports": (*study.imports, *folders)})
 
 
 def _sentence(error: ValidationError) -> str:

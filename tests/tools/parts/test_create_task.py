@@ -102,6 +102,16 @@ def test_rank_prefers_seating_then_shallow_then_fast_contacts():
     assert sorted(tried, key=tried.get, reverse=True) == list(tried)
 
 
+def test_study_takes_a_task_folder_as_its_task(folder, tmp_path, monkeypatch):
+    from guiderail.tools.experiments.declaration import load_study
+
+    file = tmp_path / "study.yaml"
+    file.write_text("{name: few, task: ./peg, methods: {random: {policy: uniform_random}}, seeds: [0]}")
+    monkeypatch.chdir(folder.parent)
+    study = load_study(file)
+    assert (study.task, study.imports) == ("parts/peg", (str(folder.resolve()),))
+
+
 def test_created_folder_is_a_task(folder, tmp_path, capsys):
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
