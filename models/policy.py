@@ -41,7 +41,7 @@ class Policy:
             the default, "normalized_relu" or "tanh") and `squash` ("tanh", the default, or "clip"). Images need `pool`,
             the side of the squares of pixels that are averaged. `image_shape`, (height, width, channels), declares that
             observations are vectors [image / 255, state] (see `ImageObservation`).
-        encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution of an image, with stride 2 and a rectifier.
+        encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution of an image, with stride 2 and a ReLU.
 
     Raises:
         ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from observation

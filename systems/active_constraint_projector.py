@@ -25,8 +25,8 @@ class ActiveConstraintProjector(LeafSystem):
     the last command and the request.
 
     The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite. The same
-    happens if the tracking error exceeds its bound and the request would not reduce it, as for a blocked robot. If a
-    transition or a moved object leaves the repeated command outside the constraints, the command moves inside.
+    happens if the tracking error exceeds its bound and the request would not reduce it, for example when the robot is
+    blocked. If a transition or a moved object puts the repeated command outside the constraints, it moves inside.
 
     .. pydrake_system::
 
@@ -43,8 +43,8 @@ class ActiveConstraintProjector(LeafSystem):
         - measured_violation
 
     All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
-    template's state. A violation is the distance of a pose from its projection, the larger of meters and radians, 0
-    inside.
+    template's state. Each violation output is the largest violation of an active constraint, in meters or radians;
+    0 inside.
 
     Args:
         template: Shared control template.

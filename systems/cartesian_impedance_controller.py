@@ -15,7 +15,7 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
-MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; wrenches of larger ones could overflow
+MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; above it, wrenches could overflow
 
 
 @dataclass(frozen=True)

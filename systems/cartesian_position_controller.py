@@ -50,7 +50,7 @@ class CartesianPositionController(LeafSystem):
     outside its position limits may return within its velocity limit and moves no farther out. While the desired pose is
     not finite, older than the timeout, or more than one period in the future (`CommandValidity`), the joint command is
     constant. Near a singular posture a damped pseudoinverse is used (`models.control.damped_inverse`): the direction of
-    the tool deviates slightly, the joints stay slow, and the return to the posture leads out of the singularity.
+    the tool deviates slightly, the joints stay slow, and null-space control leads out of the singularity.
 
     .. pydrake_system::
 
@@ -171,7 +171,7 @@ class CartesianPositionController(LeafSystem):
             plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
-        # Limits that include q: a joint outside its limits neither jumps back nor makes the problem infeasible.
+        # The limits are extended to q: a joint outside them neither jumps back nor makes the problem infeasible.
         limits = np.minimum(self._position_limits[0], q), np.maximum(self._position_limits[1], q)
         velocities, is_stuck = self._joint_velocities(q, V, J, limits)
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])

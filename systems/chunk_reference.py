@@ -33,9 +33,9 @@ class ChunkReference(LeafSystem):
     alone, so that an observation of the command does not cause an algebraic loop.
 
     Args:
-        policy: Base policy (`models.policy`), a pure function; if None, the window is always that of the reference.
+        policy: Base policy (`models.policy`), a pure function; if None, the window always comes from `reference`.
         observation_size: Size n of the observation, at least 1.
-        reference: Reference trajectory in control steps, for Σ_n and the first window.
+        reference: Reference trajectory with one point per control step, for Σ_n and the first window.
         horizon: Number of future points H after the current one, not negative.
         replan_steps: Control steps between two predictions, at least 1.
         covariance_floor: Factor of Σ_n in the covariance, positive.

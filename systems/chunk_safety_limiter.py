@@ -22,8 +22,8 @@ class ChunkSafetyLimiter(LeafSystem):
     """Execute the chunks of a policy within bounds, velocity limits and jerk limits (`ChunkGuard`).
 
     Every ``replan_steps`` control steps, from the first one on, the chunk is limited as a continuation of the last
-    three commands. In between, the limited chunk is executed. The motion starts at rest at the measured pose, or at the
-    nearest one inside the bounds.
+    three commands. In between, the limited chunk is executed. The motion starts at rest, at the pose inside the bounds
+    that is nearest to the measured pose.
 
     .. pydrake_system::
 

@@ -13,8 +13,8 @@ class CommandFilter(LeafSystem):
 
         safe_pose = law(last safe_pose, desired_pose)
 
-    See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`, which uses the last two commands. At
-    initialization, the last command is the measured pose.
+    See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`. The last of these laws uses the last two
+    commands. At initialization, the last command is the measured pose.
 
     .. pydrake_system::
 

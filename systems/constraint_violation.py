@@ -22,11 +22,11 @@ class ConstraintViolation(LeafSystem):
         - violation
 
     ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c; `UNCONSTRAINED` if there is no
-    constraint. The violation depends on the pose and the control step alone, so it evaluates every guidance in the same
+    constraint. The violation depends on the pose and the control step alone, so every guidance is evaluated in the same
     way.
 
     Args:
-        constraints: Constraints on O outputs, linear (constant, or one set per control step) or of a motion.
+        constraints: Linear constraints (constant, or one set per control step) or motion constraints, on O outputs.
         period: Control period [s], positive.
 
     Raises:

@@ -29,15 +29,15 @@ class _Admitted(NamedTuple):
 
 
 class EnergyTank(LeafSystem):
-    """Pass on changes of a reference and a wrench bound as far as the tank holds the energy that they require.
+    """Limit changes of a reference and a wrench bound, so that they use no more energy than the tank holds.
 
         T' = T + Σ D Δx² / h − (U(x_r', F') − U(x_r, F)) ≥ 0
 
     U is the energy of the clipped spring at the measured pose x. The energy that a change of the reference x_r or of
     the limits F adds to the spring is taken from the tank. The energy that the damper dissipates, at least Σ D Δx² / h
     in a period h, refills the tank up to its capacity. If the tank holds too little energy, only a share of the change
-    is passed on. A lower limit applies at once. The energy of spring, tank and motion therefore increases only by work
-    of the environment, which cannot extract more than the initial content (Ferraguti, Secchi, Fantuzzi 2013).
+    is passed on. A decrease of a limit applies at once. The energy of spring, tank and motion therefore increases only
+    by work of the environment, which cannot extract more than the initial content (Ferraguti, Secchi, Fantuzzi 2013).
 
     .. pydrake_system::
 

@@ -35,10 +35,10 @@ class TerminationTerm:
             signal share its port.
         condition: Pure function of these signals, called by name, that returns True if the condition is met.
         steps: Number of control steps in which the condition must be met before the episode ends, at least 1.
-        progress: Optional function of the same signals. With this function, the steps need not be consecutive, and
-            progress resets their count: a value above the largest one so far by more than `min_progress`. Without it,
-            the steps must be consecutive.
-        min_progress: Largest increase of the value that is no progress.
+        progress: Optional function of the same signals. Without this function, the steps must be consecutive. With it,
+            they need not be consecutive, but their count is reset when the value of the function exceeds its value at
+            the previous reset by more than `min_progress`.
+        min_progress: Increase of the value of `progress` up to which the count is not reset.
     """
 
     termination: str
@@ -93,7 +93,7 @@ class EpisodeMonitor(LeafSystem):
         self._indices = [TERMINATIONS.index(term.termination) for term in terms]
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
 
-        # [count, maximum progress] of each term, then the index of the termination.
+        # [count, progress at the last reset of the count] of each term, then the index of the termination.
         self._state = self.DeclareDiscreteState(np.append(np.tile([0.0, -np.inf], len(self._terms)), 0.0))
         # The output and the event of the same instant share one evaluation.
         self._next = declare.cache(self, "next_state", self._calc_next, [*self._signals.tickets, self._state])

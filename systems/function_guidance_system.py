@@ -34,7 +34,7 @@ class FunctionGuidanceSystem(LeafSystem):
         - fallback
 
     ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,). The
-    outputs are state without direct feedthrough, so that the measured pose of a station can close the loop.
+    outputs are state without direct feedthrough, so that feedback of the measured pose causes no algebraic loop.
 
     Args:
         function: Pure function (action, pose, wrench) → desired pose; a reset cannot restore internal memory.

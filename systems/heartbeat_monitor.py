@@ -15,10 +15,9 @@ FORGET_TIME = 1.0  # age of a heartbeat above which its sender is ignored while 
 class HeartbeatMonitor(LeafSystem):
     """Raise a fault when a robot-side safety monitor reports a stop or its heartbeat times out.
 
-    Each sender has a timeout of its own, so that one monitor cannot hide that another one has exited. A monitor whose
-    heartbeat has timed out is ignored once the heartbeat is older than `FORGET_TIME` and another monitor is alive, so
-    that a monitor can be replaced. No fault is raised before the first heartbeat, so that a robot without a safety
-    monitor can be used.
+    Each sender has a timeout of its own, so that the exit of one monitor is detected while another one is alive. To
+    allow the replacement of a monitor, a heartbeat older than `FORGET_TIME` is ignored while another monitor is alive.
+    No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
 
     .. pydrake_system::
 
@@ -67,7 +66,7 @@ class HeartbeatMonitor(LeafSystem):
         return value if isinstance(value, tuple) else ()
 
     def _senders(self, context: Context) -> np.ndarray:
-        """Return sender, sequence and age of each known monitor, (m, 3), with the newest heartbeats."""
+        """Return sender, sequence and age of each known monitor, (m, 3), updated with the newest heartbeats."""
         senders = context.get_discrete_state(self._state).value().reshape(MAX_SENDERS, 3)
         known = {sender: (sequence, age) for sender, sequence, age in senders.tolist() if not np.isnan(sender)}
         for heartbeat in self._heartbeats(context):

@@ -63,8 +63,8 @@ class LcNsKmpSystem(LeafSystem):
             (O,).
 
     Raises:
-        InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
-            `shorter` has no shorter history, the history length of another one, or other constraints than `primitive`.
+        InputError: If a gain has the wrong shape or is not finite, the period is not positive, or the primitives in
+            `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`.
     """
 
     def __init__(

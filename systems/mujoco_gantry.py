@@ -111,7 +111,7 @@ class MujocoGantry(LeafSystem):
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
         self.model, self._data = model, self._mujoco.MjData(model)
-        # Warnings of divergence, or of a full buffer: the engine would ignore further contacts.
+        # Warnings of divergence and of a full contact buffer, with which the engine ignores further contacts.
         failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
         self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
         # Stored parts of the engine's state, including the warm start, so that a restored state continues identically.
@@ -251,7 +251,7 @@ class MujocoGantry(LeafSystem):
     def _contact_wrench(self) -> np.ndarray:
         """Return the wrench of the generalized contact forces.
 
-        The slide joints are along the axes of T; the generalized force of a hinge about axis a is a · t, t the torque.
+        The slide joints are along the axes of T. The generalized force of a hinge about axis a is a · t for a torque t.
         """
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])

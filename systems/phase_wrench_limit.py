@@ -15,8 +15,8 @@ class PhaseWrenchLimit(LeafSystem):
         b_k = b_{k-1} + s (B_q - b_{k-1}),  with the largest s <= 1 such that |b_k - b_{k-1}| <= r h
 
     B_q is the limit of state q, r the largest rate and h the period. The rate is bounded in both directions: a limit
-    that falls at once would make the force jump. An episode begins with the limit of its first state. A number that
-    is not a state has the lowest limits of all states.
+    that falls at once would make the force jump. An episode begins with the limit of its first state. If ``state`` is
+    not the number of a state, B_q is the minimum of the limits of all states.
 
     .. pydrake_system::
 

@@ -23,8 +23,8 @@ POSE_AXES = [5, 4, 3]  # indices of Rx, Ry, Rz in a pose, in the order of SciPy'
 class PoseMotionLimiter(LeafSystem):
     """Follow a desired pose with limited velocity, acceleration and jerk, starting from the measured pose at rest.
 
-    While the blend factor is zero the output is the measured pose. When it becomes positive, the output starts at the
-    measured pose and moves to the desired pose on the time-optimal trajectory within the limits. The trajectory is
+    While the blend factor is zero the output is the measured pose. When the factor becomes positive, the output moves
+    from the measured pose to the desired pose on the time-optimal trajectory within the limits. The trajectory is
     computed again in each period (Berscheid and Kröger, "Jerk-limited Real-time Trajectory Generation with Arbitrary
     Target States", RSS 2021). The orientation is represented by the rotation vector from the orientation at the start
     (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
@@ -103,7 +103,7 @@ class PoseMotionLimiter(LeafSystem):
 
 
 def _plan(motion: InputParameter) -> Trajectory:
-    """Return a trajectory to the target, or a trajectory to rest if the target has none.
+    """Return a trajectory to the target, or a trajectory to rest if none to the target is found.
 
     Raises:
         InputError: If neither is found.

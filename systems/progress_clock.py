@@ -1,4 +1,4 @@
-"""Clock of a movement primitive that waits for a robot that does not follow the commands."""
+"""Clock of a movement primitive that waits while the robot does not follow the commands."""
 
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 

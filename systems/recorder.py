@@ -81,7 +81,7 @@ class Recorder(LeafSystem):
 
     def _record(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = int(context.get_discrete_state(self._count).value()[0])
-        # No step has ended at time zero. With an event offset of one period, rounding would miss k * period.
+        # No step has ended at time zero. An event offset of one period cannot be used; see `declarations.after_start`.
         if context.get_time() == 0 or count == self._num_samples:
             return EventStatus.DidNothing()
         row = np.concatenate(list(self._signals.eval(context).values()))

@@ -16,8 +16,8 @@ class ReferenceGovernor(LeafSystem):
         x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
     for six joints with stiffness K and damping D, and time step h. Motion faster than F / √(k m) is slowed down, with
-    force bound F, contact stiffness k and moving mass m (see `governed_error`). A desired pose that is close enough is
-    output unchanged up to rounding.
+    force bound F, contact stiffness k and moving mass m (see `governed_error`). A desired pose that needs no limiting
+    is output unchanged up to rounding.
 
     .. pydrake_system::
 

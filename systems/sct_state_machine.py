@@ -33,7 +33,7 @@ class SctStateMachine(LeafSystem):
         - progress
 
     ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``initial_pose`` is the
-    measured pose. It is read only at initialization, because a commanded ``pose`` may not be initialized by then.
+    measured pose. It replaces ``pose`` at initialization, when a commanded ``pose`` may not be initialized yet.
     ``state`` is (1,), the number of the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_t of
     the current state in meters or radians. ``progress`` is (1,), the progress in the whole task: it accumulates over
     the states, and its increase in a step is d_{t−1} − d_t of equation 3.2.

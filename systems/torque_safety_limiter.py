@@ -16,7 +16,7 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 # last change to DAMPING or OFF in s; blend factor from 0 to 1].
 _ARM_STATE, _BLEND_FACTOR = 0, 3
 
-ZERO_TORQUE_TIME = 0.05  # zero torque is sent this long to a robot without status before publishing stops [s]
+ZERO_TORQUE_TIME = 0.05  # after a stop, zero torque is sent at least this long, even during a status fault [s]
 
 
 class ArmState(IntEnum):
@@ -220,7 +220,7 @@ class TorqueSafetyLimiter(LeafSystem):
         return context.get_discrete_state(self._state).value()
 
     def _find_fault(self, context: Context) -> Fault:
-        """Return the first fault that is present now; in the form `not value <= limit`, NaN violates a limit."""
+        """Return the first fault that is present now; checks have the form `not value <= limit`, so that NaN fails."""
         limits, n = self._limits, self._num_joints
         status_fault = Fault(int(self._status_fault_port.Eval(context)[0]))
         if status_fault:
@@ -270,7 +270,7 @@ class TorqueSafetyLimiter(LeafSystem):
         torque = np.zeros(self._num_joints)
         if is_active and not self._present_fault.Eval(context):
             torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
-            if blend_factor < 1.0:  # while RUNNING, no inertia has to be evaluated
+            if blend_factor < 1.0:  # not while RUNNING, to avoid the evaluation of the inertia
                 torque = torque + (1.0 - blend_factor) * self._damping_torque(context)
         elif is_active or arm_state == ArmState.DAMPING:
             torque = self._damping_torque(context)

@@ -14,8 +14,8 @@ class WrenchTare(LeafSystem):
 
         y_k = 0 for k < s + n,  y_k = u_k − (1/n) Σ u_j over j = s … s + n − 1 afterwards
 
-    k counts samples since the initialization. The first s samples are skipped until filters have settled, and the next
-    n samples are averaged. A contact force during these n samples would be subtracted too.
+    k counts samples since the initialization. The first s samples are skipped, because filters settle during this time.
+    The next n samples are averaged. A contact force during these n samples would be subtracted too.
 
     .. pydrake_system::
 

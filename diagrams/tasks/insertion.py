@@ -82,8 +82,8 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
-        On hardware the pose is estimated from the robot's own pose, if the task defines `observable_success`. A sampled
-        force limit is the signal `force_limit`, and the signal `max_wrench` bounds the station's force by it.
+        On hardware the pose is estimated from the robot's own pose, if the task defines `observable_success`. If the
+        force limit is sampled, it is the signal `force_limit`, and the signal `max_wrench` limits the station's force.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -192,7 +192,7 @@ class InsertionTask(Task):
 
 
 def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransform, RigidTransform]:
-    """Return the poses of the actual target frame in the nominal one, and of the workpiece in the tool, from offsets.
+    """Convert offsets to the poses of the actual target frame in the nominal one and of the workpiece in the tool.
 
     Args:
         fixture: (x, y) of the fixture [m], and its turn about z [rad] if it has one.
@@ -208,8 +208,8 @@ ACTION_WEIGHT = FORCE_WEIGHT = 0.01
 REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 TERMINAL = {"success": 60.0, "collision": -50.0}
 # Reward per depth gained [1/mm]. The connector locks when the demonstrations end, however early the plug drops. With a
-# terminal reward alone, a policy that moves at random until the plug drops would earn as much as one that uses the
-# contact, and would sometimes fail. The path from start to lock is 15.6 mm long, with the last 5.5 mm in the jack.
+# terminal reward alone, a success by random motion would therefore earn as much as a success by use of the contact,
+# although it is less reliable. The path from start to lock is 15.6 mm long, with the last 5.5 mm in the jack.
 DEPTH_REWARD = 5.0
 # Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
 ALIGNMENT_REWARD = 5.0
@@ -232,8 +232,8 @@ def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
 def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
 
-    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components of pose and
-    wrench along and about the axis are unchanged.
+    Vectors across the axis are rotated or reflected; a reflection also changes the sign of torques and tilts, which are
+    axial vectors. Components of pose and wrench along and about the axis are unchanged.
 
     Returns:
         Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if
@@ -268,7 +268,7 @@ class DemonstratedInsertion(InsertionTask):
     Rewards: "sparse" is the thesis's reward (4.27, 4.28), with costs of actions and forces and a terminal reward.
     "shaped" adds the depth gained, and "aligned" also the distance gained towards the fixture's axis. This distance is
     privileged: the policy does not observe this simulation state. Depth gained and distance gained are differences of
-    potentials. The workpiece is the plug.
+    potentials. The name of the workpiece must be "plug".
 
     Attributes:
         insertion_length: Length of the insertion, which scales the distance of the wrist camera [m].
@@ -335,7 +335,7 @@ class DemonstratedInsertion(InsertionTask):
     def wrist_camera(self) -> Camera:
         """Return a camera on the tool that looks at the workpiece's lower end and the fixture below it.
 
-        Its distance from the tool center is about 3.5 times `insertion_length`.
+        Its distance from the tool center is about 3.4 times `insertion_length`.
         """
         eye, target = (self.insertion_length * np.array(place) for place in ([2.4, 0.0, 2.4], [0.0, 0.0, -0.3]))
         return Camera(WRIST_IMAGE_SIZE, np.deg2rad(40.0), look_at(eye, target), frame="grasp")

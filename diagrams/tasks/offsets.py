@@ -1,4 +1,4 @@
-"""Hidden offsets of fixture and workpiece with their random streams, and reference trajectories of files."""
+"""Hidden offsets of fixture and workpiece with their random streams, and reference trajectories fitted to files."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def reference_of_file(
     count: int | None = None,
     **fit: Any,
 ) -> ReferenceTrajectory:
-    """Fit a reference trajectory to a file's demonstrations; its duration is their mean duration.
+    """Fit a reference trajectory, with the mean duration of the demonstrations, to the demonstrations in a file.
 
     Args:
         path: File .npz or .csv with poses (N, 6) in the target frame.
         components: Number of components of the Gaussian mixture; None: chosen by the Bayesian information criterion.
         floor: Standard deviation (6,) of a hand's repeatability; its square is added to the fitted variances.
         count: Number of demonstrations that are used, from the first on; None: all.
-        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`, as of `ReferenceOptions.fit_arguments`.
+        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`; see `ReferenceOptions.fit_arguments`.
 
     Raises:
         InputError: If there is no such file, or its demonstrations are not poses.
@@ -56,7 +56,7 @@ def reference_of_file(
     return _REFERENCES[key]
 
 
-# Fitted trajectories, because a fit takes seconds. A key has the file's digest, as `create-task` moves the folder.
+# Fitted trajectories, because a fit takes seconds. Keys have a digest, not a path, because `create-task` moves files.
 _REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 
 

@@ -29,7 +29,7 @@ OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
 REWARDS = ("sparse", "shaped", "aligned")
 
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
-MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # larger ones are probably in mm or degrees [m], [rad]
+MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # [m], [rad]; larger values are probably in mm or degrees
 FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]
 
 
@@ -64,7 +64,7 @@ class FixtureOffsetOptions(Options):
 
 
 class ReferenceOptions(Options):
-    """Options of a task whose demonstrations a reference trajectory is fitted to."""
+    """Options of a task with a reference trajectory that is fitted to demonstrations."""
 
     reference_model: Literal["gmr", "promp"] = Field(
         "gmr",
@@ -81,7 +81,7 @@ class ReferenceOptions(Options):
 
 
 class PriorOptions(ReferenceOptions):
-    """Options of a task with recorded demonstrations of poses, which may have gaps or be a single one."""
+    """Options of a task with recorded demonstrations of poses: several, possibly with gaps, or only one."""
 
     gap_scale: Number = Field(
         1.0,

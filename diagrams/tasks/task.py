@@ -71,7 +71,7 @@ class Threshold:
 
 
 def terminal_reward(rewards: Mapping[str, float], name: str = "terminal_reward") -> RewardTerm:
-    """Return the term `name`: the reward of an episode's end by the name of its termination, zero without a reward."""
+    """Return the term `name`, the reward of an episode's end; `rewards` maps terminations to rewards, others earn 0."""
     return RewardTerm(name, {"termination": 1}, lambda termination: rewards.get(TERMINATIONS[int(termination[0])], 0.0))
 
 
@@ -96,15 +96,15 @@ class Task(ABC):
         Reset: Class of the options of a reset, a subclass of `guiderail.ResetOptions`.
         rewards: Values of the option `reward`; the first is the default.
         observations: Values of the option `observation`; the first is the default.
-        defaults: Options of the environment by name, in place of their usual defaults, such as the guidance.
+        defaults: Default values of environment options by name, such as the guidance; they replace the usual defaults.
         difficulties: Options by name for each value of the option `difficulty`, one of which is "standard". They
             override `defaults`, and given options override them.
         learner: Default algorithm and preset of `guiderail train`.
         num_steps: Control steps of an episode; set in the class or in `__init__`.
         clip: Largest absolute value in an observation.
         collision: Signal and limit of the statistic `collisions`; default: any contact force. An evaluation omits the
-            statistic if the task declares no signal. A `TerminationTerm` that ends an episode as a collision is not
-            counted by itself.
+            statistic if the task declares no signal. An episode that a `TerminationTerm` ends as a collision is counted
+            only if the signal is above its limit too.
         statistics: Statistics of a table of episodes that only this task has; a study may name them.
         isotropic_groups: Groups of outputs with the same unit, as indices; in residual learning, an action of 1
             displaces each output of a group by the same amount. None: one group of all outputs.
@@ -157,9 +157,9 @@ class Task(ABC):
         return max(round(nominal_steps * self.default_control_period / self.control_period), 1)
 
     def on_clock(self, reference: ReferenceTrajectory, time_scale: float = 1.0) -> ReferenceTrajectory:
-        """Return a reference trajectory in steps of the control period, and `time_scale` times as long.
+        """Return a reference trajectory resampled to the control period, and `time_scale` times as long.
 
-        The trajectory itself is returned if it has such steps already.
+        The trajectory itself is returned if it has this period already and `time_scale` is 1.
         """
         return _on_clock(reference, self.control_period, time_scale)
 
@@ -189,7 +189,7 @@ class Task(ABC):
         raise NotImplementedError
 
     def keep_out(self) -> KeepOut:
-        """Return the walls that safe residual learning stops at."""
+        """Return the walls at which safe residual learning stops the robot."""
         raise NotImplementedError
 
     def template(self) -> PlacedTemplate:

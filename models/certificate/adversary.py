@@ -30,8 +30,8 @@ class AttackResult:
             that no action moves: at one step, and in total over a sequence.
         steps: Number of executed steps.
         corrected: Number of steps with a correction.
-        worst: Worst value with its actions (N, A) and start (O,). A key has the quantity, the output, and True for the
-            steps at which a constraint can be active.
+        worst: Worst value with its actions (N, A) and start (O,), by quantity, output and kind of step: True for the
+            steps at which a constraint can be active, False for the others.
     """
 
     largest: dict[str, np.ndarray]
@@ -49,8 +49,8 @@ class Adversary:
 
     Args:
         loop: Loop to attack.
-        can_be_corrected: Mask (N,) of the steps at which a constraint can be active; the worst sequences are searched
-            for these and for the other steps.
+        can_be_corrected: Mask (N,) of the steps at which a constraint can be active; the worst values at these steps
+            and at the others are searched for separately.
         seed: Seed of all random numbers.
         attacks_budgets: If True, only sequences with the largest excess or residue are varied.
     """

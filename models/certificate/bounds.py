@@ -5,8 +5,8 @@ are the impulse responses. Its half-width along a direction is the sum of the ab
 that direction. Three regimes are certified:
 
 - *free*: all sequences, until a constraint becomes active. These bounds are exact.
-- *always*: all sequences. Before the first step at which a constraint can be active in the window (history and
-  horizon), the bounds are those of *free*. From then on, a constrained output is bounded by the constraints themselves.
+- *always*: all sequences. Where no constraint of the window can be active (with a history: up to the first step where
+  one can), the bounds are those of *free*. Elsewhere, a constrained output is bounded by the constraints themselves.
   Without a history (KGRL), a command depends on one action only, and the actions are divided into cells. An action in
   a cell is a convex combination of the corners, with weights λ_i. The same combination v̄ = Σ λ_i v_i of the corners'
   corrections v_i is feasible for this action. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖²,
@@ -34,7 +34,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 CELLS = {1: 16, 2: 24, 3: 3}  # number of actions → number of cells along each; 1 for more actions
 MAX_ACTIONS = 6  # largest number of actions whose corners are enumerated
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
-BORDER = 1e-6  # largest slack, relative to the terms of a constraint, of a constraint that counts as active
+BORDER = 1e-6  # slack, relative to the terms of a constraint, up to which the constraint counts as active
 CORNER_MARGIN = 1e-8  # margin of the corrections at corners, so that the checker's rounding cannot make them infeasible
 
 

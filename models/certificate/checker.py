@@ -1,11 +1,11 @@
-"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0: yes, 1: no, 2: unreadable.
+"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0 valid, 1 rejected, 2 unreadable.
 
-It bounds the commands y for all actions a. W h is the window's mean given the history h, and C the kernel given h:
+The checker bounds the commands y for all actions a. W h is the window's mean and C the kernel, given the history h:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
 must leave room for these errors (see docs/concepts/certificates.md). `guiderail certify SKILL --verify FOLDER` also
-compares subject, primitive, impedance and budget with those of the skill; this program only reads them.
+compares subject, primitive, impedance and budget with those of the skill; this program does not.
 The digest detects accidental changes only, as anyone can compute it; a signature needs the key.
 """
 
@@ -27,7 +27,7 @@ KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / 
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 BUDGETS = ("excess", "residue")
 AGREEMENT = 1e-4  # largest excess of a claim over the computed value, relative to the largest value of the quantity
-BORDER = 1e-5  # largest slack, relative to the terms of a constraint, of a constraint that may be claimed active
+BORDER = 1e-5  # slack, relative to the terms of a constraint, up to which it may be claimed to be active
 COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit norm, that the primitive accepts
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec = 60
@@ -254,7 +254,7 @@ class Primitive:
             H, bound = np.abs(history).astype(float), error(past, reached)
             pushed = np.abs(p["gains"][moved]) @ np.linalg.norm(L[moved], axis=1)
             bound += action_error * pushed + EPS * np.abs(by).sum(axis=1)
-            # An error at one step reaches a later one by the impulse responses of the loop.
+            # An error at one step propagates to later steps by the impulse responses of the loop.
             earlier = echo[n : P + n, :, : n * outs].reshape(P * outs, n * outs)
             echo[P + n, :, : n * outs] = history[:outs].astype(float) @ earlier
             echo[P + n, np.arange(outs), np.arange(n * outs, (n + 1) * outs)] = 1

@@ -14,7 +14,7 @@ from guiderail.models.certificate.loop import Bounds, CertifiedLoop, single_outp
 
 ROUNDS = 4  # number of constraints at other steps that tighten one bound
 MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps from the step of the bound, and their spacing
-NUM_CANDIDATES = 6  # constraints tried in each round, by their correlation with the direction
+NUM_CANDIDATES = 6  # number of constraints tried in each round: those most correlated with the direction
 FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares one
 
 
@@ -76,7 +76,7 @@ def bound_within_budget(
 
 
 def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
-    """Compute the responses (P + N, O, B) to a residue of one in each unmoved output at each step from `first` on."""
+    """Compute the responses (P + N, O, B) to a unit residue in each unmoved output at each step from `first` on."""
     primitive, past = loop.primitive, loop.primitive.history
     steps, unmoved = primitive.num_steps, np.flatnonzero(loop.gains == 0.0)
     response = np.zeros((past + steps, primitive.num_outputs, (steps - first) * len(unmoved)))
@@ -136,9 +136,9 @@ class MultiplierSearch:
     def bound(
         self, directions: np.ndarray, steps: np.ndarray, outputs: np.ndarray, multipliers: np.ndarray
     ) -> np.ndarray:
-        """Compute the largest displacement (O,) of commands in directions (O, ·), the generators along each direction.
+        """Compute upper bounds (O,) on the displacement of commands in directions, given as generators (O, ·).
 
-        It is proven by the `multipliers` (O, R) of the constraints at `steps` (O, R) on `outputs` (O, R).
+        The `multipliers` (O, R) of the constraints at `steps` (O, R) on `outputs` (O, R) prove the bounds.
         """
         rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._past + steps, outputs])
         margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]

@@ -55,7 +55,7 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds (N, O) by the constraints on a single output, lower and upper, widened by their tolerance."""
+    """Return lower and upper bounds (N, O) from the constraints on a single output, widened by the tolerance."""
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))
     is_single = ((G != 0.0).sum(axis=2) == 1)[..., None]

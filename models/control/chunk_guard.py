@@ -123,7 +123,7 @@ class ChunkGuard:
         Args:
             chunk: Requested outputs (K, O), from the next control step on.
             past: Last three executed outputs (3, O).
-            plan: Rest of the previous result (n, O), n at least 1, repeated if no chunk within the limits is found.
+            plan: Rest of the previous result (n, O), n at least 1; returned if no chunk within the limits is found.
 
         Raises:
             InputError: As `guard`.

@@ -90,9 +90,9 @@ class TangentSpaceFilter(_LastCommand):
 
         y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
 
-    Far from a constraint this is the desired command; at a constraint it moves along it only. Constraints that the step
-    moves away from are left out, so that the command can leave them. The projection is only accurate near the
-    start of a step: a step that would cross a constraint ends at it.
+    Far from a constraint this is the desired command; at a constraint the command only moves along the constraint.
+    Constraints that the step moves away from are left out, so that the command can leave them. The projection is only
+    accurate near the start of a step; a step that would cross a constraint is therefore shortened to end at it.
 
     Args:
         keep_out: Boxes and constraints, with their margin. A box is replaced by its face with the most clearance.

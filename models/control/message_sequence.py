@@ -61,7 +61,7 @@ class CommandSequence:
 
     - *Return*: time stamps that jump relative to the local clock, and within `RETURN_TIME` jump back.
     - *Equal time*: within `EQUAL_TIME`, two commands with the time stamp of their predecessor but other torques.
-    - *Rate*: more than `LEAK` commands per period, with `MAX_LEVEL` at once.
+    - *Rate*: more than `LEAK` commands per period in the long run, where up to `MAX_LEVEL` may arrive at once.
 
     Attributes:
         num_conflicts: Number of contradictions.

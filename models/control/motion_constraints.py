@@ -18,8 +18,8 @@ from guiderail.models.primitives import LinearConstraints, UnsolvableError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.qp import solve_least_norm
 
-# Distances from a shape and from the plane of a linear constraint: that at which the QP aims, and the smaller one that
-# every command keeps. The difference allows for the solver's tolerance.
+# Distances from a shape and from the plane of a linear constraint: first the distance at which the QP aims, then the
+# smaller distance that every command keeps. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
 _CUTS = 4  # number of linearizations of the `inside` shapes
 _BISECTIONS = 12  # number of bisections between the braking command and the nearest command
@@ -113,13 +113,13 @@ class MotionConstraintFilter:
 
         |y − p| ≤ v h        |y − 2 p + p'| ≤ a h²
 
-    for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if a motion that
-    brakes from it on a straight line at the largest deceleration stays within the constraints; otherwise the last safe
+    for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if the motion can
+    brake from there, on a straight line at the largest deceleration, within the constraints. Otherwise, the last safe
     command on the line from the braking command to the nearest one is executed. Braking was verified one step earlier,
     so that a safe command always exists. Without a largest acceleration, braking repeats the last command.
 
-    A start outside of the constraints (after a push, or because the constraints moved) moves back inside; from
-    then on every command satisfies all of them.
+    If the start is outside of the constraints (after a push, or because the constraints moved), the commands move back
+    inside; from then on every command satisfies all constraints.
 
     Args:
         constraints: Constraints.
@@ -199,7 +199,7 @@ class MotionConstraintFilter:
         return np.concatenate([command, command - last]), safe == 0.0
 
     def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
-        """Return the displacements of the next step and until rest in braking, as shares of the last displacement (O,).
+        """Return the braking displacements, of the next step and until rest, as shares of the last displacement (O,).
 
         The share of each step is smaller by φ than that of the step before: 1 − φ, 1 − 2 φ, …. φ is the largest number
         that the acceleration limits of all outputs allow.

@@ -13,9 +13,9 @@ from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus
 from guiderail.models.control.message_sequence import RESOLUTION
 
 ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # faults with a valid status
-# Faults after which the message is dropped, and the next one is compared with the last readable status. After any other
-# fault, statuses are in doubt until all have been valid for the settling time. A status in doubt is only accepted if it
-# agrees with the prediction.
+# Faults after which the message is dropped, and the next one is compared with the last readable status. After a fault
+# in neither of the two lists, statuses are in doubt until all have been valid for the settling time. A status in doubt
+# is only accepted if it agrees with the prediction.
 DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
 FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping with a measured velocity does not oscillate
 AGREEMENT = 0.1  # largest difference from the predicted velocity for a status in doubt to be accepted [rad/s]
@@ -23,7 +23,7 @@ AGREEMENT = 0.1  # largest difference from the predicted velocity for a status i
 # would make all others late.
 EARLY_FRACTION = 0.2
 EARLY_WINDOW = 0.5  # decay time of the sum of these offset corrections [s]
-MAX_EARLY = 1.0 / 3.0  # largest sum of these corrections, in maximum leads; above it the robot's clock is too fast
+MAX_EARLY = 1.0 / 3.0  # largest sum of these corrections, relative to `max_lead`; above it, the robot's clock is fast
 POSITION_WINDOW = 0.1  # decay time of the difference between positions and integrated velocities [s]
 REACTION_WINDOW = 0.02  # time in which the external torque must explain a change of velocity [s]
 MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
@@ -133,10 +133,10 @@ class StateEstimator:
 
     A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
-    One wrong source cannot move it out of the interval of the other two. While no status is accepted, the third source
-    continues alone, so that damping removes the momentum once and then ends; a status that is accepted in doubt only
-    decreases the estimate. The accepted velocity, with which the arm is controlled, is the reported one, limited to the
-    interval of the other two sources, widened by the velocity noise.
+    One wrong source cannot move it out of the interval of the other two. While no status is accepted, only the third
+    source is used, so that damping ends when it has removed the momentum; a status in doubt can only reduce the size of
+    the estimate. The accepted velocity, with which the arm is controlled, is the reported one, limited to the interval
+    of the other two sources, widened by the velocity noise.
 
     The clocks are synchronized with the first status. Afterwards the offset follows early statuses quickly and late
     ones slowly; after a fault or a timeout the clocks are synchronized again. Delays of this program are not attributed
@@ -187,7 +187,7 @@ class StateEstimator:
             return self._finish(state, before, fault, now)
 
         if fault == Fault.CONFLICT and not is_doubted:
-            # The last statuses may be from a second robot: the effect of the torques that they lack is added.
+            # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
             reported = before.last_values[self._velocities]
             state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values
@@ -336,7 +336,7 @@ class StateEstimator:
         return np.clip(bias, -limit, limit)
 
     def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the effect of recent torques that the reported velocity lacks, (n,) [rad/s], and a mask (n,) of where.
+        """Return the effect of recent torques that the reported velocity lacks [rad/s], and its mask; both are (n,).
 
         A wrong velocity lacks the effect of the torques both with and without the external ones; the smaller effect
         counts. If only one of the two effects is missing, or they differ in sign, the external torque is wrong.

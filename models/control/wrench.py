@@ -90,8 +90,8 @@ def slow_down(
     """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates to at most F / √(k m).
 
     d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
-    that does positive work is reduced, so that no energy is added: while it moves to its rest position, the spring
-    returns at most what it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], and
+    that does positive work is reduced, so that no energy is added: on the way to its rest position, the spring returns
+    at most the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], and
     `force` is F [N].
     """
     speed = float(np.sqrt(velocity @ velocity))
@@ -129,7 +129,7 @@ def bounded_wrench(
 
 
 def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -> float:
-    """Return the largest β from 0 to 1 with s − β d inside the bound, for the wrenches s and d (6,), s inside it."""
+    """Return the largest β from 0 to 1 with s − β d inside the bound, for wrenches s (6,) inside it and d (6,)."""
     wrench = spring - damping
     f, t = wrench[:3], wrench[3:]
     if (np.abs(wrench) <= bound.axes).all() and f @ f <= bound.force**2 and t @ t <= bound.torque**2:
@@ -222,7 +222,7 @@ def external_wrench(
 
 
 def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return copies of stiffness and damping (6,) of a pose's coordinates; `owner` needs them, for messages.
+    """Return copies of stiffness and damping (6,) of a pose's coordinates; `owner` is a name for messages.
 
     Raises:
         InputError: If a shape is wrong, a stiffness is not positive, or a damping is negative.
@@ -257,7 +257,7 @@ def admissible_share(
     """Return the largest share from 0 to 1 of a change of reference and limits that adds at most `energy` [J].
 
     The energy is convex in the reference, so the share is found by bisection. The share is 1 if the whole change is
-    admissible. No limit may decrease: a lower limit is applied at once, which removes energy from the spring.
+    admissible. No limit may decrease: the caller applies a lower limit at once, which removes energy.
 
     Args:
         stiffness: Stiffness (n,).

@@ -89,7 +89,7 @@ def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMes
     )
 
 
-# References that keep the folders: a simulator may read a mesh long after the SDF file.
+# References that prevent the deletion of the folders: a simulator may read a mesh long after the SDF file.
 _FOLDERS: list[TemporaryDirectory[str]] = []
 
 

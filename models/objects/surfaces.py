@@ -7,8 +7,8 @@ import numpy as np
 from guiderail.models.common.transforms import MM
 
 # If neighbouring convex pieces only touched, their seam would catch a sliding body: there, the shortest way out of a
-# piece is sideways. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, at an
-# angle of nine degrees.
+# piece is sideways. Each piece therefore extends by SHOULDER into its neighbours and slopes down, by nine degrees, to
+# a depth BELOW under their surface.
 SHOULDER, BELOW = 0.3 * MM, 0.05 * MM
 
 
@@ -60,8 +60,8 @@ class Surface:
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:
     """Return the vertices (4 K, 3) [m] of convex pieces of a polygonal ring about z, including shoulders.
 
-    The first corner of the polygon, with sides as for `sdf.lathe`, is half a side from the x axis. The corners (K, 2)
-    of the convex section are [radius of the circle inside the polygon, height] [m].
+    The middle of a side lies on the x axis, as in `sdf.lathe`. `profile` (K, 2) holds the corners of the convex
+    section: [radius of the circle inside the polygon, height] [m].
     """
     radius, height = np.asarray(profile, dtype=float).T
     radius = radius / np.cos(np.pi / num_sides)

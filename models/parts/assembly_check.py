@@ -136,7 +136,7 @@ def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list
     return obstructions
 
 
-MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance; a larger overlap shows that parts are drawn apart [m]
+MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance; above it, the parts are not drawn assembled [m]
 _SPARE = 0.01 * MM  # clearance left by the suggested distance [m]
 _VOLUME_SAMPLES = 1000  # number of points sampled on the surface of a common volume
 _REGULARIZATION = 1e-3  # relative weight of the motion of a vertex in the least-squares problem

@@ -26,7 +26,7 @@ _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold
 def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES) -> list[Any] | None:
     """Cut a solid into convex pieces.
 
-    Each cut is along the plane of a face at a concave edge: the one that leaves the smallest concave volume.
+    Each cut is along the plane of a face at a concave edge; the plane that leaves the smallest concave volume is used.
 
     Returns:
         The pieces; None if more than `max_pieces` are necessary, or if they would fill a concavity that no cut removes.
@@ -43,7 +43,7 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES) -> list[Any
                 filled += hollow
             else:
                 uncut += cut
-        # Edges that are each too flat to count as concave may form a bore.
+        # Edges that are each too flat to count as concave may together form a bore, which the hulls would fill.
         if len(pieces) + len(uncut) > max_pieces or filled > 2.0 * _CONVEX * total:
             return None
     return pieces

@@ -16,8 +16,8 @@ TURN_SPEED = 45.0 * DEGREE  # [rad/s]
 SEARCH = 1.8  # time on the rim [s]
 PAUSE = 0.3  # time after each part of the motion [s]
 NUM_DEMONSTRATIONS = 10  # with five, the variance changes by a factor of four along the search
-SPREAD = 1.7 * MM  # distance from the nominal place at which the sockets of the demonstrations are, on a circle [m]
-_ANGLES = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS  # of the sockets on the circle [rad]
+SPREAD = 1.7 * MM  # radius of the circle around the nominal position on which the demonstrations' sockets lie [m]
+_ANGLES = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS  # angles of the sockets on the circle [rad]
 
 # Standard deviations of the hand [m, rad]: wide on the rim, narrow where the parts guide the motion.
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
@@ -80,7 +80,7 @@ def demonstrator_motions(
     """Return different searches (D, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
     The random deviations are wide while the command is above the height `press_from` [m]. Below it, each search ends at
-    a socket of its own (`socket_offsets`), so that the variance of the demonstrations is that of the socket's place,
+    a socket of its own (`socket_offsets`), so that the variance of the demonstrations is that of the socket's position,
     and actions can follow a displaced socket down to the target. With a `search_turn` [rad] the sockets are also turned
     (`socket_turns`), and each motion has its socket's turn from the start.
     """
@@ -92,7 +92,7 @@ def demonstrator_motions(
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
     curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
     wander = curves - _CENTERING * curves.mean(axis=0)
-    wander /= wander.std(axis=0)  # where the curves happened to be close, an action would move little
+    wander /= wander.std(axis=0)  # otherwise an action would have little effect where the curves are close by chance
     nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
     motions = nominal + scale * wander
     motions[:, :, :2] += (1.0 - wide) * socket_offsets()[:, None, :]

@@ -124,7 +124,7 @@ def load_part(path: Path, unit: str) -> Part:
 
 
 def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return vertices (V, 3), triangles (T, 3), and the number of triangles; both are empty if there are too many.
+    """Return vertices (V, 3), triangles (T, 3) and the number of triangles; the arrays are empty if it is too large.
 
     Without a path and materials, a parser opens no other file and decodes no image.
     """

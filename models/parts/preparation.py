@@ -22,7 +22,7 @@ MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decima
 NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at without walls that face each other [m]
 MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [m]
 _THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
-MAX_YAW = 0.1  # rotation of the plug about its axis in a search, if it is small, which widens the margin [rad]
+MIN_YAW = 0.1  # default rotation of the plug about its axis in a search, by which the margin is widened [rad]
 CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
 _FIRST_FRACTION = 0.7  # fraction of the remaining tolerance at the first attempt; `manifold3d` may exceed its bound
@@ -70,7 +70,7 @@ def prepare_surfaces(
     tolerance: float,
     moved: float,
     snapping: frozenset[int],
-    yaw: float = MAX_YAW,
+    yaw: float = MIN_YAW,
 ) -> tuple[ContactSurface, ContactSurface]:
     """Return the contact surfaces of both parts.
 

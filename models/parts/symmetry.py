@@ -32,7 +32,7 @@ _AROUND = 1.15  # radius around the axis in which a socket is compared, in radii
 def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the symmetries of both parts, and of further ones that nearly hold on the rim.
 
-    The parts are in the target frame, the plug at its target. On the rim it is turned by minus the motion's turn.
+    The parts are in the target frame, the plug at its target. On the rim, the plug is turned by minus `motion.turn`.
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
     socket_solids, plug_solids = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]

@@ -16,7 +16,7 @@ _FLAT = 1e-21  # six times the volume below which a tetrahedron is degenerate [m
 def tetrahedralize(
     vertices: np.ndarray, triangles: np.ndarray, tolerance: float, edge: float = 0.15, optimize: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (P, 3) [m] and tetrahedra (N, 4) of the volume of any triangles, crossing or open ones included.
+    """Return points (P, 3) [m] and tetrahedra (N, 4) of the volume within triangles that may cross or leave gaps.
 
     Args:
         vertices: Vertices (V, 3) [m].

@@ -107,7 +107,7 @@ class LinearConstraints:
         return self.G[steps], self.c[steps]
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Compute the maximum over the constraints of a step of c − G y, with rows of unit norm [unit of the output].
+        """Compute the largest violation c − G y of a step's constraints, with rows of unit norm [unit of the output].
 
         For the output y (O,), a negative violation is slack, and −inf is returned without constraints.
         """

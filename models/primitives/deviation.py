@@ -11,7 +11,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
 MAX_MISS = 0.1
-"""RMS distance relative to an output's range; up to it any deviation is accepted, because spreads may be tiny."""
+"""RMS distance, relative to an output's range, up to which any deviation is accepted: spreads may be tiny."""
 _EVALUATED = 16  # number of steps at which the deviation is measured
 
 

@@ -10,7 +10,7 @@ from guiderail.models.primitives.kernels import Kernel
 # Conditioning on a history with a standard deviation √ρ far below the kernel's, which is 1, loses digits in double
 # precision. Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
-# Smallest conditional variance of a point given the others, relative to the kernel's, for it to have its own action.
+# A point can have an action of its own if its variance given the others, relative to the kernel's, is at least this.
 _MIN_INDEPENDENCE = 1e-9
 
 

@@ -20,7 +20,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.reference import ReferenceTrajectory, information_criteria
 
 MIN_SHARE = 0.95
-"""Smallest share of the steps within one standard deviation at which a motion follows the demonstrations."""
+"""Share of the steps that must be within one standard deviation for a motion to follow the demonstrations."""
 # Length scales to try, relative to the motion's duration: from one bend to a few steps.
 _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
 # Values of ħ to try, for outputs of unit size.

@@ -32,7 +32,7 @@ def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.n
 
     The factor √3 is KGRL's own relation: uniform actions in ±1 then cause an RMS of κ standard deviations. Displacement
     and deviation are RMS over the whole motion, so that wide regions, which leave room to explore, dominate. The result
-    does not depend on the action repeat, because a constant action is constant for any of them.
+    does not depend on the action repeat, because a constant action is the same for every action repeat.
 
     Args:
         primitive: Primitive to calibrate.

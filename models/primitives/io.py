@@ -276,7 +276,7 @@ def _read_csv(data: bytes) -> Recording:
 
 
 def find_repeated(names: Iterable[str]) -> str:
-    """Return the first name that occurs twice; empty if there is none, because a column may have no name."""
+    """Return the first name that occurs twice, or an empty text; several columns may have no name."""
     names = list(names)
     return next((name for number, name in enumerate(names) if name and name in names[:number]), "")
 

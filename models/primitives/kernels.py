@@ -110,8 +110,8 @@ class SquaredExponential(_StationaryKernel):
 class Matern52(_StationaryKernel):
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
-    Its functions are only twice differentiable. It suits motions for which the squared exponential kernel is too
-    smooth, such as motions with a contact in the middle.
+    Motions with this kernel are only twice differentiable. The kernel suits motions for which the squared
+    exponential kernel is too smooth, such as motions with a contact in the middle.
 
     Args:
         length_scale: Length scale ℓ, in the unit of the input, positive.

@@ -39,7 +39,7 @@ def pose_outputs(
         target_quaternion_wxyz: R_WT (4,).
         orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", for rotations
             of about a half turn.
-        near: Orientation (3,) [rad] on whose branch the first sample lies; the branch of least magnitude by default.
+        near: Orientation (3,) [rad] that selects the branch of the first sample; that of least magnitude by default.
             Demonstrations of one motion must share a branch, or their mean is meaningless.
 
     Raises:

@@ -106,7 +106,7 @@ class ProMp:
 
 
 def _features(phases: np.ndarray, count: int) -> np.ndarray:
-    """Return normalized Gaussian bumps (n, K) at phases (n,); their standard deviation is their distance."""
+    """Return normalized Gaussian bumps (n, K) at phases (n,); their standard deviation equals their spacing."""
     offsets = (np.asarray(phases, dtype=float)[:, None] - np.linspace(0.0, 1.0, count)) * (count - 1)
     bumps = np.exp(-0.5 * offsets**2)
     return bumps / bumps.sum(axis=1, keepdims=True)

@@ -98,8 +98,8 @@ class ReferenceTrajectory:
             prior_std: Standard deviations (O,) of a single demonstration, a scalar, or rows as in `interpolate_prior`;
                 required for one demonstration, refused for several.
             model: "gmr", or "promp" with the default number of basis functions (`ProMp`).
-            gap_scale: Factor of the standard deviation in a gap of all recordings, positive: below 1 it stops
-                exploration there, above 1 it widens it. At the step n the factor is `gap_scale` to the power of
+            gap_scale: Factor of the standard deviation in a gap of all recordings, positive. Below 1, exploration in
+                the gap is narrower; above 1, it is wider. At the step n the factor is `gap_scale` to the power of
                 `unobserved_share`.
             kernel: Kernel of `unobserved_share`; `SquaredExponential()` by default.
 
@@ -261,7 +261,7 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
         num_outputs: Number of outputs O.
 
     Raises:
-        InputError: If there is another number of numbers, phases do not increase or are not in 0 to 1, or a standard
+        InputError: If the number of values does not fit, phases do not increase or are not in 0 to 1, or a standard
             deviation is not positive and finite.
     """
     numbers = np.ravel(np.asarray(prior_std, dtype=float))
@@ -287,11 +287,11 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
 def unobserved_share(
     reference: ReferenceTrajectory, recordings: Demonstrations, kernel: Kernel | None = None
 ) -> np.ndarray:
-    """Compute the epistemic variance (N, O) of a reference, as a share of that far from all demonstrations.
+    """Compute the epistemic variance (N, O) of a reference, as a share of the variance far from all demonstrations.
 
-    It is the diagonal of equation 2.18 with λ_c = 1, without its factor N/λ_c, over k(ζ, ζ). Reference points are the
-    steps at which at least one recording has a sample. The share is close to 0 there and approaches 1 in a gap that is
-    long compared with the kernel's length scale.
+    The share is the diagonal of equation 2.18 with λ_c = 1, without the factor N/λ_c, divided by k(ζ, ζ). Reference
+    points are the steps at which at least one recording has a sample. The share is close to 0 there and approaches 1 in
+    a gap that is long compared with the kernel's length scale.
 
     Args:
         reference: Reference of the demonstrations.

@@ -228,7 +228,7 @@ def _inward_nudge(lower: float, upper: float) -> float:
 @register(ACTIVE_CONSTRAINTS, "keep_above")
 @dataclass(frozen=True)
 class KeepAbove(FrameConstraint):
-    """Lower bound on the height of points fixed to the end effector; a projection lifts it along F's z axis."""
+    """Lower bound on the height of points of the end effector E; a projection lifts E along F's z axis."""
 
     height_m: float  # lower bound along F's z axis
     frame: str = WORLD  # F: frame of an object, or `world`

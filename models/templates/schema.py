@@ -185,7 +185,7 @@ def _union(kinds: tuple[tuple[str, type], ...]) -> TypeAdapter[Any]:
 
 
 def _kind_model(name: str, kind: type) -> Any:
-    """Return the type of a kind's entries, each of which becomes an instance of the kind."""
+    """Return the type that validates an entry of a kind and converts it to an instance of the kind."""
     hints, types = get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         is_required = field.default is field.default_factory is dataclasses.MISSING

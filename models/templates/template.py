@@ -149,14 +149,14 @@ class SharedControlTemplate:
     def command(
         self, state: int, X_WLast: RigidTransform, X_WRequest: RigidTransform, frames: Frames, period_s: float
     ) -> Command:
-        """Return the pose nearest to a request, of the poses that are allowed and reachable in one period.
+        """Return the pose nearest to a request among the poses that are allowed and reachable in one period.
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. It is also scaled down if one constraint undoes another. Constraints that keep the end effector outside
-        of a shape are linearized at the last command, so that the line to the new command is outside too. From a last
-        command inside the constraints, every command is inside. A last command outside (at the start of an episode, or
-        after an object moved) moves inside at the largest speed.
+        object. The displacement is also scaled down if one constraint undoes another. Constraints that keep the end
+        effector outside of a shape are linearized at the last command, so that the line to the new command is outside
+        too. If the last command is inside the constraints, so is the new one. If the last command is outside (at the
+        start of an episode, or after an object moved), the commands move inside at the largest speed.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
@@ -237,8 +237,8 @@ class SharedControlTemplate:
     def next_state(self, state: int, X_WE: RigidTransform, frames: Frames, period_s: float | None = None) -> int:
         """Return the state after `state`, at most one transition away.
 
-        If `period_s` is given, X_WE is the last command, and a state is not entered while its constraints cannot be
-        reached from X_WE in one period.
+        If `period_s` is given, X_WE is the last command, and a state is only entered if one period is enough to move
+        from X_WE into its constraints.
         """
         for source, sign, target, threshold in self._exits[state]:
             distance = self.states[source].transition_distance.value(X_WE, frames)
@@ -280,7 +280,7 @@ class SharedControlTemplate:
         """Return the progress in the task: that of previous phases plus the weighted decrease of this phase's distance.
 
         An increase of progress is d_{t−1} − d_t of equation 3.2, on one scale for all phases. Progress is continuous at
-        a transition if the distance of the next phase is its starts_at there.
+        a transition if the distance of the next phase equals its `starts_at` there.
         """
         phase = self.states[state]
         return self._initial_progress[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))

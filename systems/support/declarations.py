@@ -194,7 +194,7 @@ def update(
 
 
 def reset_to_default(system: LeafSystem) -> Callable[[Context, DiscreteValues], None]:
-    """Return a reset that restores the default of every discrete state that has been declared."""
+    """Return a reset that restores the defaults of the discrete states; call this after all are declared."""
     default = system.AllocateDiscreteVariables()
     return lambda context, discrete_state: discrete_state.SetFrom(default)
 

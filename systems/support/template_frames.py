@@ -19,7 +19,7 @@ class TemplateFrames:
     no additional port, and a reset moves an object with `set`.
 
     Args:
-        system: System under construction; its outputs that use the frames depend on `ticket`.
+        system: System under construction; outputs that use the frames must depend on `ticket`.
         template: Template with the frames.
         frames: Default poses by name of the frame.
 

@@ -30,7 +30,7 @@ from guiderail.models.parts.assembly_check import (
 from guiderail.models.parts.assembly_check import shrink as shrink_part
 from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
-from guiderail.models.parts.preparation import MAX_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
+from guiderail.models.parts.preparation import MIN_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact, cpu_time
@@ -167,10 +167,10 @@ def create_task(
     tolerance = choose_tolerance(clearance)
     (lean_plug, first), (lean_socket, second) = (decimate(part, tolerance) for part in parts)
     snapping = _snapping(lean_plug, lean_socket, path, first + second)
-    yaw = max(MAX_YAW, (1.0 + COMMANDED_TURN) * search_turn * DEGREE)
+    yaw = max(MIN_YAW, (1.0 + COMMANDED_TURN) * search_turn * DEGREE)
     both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, max(first, second), snapping, yaw)
     surfaces = dict(zip(("plug", "socket"), both, strict=True))
-    deviation = max(surface.deviation for surface in both)
+    deviation = max(part.repair.moved + surface.deviation for part, surface in zip(parts, both, strict=True))
     log(_describe_surfaces(parts, both, deviation, clearance))
     # Symmetries leave a turn unchanged, but a reflection would reverse the one that a policy searches.
     sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path)

@@ -37,7 +37,7 @@ LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger 
 
 
 class BncUncertainty(HiddenOffsets):
-    """Sampler of the offsets of jack and plug; `HiddenOffsets` has the options of a reset.
+    """Sampler of the offsets of jack and plug; see `HiddenOffsets` for the options of a reset.
 
     - "per_run": the jack is offset by 1.0 to 1.5 mm in a random direction, sampled once per run; the plug is within
       0.3 mm of its nominal position in the tool, sampled each episode. The thesis uses this setting.
@@ -69,7 +69,7 @@ class BncUncertainty(HiddenOffsets):
         self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)
 
     def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
-        # Every kind samples it, so that the random streams of the kinds agree.
+        # Every kind samples this offset, so that the random streams of all kinds agree.
         return self._turned(in_ring(rng, *self.offset_range), rng)
 
     def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

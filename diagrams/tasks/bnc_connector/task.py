@@ -62,7 +62,7 @@ def reference_trajectory(demonstrations: str, count: int | None = None, **fit: A
     return _fit_reference(demonstrations, count, tuple(sorted(fit.items())))
 
 
-@cache  # its arguments are positional, so that omitted and default arguments share a fit
+@cache  # called with positional arguments only: an omitted argument and its default have the same key
 def _fit_reference(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **dict(fit))
@@ -87,7 +87,7 @@ MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the 
 
 
 def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
-    """Return an action (2,) in x and y that opposes the contact torque of the rim, to move towards the jack."""
+    """Return an action (2,) in x and y along (−τ_y, τ_x) of the contact torque on the rim, towards the jack."""
     step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
     is_on_rim = observation[Z] > SCALED_RIM and observation[FORCE_Z] > CONTACT_FORCE
     if not (PRESSING[0] < step < PRESSING[1] and is_on_rim):

@@ -107,7 +107,7 @@ class GridClampWorkcell(MovableWorkcell):
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
 # Reward per distance gained towards the holes' axis [1/m], large because steps are fractions of a millimeter.
-# Terminal reward of a collision, so that ending an episode at once does not cost less than pressing gently for long.
+# Terminal reward of a collision. It makes an early collision cost more than a long episode of gentle pressing.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
 
@@ -133,7 +133,7 @@ KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with "none"
 
 
 class GridClampUncertainty(HiddenOffsets):
-    """Sampler of the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
+    """Sampler of the offsets of table and clamp; see `HiddenOffsets` for the options of a reset.
 
     - "per_run": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp offset,
       all hidden and the same for a whole run. In an episode the clamp is picked up at one sampled place, with a

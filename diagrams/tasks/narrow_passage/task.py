@@ -190,7 +190,7 @@ class NarrowPassage(Task):
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success at the goal, blocked at a wall without progress, and collision if obstacles end the episode.
 
-        Collision, which has priority, is the robot's center in an obstacle.
+        A collision means that the robot's center is inside an obstacle; this term takes precedence.
         """
         geometry = self._geometry
 

@@ -181,7 +181,7 @@ def _is_row(row: Any) -> bool:
 
 
 def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
-    numbers = np.array(rows, dtype=float)  # None becomes NaN; no bound is NaN
+    numbers = np.array(rows, dtype=float)  # None becomes NaN; all numbers are finite
     return np.where(np.isnan(numbers), missing, numbers)
 
 
@@ -320,7 +320,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
 
 
 def task_folder_digest(folder: Path) -> str:
-    """Return a digest of a task: of its file without the measurements, and of the files that it names.
+    """Return a digest of `task.yaml` without its measurements, and of all files that `task.yaml` names.
 
     Raises:
         InputError: As `read_task_file`.

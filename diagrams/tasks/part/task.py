@@ -121,7 +121,7 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
 IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
-FOLLOWING = 3.0  # rate at which the command follows a plug in the socket, per 2 mm of distance [1/s]
+FOLLOWING = 3.0  # action rate per 2 mm of distance from the command to a plug in the socket [1/s]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
@@ -165,10 +165,10 @@ class PartUncertainty(BncUncertainty):
 class ScriptedSearch:
     """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
 
-    Below the rim, while it is not blocked, the command follows the plug sideways, so that it does not push it against a
-    wall. If the task has a `search_turn`, a third action turns a blocked plug to and fro.
+    A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows it sideways and so does
+    not push it against a wall. If the task has a `search_turn`, a third action turns a blocked plug back and forth.
 
-    An episode starts where the observed time does not increase; the action is then zero. The search integrates the
+    An observed time that does not increase starts a new episode with a zero action. The search integrates the
     action and not the displacement, because the displacement per action depends on the guidance and changes during the
     motion.
     """

@@ -62,7 +62,7 @@ HARD: Mapping[str, Any] = {
     "mug_inner_diameter": 0.07,
     "time_limit": 6.0,
 }
-"""Options of difficulty="hard": the mug is not where the template assumes, by an error that is sampled and observed."""
+"""Options of difficulty="hard": the template assumes a mug position with an error, which is sampled and observed."""
 
 
 MOST_BALLS = 8

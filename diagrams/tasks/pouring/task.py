@@ -47,7 +47,7 @@ SHAPING = 200.0  # equation 3.7
 APPROACH = 15.0  # [1/m] equation 3.9
 NEAR_BONUS = 0.2  # bonus per action within `NEAR`
 TILT = 20.0  # [1/rad] equation 3.10
-NEAR = 0.07  # [m] distance of the tips at which pouring begins: the rims keep them beyond the 0.04 of the thesis
+NEAR = 0.07  # [m] distance of the tips at which pouring begins; the rims prevent the 0.04 m of the thesis
 POUR = 2  # index of the template's state Pour
 AIM = np.array([0.0, -0.045])  # [m] position of the tip in the mug's frame from which both balls fall into the mug
 AIMING = 2000.0  # reward per distance gained towards `AIM` [1/m]: 50 mm earn half as much as the whole tilt
@@ -267,7 +267,7 @@ class Pouring(Task):
         """Return collision, success and spill; an episode that touched the mug is no success.
 
         An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug. It is
-        a success when they have been in the mug for `POURED_STEPS`, because a ball can bounce out again.
+        a success after `needed` balls have been in the mug for `POURED_STEPS`, because a ball can bounce out again.
         """
         config, needed = self._scene_config, self.options.needed
         mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2

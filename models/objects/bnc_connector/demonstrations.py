@@ -3,8 +3,8 @@
 The scripted demonstrator replaces the human hand of the thesis (section 4.4.2). Its motions differ randomly: it
 approaches the jack roughly, wanders over the rim with a light push until the plug drops in, is precise where the
 connector guides the motion, and varies its speed. It moves the *desired* pose of a station with impedance control. The
-file holds the commanded and the measured poses. A primitive learns the commanded ones, because the push is the
-difference between commanded and measured poses.
+file `bnc_connector.npz` holds the commanded and the measured poses. A primitive learns the commanded ones, because the
+push is the difference between commanded and measured poses.
 
 `python -m research.generate connector-demonstrations` records them again.
 """

@@ -1,9 +1,9 @@
 """Five demonstrations of searching for a jack at an uncertain position, inserting and locking the plug.
 
 The demonstrator circles around the expected position of the jack with a light push, and then inserts the plug. The five
-circles begin a fifth of a turn apart. At every time of the search the five lie evenly on a circle: their mean is its
-center, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
-the same effect in every direction during the whole search.
+circles begin a fifth of a turn apart. During the search the five positions are always evenly spaced on a circle. Until
+the plug drops in, their mean is the center of the circle, and their covariance is the same in every direction. An
+action of a policy therefore has the same effect in every direction during the whole search.
 
 There are two sets. The push of "search" is light. That of "firm_search", recorded on an arm, is four times as large.
 The torque from the rim shows on which side of the rim the plug stands. With the firm push this torque is as large as
@@ -35,8 +35,8 @@ FIRM_PATH = Path(__file__).with_name("bnc_firm_search.npz")
 
 RADIUS = 2.5 * MM  # radius of the circle
 TURN = 0.3  # period of the circle [s], much shorter than the search
-SEARCH_PUSH = 1.5 * MM  # distance of the command below the rim, about two newtons
-FIRM_PUSH = 6.0 * MM  # about nine newtons
+SEARCH_PUSH = 1.5 * MM  # distance of the command below the rim, which causes a force of about two newtons
+FIRM_PUSH = 6.0 * MM  # distance of the command below the rim, which causes a force of about nine newtons
 SEARCH = (1.2, 3.0)  # begin and end of the search [s]
 HOLD_UNTIL, IN_BY = 3.6, 4.1  # times when the circle begins to shrink and when it has vanished [s]
 
@@ -102,5 +102,5 @@ def load() -> Demonstrations:
 
 
 def load_firm() -> Demonstrations:
-    """Load the commanded poses with the firm push, of the same shape."""
+    """Load the commanded poses with the firm push: five demonstrations of 400 poses in the locked frame."""
     return Demonstrations.load(FIRM_PATH)

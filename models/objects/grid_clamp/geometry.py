@@ -4,11 +4,11 @@ Frames. The table's frame G lies in its surface at the center of the middle hole
 tip of the middle peg, z up along the peg. The clamp has snapped in at X_GC = (0, 0, −`peg_length`), with its shoulder
 on the table.
 
-Contact. Every hole is an open rigid surface that collides only with its own peg: the face around it, a chamfer and a
-short wall, because a wall of the hole's full depth would take half of the simulation time. Pegs are compliant convex
-solids with as many sides as their holes, so that few triangles keep the full clearance. The middle hole has a lip and
-the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains the clamp. The body
-is a soft pad, thick enough for impacts, that collides only with the table's slab.
+Contact. Every hole is an open rigid surface that collides only with its own peg. It consists of the face around the
+hole, a chamfer and a short wall; a wall of the hole's full depth would take half of the simulation time. Pegs are
+compliant convex solids with as many sides as their holes, so that few triangles keep the full clearance. The middle
+hole has a lip and the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains
+the clamp. The body is a soft pad, thick enough for impacts, that collides only with the table's slab.
 
 `python -m guiderail.models.objects.grid_clamp.sdf` writes the SDF and OBJ files in this folder.
 """

@@ -76,7 +76,7 @@ class PassageGeometry:
     def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
         """Return the distance d_t [m] of the robot's center from an obstacle's edge, negative inside (equation 4.24).
 
-        The center is (2,) [m], and so is the obstacle's, by default the attribute `obstacle`.
+        `pose` (2,) [m] is the robot's center, and `obstacle` (2,) [m] that of the obstacle; default: the attribute.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius

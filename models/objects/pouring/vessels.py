@@ -51,7 +51,7 @@ class Vessel:
         return SpatialInertia(self.mass, center, solid.ShiftFromCenterOfMass(-center))
 
     def boxes(self) -> list[tuple[RigidTransform, Box]]:
-        """Return the boxes of the wall in the tip frame; their inner faces close the ring."""
+        """Return the boxes of the wall in the tip frame; adjacent boxes share an outer edge, so the ring is closed."""
         radius = self.inner_diameter / 2
         width = 2 * (radius + self.wall) * np.tan(np.pi / WALL_BOXES)
         boxes = []

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.parts import repair
 from guiderail.models.parts.mesh_file import load_part
+from guiderail.models.parts.solids import to_manifold
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -97,6 +99,25 @@ def test_load_part_refuses_a_hole(tmp_path):
     hole(box()).export(tmp_path / "part.stl")
     with pytest.raises(InputError, match=r"\(3 open edges.*close it"):
         load_part(tmp_path / "part.stl", "mm")
+
+
+def test_load_part_closes_a_small_hole_and_states_the_distance(tmp_path, monkeypatch):
+    def closed(gaps, vertices, triangles):
+        return to_manifold(np.asarray(whole.vertices) * 1e-3, np.asarray(whole.faces))
+
+    monkeypatch.setattr(repair, "_wrap", closed)
+    for scale, is_closed in ((0.05, True), (1.0, False)):  # the edges of the hole are 0.5 and 10 mm long
+        whole = box().apply_scale(scale)
+        hole(whole.copy()).export(tmp_path / "part.stl")
+        if is_closed:
+            part = load_part(tmp_path / "part.stl", "mm")
+            assert 5e-5 < part.repair.moved < repair.MAX_MOVED
+            assert "surface moved by at most 0." in str(part.repair)
+            continue
+        with pytest.raises(
+            InputError, match=r"has a hole around .* \(3 open edges\), which a repair would close by moving"
+        ):
+            load_part(tmp_path / "part.stl", "mm")
 
 
 @pytest.mark.parametrize(
