@@ -28,7 +28,7 @@ def zero(rng: np.random.Generator, size: int) -> PolicyFn:
 
 
 def uniform_random(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return a policy of independent uniform actions in [−1, 1], as an untrained policy has."""
+    """Return a policy of independent uniform actions in [−1, 1], like those of an untrained policy."""
     return lambda observation: rng.uniform(-1.0, 1.0, size)
 
 
@@ -104,7 +104,7 @@ def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
 
 
 def scripted_policies(task: str, difficulty: str = STANDARD) -> Mapping[str, PolicyFn]:
-    """Return a task's scripted policies by name, the default for `difficulty` first; none for other tasks."""
+    """Return a task's scripted policies by name, the default for `difficulty` first; empty for an unregistered task."""
     return TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
 
 

@@ -31,10 +31,10 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataF
 def episodes_file(
     folder: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
 ) -> Path:
-    """Return the file of evaluated episodes of the policy `name`, which depend on all other arguments.
+    """Return the path of a policy's evaluated episodes, with its `name` and a digest of all that they depend on.
 
-    `about` is anything that they depend on besides the arguments `how` of `evaluate_policy`, such as the digest of a
-    policy. They do not depend on `label` and `processes`.
+    The digest covers the environment, the run's seed, the task's files, package versions, and the arguments `how` of
+    `evaluate_policy` except `label` and `processes`. `about` is anything else, such as the digest of the policy.
     """
     how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)

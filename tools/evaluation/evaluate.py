@@ -92,7 +92,7 @@ def evaluate_policies(
     check_seed(seed)
     processes = check_processes(processes)
     if has_image(env.observation_space):
-        processes = 1  # the renderer has threads, which a fork does not have
+        processes = 1  # the renderer has threads, which a fork does not inherit
     names = list(policies)
 
     def run(number: int) -> tuple[dict[str, Any], Any]:
@@ -119,7 +119,7 @@ def evaluate_policies(
 def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
     """Return the rows of held-out episodes of one policy; see `evaluate_policies` for the other arguments.
 
-    The label is that of the progress bar on standard error; there is no bar without one.
+    The label is that of the progress bar on standard error; without a label there is no bar.
     """
     ((_, rows, _),) = evaluate_policies(env, {POLICY: act}, labels={POLICY: label}, **how)
     return rows

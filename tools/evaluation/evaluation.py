@@ -102,9 +102,9 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of the policy named `POLICY` with that of baseline policies under the same conditions.
 
     The test is McNemar's, exact and one-sided. Only episodes in which exactly one of the two policies succeeds count: a
-    policy that is not better wins half of them on average. The result is the largest p of all baseline policies, so
-    that "better than the best baseline" means better than each of them (intersection-union test). No correction for
-    their number is needed. Without a baseline policy the result is None.
+    policy that is not better wins at most half of them on average. The result is the largest p of all baseline
+    policies, so that "better than the best baseline" means better than each of them (intersection-union test). No
+    correction for their number is needed. Without a baseline policy the result is None.
     """
     won = rows[POLICY]["success"].to_numpy(float)
     others = {name: table["success"].to_numpy(float) for name, table in rows.items() if name != POLICY}

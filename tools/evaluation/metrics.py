@@ -67,8 +67,8 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 def wilson_of_each(successes: Sequence[int], episodes: Sequence[int]) -> list[tuple[float, float]]:
     """Return the 95 % Wilson interval of each seed's success rate.
 
-    No interval covers all seeds together: episodes of one policy are independent, episodes of several policies are
-    not, because all episodes of one seed share what that seed learned.
+    The episodes of all seeds are not pooled into one interval, because they are not independent: all episodes of one
+    seed use the same policy.
     """
     return [wilson(won, of) for won, of in zip(successes, episodes, strict=True)]
 
@@ -153,7 +153,7 @@ COLLISION = "contact force, or the task's own collision signal, above its limit"
 
 
 def _violations(compute: Callable[[str], Callable[[Any], float]]) -> list[Metric]:
-    """Return the largest violations of the commanded and of the measured poses, as `compute` takes them by name."""
+    """Return the metrics of the largest violation of commanded and measured poses, computed by `compute(name)`."""
     meaning = "largest constraint violation of any {} pose; negative is slack"
     pairs = [(f"max_{which}_violation", meaning.format(which)) for which in ("commanded", "measured")]
     return [Metric(name, VIOLATION, meaning, compute(name)) for name, meaning in pairs]
@@ -190,8 +190,8 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
     """Return an episode's row for an environment that is not of this package, with the columns that `info` provides.
 
-    The success of the episode is `is_success` or `success` in the `info` of any step; `constraint_violation` and
-    `contact_force` are those of a step. `is_terminated` is False for a time limit.
+    The success of the episode is `is_success` or `success` in the `info` of any step. Of `constraint_violation` and
+    `contact_force`, the largest value of any step is used. `is_terminated` is False for a time limit.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -340,7 +340,7 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
     With a task, its own statistics may be named too.
 
     Raises:
-        InputError: If a statistic is unknown, or the episodes lack a column that one is computed from.
+        InputError: If a statistic is unknown, or the episodes lack a column that a statistic is computed from.
     """
     known = statistics_of(task) if task else STATISTICS
     statistics: dict[str, Any] = {}

@@ -149,8 +149,8 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
 
     Args:
         source: Folder with `policy.safetensors`; `pretrained:NAME`; .zip of Stable-Baselines3; .onnx; TorchScript
-            (.pt, .ts, .torchscript); or `module:function`, where a module is a module's name or a file (.py), and a
-            function any policy that `as_policy` takes, or a class of such policies.
+            (.pt, .ts, .torchscript); or `module:function`, where `module` is a module's name or a file (.py), and
+            `function` is any policy that `as_policy` takes, or a class of such policies.
         trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
 
     Raises:

@@ -60,7 +60,7 @@ def _scalar(option: str, unit: float = 1.0, kind: type = float) -> Callable[[Env
 
 
 def _force_and_torque(option: str) -> Callable[[Environment, float], dict[str, Any]]:
-    """Change a force [N] and the torque that it has at a lever arm of 0.02 m."""
+    """Return the change of an option (force [N], torque [Nm]); the torque is the force times a lever arm of 0.02 m."""
     return lambda environment, value: {option: (value, 0.02 * value)}
 
 

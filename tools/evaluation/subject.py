@@ -35,7 +35,7 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Raise an InputError if an environment has another guidance than the training, which defines what actions mean."""
+    """Raise an InputError if the guidance is not that of the training: guidance defines the meaning of actions."""
     trained, used = own.get("guidance"), other.get("guidance")
     if trained != used:
         raise InputError(
@@ -168,9 +168,9 @@ def _digest(source: Path) -> str:
 def make_baselines(
     config: RunConfig | None, environment: Mapping[str, Any], baselines: Mapping[str, MakePolicy] | Sequence[str] | None
 ) -> Mapping[str, MakePolicy]:
-    """Return the functions that make baseline policies by name, given as such or by names; None for the default set.
+    """Return functions that make baseline policies, by name; `baselines` are such functions, or only the names.
 
-    There is no configuration if the environment is given as an object.
+    With None, the default set is returned. `config` is None if the environment is given as an object.
 
     Raises:
         InputError: If a name is unknown.

@@ -32,7 +32,7 @@ LEARNED = "learned"
 
 
 def _with_placeholders(**examples: Any) -> AfterValidator:
-    """Return a validator of file names with placeholders in braces, each given by an example of its value."""
+    """Return a validator of file names with placeholders in braces; `examples` has a value of each."""
 
     def check(name: str) -> str:
         known = ", ".join(f"{{{word}}}" for word in examples)
@@ -40,7 +40,7 @@ def _with_placeholders(**examples: Any) -> AfterValidator:
             fields = [field[1:] for field in string.Formatter().parse(name) if field[1] is not None]
         except ValueError:
             raise ValueError(f"{name!r} has an open brace: it may have {known}") from None
-        # Format specifications, which could set a width of gigabytes, conversions and attributes are not allowed.
+        # Format specifications (which could set a width of gigabytes), conversions and attributes are not allowed.
         if any(word not in examples or specification or conversion for word, specification, conversion in fields):
             raise ValueError(f"{name!r} has an unknown placeholder: it may have {known}")
         path = PurePath(name.format(**examples))
@@ -187,7 +187,7 @@ class Study(_Strict):
 def load_study(file: Path | str) -> Study:
     """Read a study's YAML file.
 
-    A task may be the path of a task folder, from the working directory, as in `guiderail train`.
+    A task may be the path of a task folder, relative to the working directory, as in `guiderail train`.
 
     Raises:
         InputError: If the file does not exist or is not a valid study, or if the task folder is not valid.

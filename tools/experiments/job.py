@@ -308,7 +308,7 @@ def _best_constant(job: Job) -> np.ndarray:
 
 
 def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: Mapping[str, str]) -> Outcome:
-    """Return the rows of a job by `work`, or one sentence on its failure, and log the attempt; raise nothing.
+    """Run `work` on a job and log the attempt; return its rows, or one sentence on its failure, and raise nothing.
 
     A worker with other package versions than `versions` is refused, because results depend on them.
     """

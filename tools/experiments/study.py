@@ -2,7 +2,7 @@
 
 Each seed has rows of its own, so that failures of single seeds are not averaged away. An interrupted study is
 resumed by the same call, and studies that share runs use them again. An engine runs the jobs; the rows do not depend on
-which one.
+the engine.
 """
 
 from __future__ import annotations

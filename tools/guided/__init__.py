@@ -1,1 +1,1 @@
-"""Guidance around environments that were made elsewhere: `GuidedEnv`, which needs neither Drake nor PyTorch."""
+"""Guidance for environments of other packages: `GuidedEnv`, which needs neither Drake nor PyTorch."""

@@ -29,9 +29,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     The action is (A,) in [−1, 1], one entry for each of `action_dims` or each input of the template. It is applied for
     `action_repeat` steps of the environment, whose rewards are added up. An episode is truncated when the motion has
-    ended. `info` has, in addition to the environment's: `constraint_violation` (the largest of the commands of the
-    action's steps; negative inside, at most 1e-9 for guidance that enforces the constraints), `fallback` (number of
-    these steps without a solution), `phase` (0 to 1), `command` (O,) and `segment` (its name).
+    ended. `info` has, in addition to the environment's: `constraint_violation` (the largest of all commands of the
+    action; negative inside, at most 1e-9 for guidance that enforces the constraints), `fallback` (number of the
+    action's steps without a solution), `phase` (0 to 1), `command` (O,) and `segment` (its name).
 
     Args:
         env: Environment to wrap; its own action is what `to_action` returns.
@@ -54,10 +54,10 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         history: P, past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
         horizon: H, future points at which the constraints are satisfied.
-        orientation: Meaning of outputs 3 to 6: "rotation_vector" or "euler_zyx".
+        orientation: Meaning of the last three of six outputs: "rotation_vector" or "euler_zyx".
         observe: What is appended to the observation: "phase" (1,), and "command" (O,), the last command in the
-            segment's frame, scaled to the demonstrations' range. A template's is in its first frame, in units of 0.2 m
-            and π.
+            segment's frame, scaled to the demonstrations' range. The command of a template is in the template's first
+            frame, in units of 0.2 m and π.
 
     Raises:
         InputError: If an argument is out of range. In `reset`, if the measured pose is not finite. In `step`, if the
@@ -227,7 +227,7 @@ def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment
 
 
 class GuidedVectorEnv(SyncVectorEnv):
-    """Vector environment of `GuidedEnv`s that share their guidance; each behaves as it does alone.
+    """Vector environment of `GuidedEnv`s that share their guidance; each behaves like a single `GuidedEnv`.
 
     The guidance is fitted once. `LcNsKmp.predict_batch` computes the predictions of all environments at a control step.
     An environment is reset in the step after the end of its episode (`AutoresetMode.NEXT_STEP`).

@@ -1,4 +1,4 @@
-"""Guides: compute commands from a policy's actions and demonstrations or a shared control template."""
+"""Guides, which compute commands from a policy's actions and from demonstrations or a shared control template."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from guiderail.tools.guided.segment import Frame, Segment
 PRIMITIVE_GUIDANCE = ("kgrl", "skgrl", "kmp", "residual", "clipped_residual")
 GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
 
-# Unit of an observed command of a template, which has no demonstrations with a range [m, rad].
+# Scale of the observed command of a template [m, rad]; a template has no demonstrations that define a range.
 _COMMAND_SCALE = np.array([0.2, 0.2, 0.2, np.pi, np.pi, np.pi])
 
 Request = tuple[LcNsKmp, int, np.ndarray, np.ndarray | None]
@@ -68,7 +68,7 @@ class Guide(ABC):
 
         Args:
             env: Environment, for the callables of segments and templates.
-            observation: Its last observation.
+            observation: Last observation of `env`.
             action: Policy's action (A,), in [−1, 1].
             pose: Measured pose (O,).
         """
@@ -118,7 +118,7 @@ class _FittedSegment:
             self.primitive_for(self.as_constraints(given))  # refuses invalid constraints before an episode
 
     def as_constraints(self, given: Any) -> LinearConstraints:
-        """Return linear constraints: the given ones, or a box for each step's phase from demonstrated bounds."""
+        """Return the linear constraints in `given`; demonstrated bounds become a box for each step."""
         if given is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(given, DemonstratedBounds):
@@ -174,7 +174,7 @@ class GuideSettings:
     history: int = 4  # P, past outputs that the motion of sKGRL passes through
     history_variance: float = 1e-6  # ρ, variance of the past outputs [output²]
     horizon: int = 20  # H, future points at which the constraints are satisfied
-    orientation: Orientation = "rotation_vector"  # meaning of outputs 3 to 6 of a pose, in frames with a rotation
+    orientation: Orientation = "rotation_vector"  # meaning of the last three of six outputs, in frames with a rotation
 
 
 class PrimitiveGuide(Guide):

@@ -45,15 +45,15 @@ class Frame:
             raise InputError("a frame's rotation must be an orthonormal matrix (3, 3)")
 
     def to_world(self, output: np.ndarray, orientation: Orientation) -> np.ndarray:
-        """Return an output (O,) in F as one in W; entries 3 to 6 are an orientation if the frame has a rotation."""
+        """Transform an output (O,) from F to W; if F has a rotation, the last 3 of 6 entries are an orientation."""
         return self._transformed(output, orientation, is_inverse=False)
 
     def to_frame(self, output: np.ndarray, orientation: Orientation, near: np.ndarray | None = None) -> np.ndarray:
-        """Return an output (O,) in W as one in F.
+        """Transform an output (O,) from W to F.
 
         Args:
             output: Output (O,) in W.
-            orientation: Meaning of entries 3 to 6.
+            orientation: Meaning of the last three of six entries.
             near: Output (O,) in F; full turns are added to the orientation so that it is nearest to this one.
         """
         return self._transformed(output, orientation, is_inverse=True, near=near)
@@ -110,7 +110,7 @@ class Segment:
             the most frequent value of the demonstrations at its phase.
         until: (env, observation) → true to end the segment early; by default it ends with its steps.
         num_steps: Control steps; the mean duration of the demonstrations divided by the period by default.
-        dwell: Control steps for which the last point is held after that.
+        dwell: Control steps for which the last point is held after `num_steps`.
         floor: Standard deviation (O,) or scalar added to every covariance [unit of the output].
         name: Name of the segment, in `info`.
 
@@ -202,7 +202,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
 
 
 def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np.ndarray], bool]]) -> list[list[int]]:
-    """Return for each recording the sample indices at which the conditions hold first, each after the one before.
+    """Return the sample indices of events in each recording: the first match of each condition after the event before.
 
     Args:
         signals: M arrays (N_m, S), such as outputs and a gripper.

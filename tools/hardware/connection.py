@@ -27,7 +27,7 @@ LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall cloc
 COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
 MAX_DURATION = 7 * 24 * 3600.0  # longest run of a simulated driver, by the robot's clock [s]
 DEFAULT_RATE = 0.2  # rate of a simulated robot's clock; simulating contact at 1 kHz is slower than real time
-FCI = "fci"  # driver of a Franka on its own protocol
+FCI = "fci"  # driver of a Franka arm over the Franka Control Interface
 SIMULATED = (DEFAULT_ROBOT, FCI)  # drivers that have a simulated robot
 ROBOT_TIMEOUT = 60.0  # longest wait for the first status of a simulated driver, which has to start first [s]
 NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine the arm will be stopped because commands are late"
@@ -74,8 +74,8 @@ class RobotConnection:
     robot: str = ""  # name of the arm; by default the driver's, or `DEFAULT_ROBOT`
     driver: str = ""  # name of the driver; empty for the one with the robot's name
     sim: bool = False  # use a simulated driver, in a process of its own
-    # Run station and simulated driver in lockstep instead of by the wall clock; always so for the driver fci, whose
-    # robot at 1 kHz is slower than real time on most machines.
+    # Run station and simulated driver in lockstep instead of by the wall clock. Always True for the simulated robot of
+    # the driver fci, because at 1 kHz it is slower than real time on most machines.
     synchronous: bool = False
     rate: float = DEFAULT_RATE  # rate of a simulated robot's clock relative to the wall clock
     scenario: Path | None = None  # scenario file with robot, address and surroundings

@@ -345,7 +345,7 @@ def recordings_folder(run: Path) -> Path:
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
     """Return a run's environment options without those of the station that it was trained on.
 
-    A reward that needs simulation state is replaced by the task's first one that does not: no policy depends on it.
+    A reward that needs simulation state is replaced by the task's first reward that does not; no policy uses rewards.
 
     Raises:
         InputError: If `station` is simulated.

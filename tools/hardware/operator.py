@@ -35,7 +35,7 @@ class OperatorKeys:
         return self._is_stop_requested
 
     def describe(self, *, has_pauses: bool = False) -> str:
-        """Return a sentence on the keys, including the pause key if `has_pauses`; only Ctrl-C without a terminal."""
+        """Return a sentence on the keys, with the pause key if `has_pauses`; without a terminal, only Ctrl-C works."""
         if not sys.stdin.isatty():
             return "Ctrl-C stops the arm"
         return "Enter or Ctrl-C stops the arm" + has_pauses * ", p and Enter pauses it at the end of an episode"
@@ -67,7 +67,7 @@ def operator_keys() -> Iterator[OperatorKeys]:
 
 
 def confirm(question: str) -> None:
-    """Ask the operator at the terminal to confirm; what was typed before the question is no answer to it.
+    """Ask the operator at the terminal to confirm; input typed before the question is discarded.
 
     Raises:
         InputError: If the answer is not yes, Ctrl-C is pressed, or there is no terminal.
@@ -75,7 +75,7 @@ def confirm(question: str) -> None:
     if not sys.stdin.isatty():
         raise InputError("this has to be confirmed at a terminal, or by --yes of a caller who has checked it")
     termios.tcflush(sys.stdin, termios.TCIFLUSH)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # nothing moves that Ctrl-C would have to stop
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # nothing moves, so Ctrl-C only ends the question
     try:
         answer = input(f"{question} Type yes: ")
     except (EOFError, KeyboardInterrupt):

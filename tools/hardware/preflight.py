@@ -107,7 +107,7 @@ class PreflightChecks:
         return check_robot(self._station, self.simulator.get_context(), self._start, num_commands)
 
     def repeat(self) -> list[Check]:
-        """Repeat the checks on new statuses, after a time without any."""
+        """Receive new statuses after a pause in which none were received, and repeat the checks."""
         self._clock.begin()
         self._clock.advance(self.simulator, self._station, self._num_steps)
         # A new simulator accepts the arm's position at once, even if it was moved by hand in the meantime.
@@ -150,7 +150,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     payload = sum(body.default_mass() for body in arm.tool)
     torque_shares, axis_limits = station.max_torque_shares(positions), station.impedance.limits[:3]
     if isinstance(driver, PoseDriver):
-        # Nothing clips the torques of the robot's own impedance: the limits of the external torques stop the arm.
+        # Nothing clips the torques of the robot's own impedance controller; its limits of external torque stop the arm.
         torque_share = (torque_shares * np.divide(limits.torque, limits.external_torque)).max()
         torques = f"stopped at external torques of {_numbers(limits.external_torque, 1)} Nm"
         hint = "; above 100% a firm push stops the arm: choose a smaller force_limit"
@@ -211,8 +211,8 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
 def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
     """Show the checks and have the operator confirm them; then repeat them, because the robot may have changed.
 
-    An error of the robot, such as a reflex, is cleared before if the operator agrees. With `assume_yes` nothing is
-    asked. Returns the checks that were shown.
+    If the robot reports an error, such as a reflex, and the operator agrees, the error is cleared first. With
+    `assume_yes` nothing is asked. Returns the checks that were shown.
 
     Raises:
         InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an

@@ -33,7 +33,7 @@ RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
 
 
 class RobotStoppedError(Exception):
-    """Error while the arm is being stopped by a limit, a fault or the operator.
+    """Error raised when a limit, a fault or the operator stops the arm.
 
     Attributes:
         fault: Reason of the stop.
@@ -280,7 +280,7 @@ class RobotEnv(DiagramEnv):
     def _return_to_start(self) -> None:
         """Move back along the return path, and slowly to the start.
 
-        Friction can leave a bayonet locked by the first return; then the path is followed once more, there and back.
+        Friction can leave a bayonet locked after the first return. The arm then repeats the path, forward and back.
         If that fails as well, the operator releases the workpiece.
         """
         self._switch_to_transfer()

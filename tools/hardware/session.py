@@ -45,7 +45,7 @@ def robot_session(
     """Wait for the robot, ask for confirmation of the pre-flight checks, and yield the session.
 
     With a simulated driver, a reset samples the offsets of the parts as in simulation. With `assume_yes`, the checks
-    need no confirmation; with a simulated driver as well, resuming after a stop needs none.
+    need no confirmation; if the driver is also simulated, resuming after a stop needs none either.
 
     Raises:
         InputError: If the task cannot be done on hardware, or a check fails or is not confirmed.

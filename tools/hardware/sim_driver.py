@@ -29,7 +29,7 @@ DEFAULT_TASK = "BncConnector"
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # initial pose of the default task: the plug above the jack
 REMOVED = (1.0, 0.0)  # offset of a fixture that is out of the arm's way [m]
 START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # initial pose relative to another task's start pose
-PLANT_STEPS_PER_STATUS = 5  # if not in lockstep; a real arm's own control loop has 1 kHz
+PLANT_STEPS_PER_STATUS = 5  # if not in lockstep: 1 kHz, like a real arm's own control loop
 PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
@@ -57,9 +57,9 @@ def run_sim_driver(
             instead (lockstep).
         offset: Offset (x, y) of the fixture from its nominal position [m].
         scenario: Scenario file with the surroundings; see `load_scenario`.
-        driver: "fci" for a Franka on its own protocol, at the address `url`: in lockstep with a `FciLockstepClock`,
-            without one by the wall clock.
-        joint_friction: Friction of each joint of the Franka [Nm]; by default what its compensation may leave.
+        driver: "fci" for a Franka arm on the Franka Control Interface at the address `url`. It runs in lockstep while a
+            `FciLockstepClock` is connected, otherwise by the wall clock.
+        joint_friction: Friction of each joint of the Franka [Nm]; by default what friction compensation may leave.
         log: Function that shows a message.
 
     Returns:

@@ -41,7 +41,7 @@ class SimulatedEpisode(NamedTuple):
 
 
 class ParallelLearner(Learner):
-    """Learner whose episodes are simulated by N actors, forks of this process, while it learns in this one.
+    """Learner that trains in this process while N actors, which are forks of this process, simulate episodes.
 
     Episode k uses the weights learned from the first k − N episodes, in their order; its random numbers depend only on
     the seed and k. The result of a run therefore depends on N but not on the timing of the processes; the conditions of
@@ -67,8 +67,8 @@ class ParallelLearner(Learner):
             num_envs: Number N of actors.
             seed: Seed of the run.
             num_episodes: Number of episodes of the run.
-            demonstrator: Policy that acts instead of the learner in the first episodes, and the number of them.
-            callbacks: Callbacks of the episodes, in the actor's process.
+            demonstrator: Policy that acts instead of the learner in the first episodes, and their number.
+            callbacks: Callbacks of the episodes; they run in the actors' processes.
 
         Raises:
             InputError: If the learner is not an `OffPolicyLearner`, or the system cannot fork.
@@ -122,7 +122,7 @@ class ParallelLearner(Learner):
         return max(0, index - self._num_envs)
 
     def _exchange(self, timeout: float | None) -> None:
-        """Assign episodes to idle actors and collect simulated ones; wait at most `timeout` [s], or for one if None."""
+        """Assign episodes to idle actors and collect simulated ones; wait at most `timeout` [s], forever if None."""
         assert self._forks is not None
         while self._forks.has_idle and self._assigned < self._num_episodes:
             if (required := self._required(self._assigned)) > self._learned:

@@ -1,4 +1,4 @@
-"""Checkpoint files, from which a run continues bit for bit and which hold no code; and the selection of an actor."""
+"""Checkpoint files, which resume a run bit for bit and store no code, and the selection of the actor to export."""
 
 import json
 from collections.abc import Mapping
@@ -22,11 +22,11 @@ Entry = TypeVar("Entry")
 
 @dataclass
 class Candidate:
-    """Actor with the numbers of consecutive successful greedy episodes before it and from its own episode on."""
+    """Actor of a greedy episode, with the numbers of consecutive greedy successes before and from this episode on."""
 
     actor: Actor  # parameters by name
-    before: int  # number of successes before its own episode
-    since: int = 0  # number of successes from its own episode on
+    before: int  # number of successes before the episode
+    since: int = 0  # number of successes from the episode on
 
     def score(self) -> int:
         """Return the smaller of both numbers: an actor that succeeds by luck has few successes before or after it."""

@@ -1,4 +1,4 @@
-"""Chunk cloning: an ensemble that is regressed on the commanded poses that follow an observation (ACT's objective)."""
+"""Chunk cloning: an ensemble learns to predict the next commanded poses from an observation (ACT's objective)."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -14,7 +14,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.cloning import BcLearner, perceptron
 from guiderail.tools.learning.config import ChunkConfig
 
-MIN_SCALE = 1e-6  # smallest scale of an output; the spread of a constant output is zero
+MIN_SCALE = 1e-6  # smallest scale of an output, because the standard deviation of a constant output is zero
 
 
 class ChunkLearner(BcLearner):
@@ -33,8 +33,7 @@ class ChunkLearner(BcLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If observations are images, the environment is not of a task's diagram, or `pipelined` or
-                `num_envs` is set.
+            InputError: If the environment is not built from a task's diagram, or `pipelined` or `num_envs` is set.
         """
         super().__init__(config, env, **arguments)
         if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
@@ -75,7 +74,7 @@ class ChunkLearner(BcLearner):
         return super().on_episode_end(row)
 
     def _add(self, observations: np.ndarray, chunks: np.ndarray) -> None:
-        """Store observations (n, …) and chunks (n, K, O) with symmetric copies; `_dims` are mapped like actions."""
+        """Store observations (n, …) and chunks (n, K, O) with symmetric copies; outputs `_dims` map like actions."""
         symmetries = [(np.eye(observations.shape[1]), None)]
         if self._symmetry is not None:
             symmetries += [*zip(self._symmetry.observations, self._symmetry.actions, strict=True)]

@@ -123,6 +123,6 @@ class BcLearner(Learner):
 
 
 def perceptron(sizes: list[int]) -> torch.nn.Sequential:
-    """Return linear layers with rectifiers between them."""
+    """Return a multilayer perceptron: linear layers with ReLU activations between them."""
     layers = [layer for into, out in pairwise(sizes) for layer in (torch.nn.Linear(into, out), torch.nn.ReLU())]
     return torch.nn.Sequential(*layers[:-1])

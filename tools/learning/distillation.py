@@ -15,14 +15,14 @@ from guiderail.tools.learning.chunking import ChunkLearner
 from guiderail.tools.learning.config import DistillationConfig
 from guiderail.tools.pretrained import find_run
 
-CLOCK_SPREAD = 1e-6  # largest spread between episodes of an observation entry that depends on the step only
+CLOCK_SPREAD = 1e-6  # an observation entry that varies less than this between episodes depends on the step only
 
 
 class DistillationLearner(ChunkLearner):
     """Learner of a student that maps the teacher's observation directly to the next K commands.
 
-    In every episode the teacher acts, with noise on its actions, so that observations off its own path are visited. The
-    labels are its commands without noise,
+    In every episode the teacher acts with noise, so that observations off the teacher's own path are visited. The
+    labels are the commands of the teacher without noise,
 
         y_{t+k} = LC-NS-KMP(t + k, π(s_t)),   k = 0 … K−1,
 
@@ -37,8 +37,8 @@ class DistillationLearner(ChunkLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If there is no teacher with these observations and actions, or the guidance is not KGRL driven
-                by the clock.
+            InputError: If no teacher is given, the teacher's observations or actions differ from the environment's, or
+                the guidance is not KGRL driven by the clock.
         """
         super().__init__(config, env, **arguments | {"symmetry": None})
         if not config.teacher:
@@ -116,7 +116,7 @@ class DistillationLearner(ChunkLearner):
         return np.max(spreads, axis=0) < CLOCK_SPREAD
 
     def _training_rows(self, random: np.random.Generator) -> np.ndarray:
-        """Return the indices of all samples: the teacher labels any observation, so no spread is estimated."""
+        """Return the indices of all samples: a teacher can label any observation, so no bootstrap sample is needed."""
         return np.arange(len(self._groups))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -2,9 +2,9 @@
 
 `FastTrainingStep` is a mixin that replaces `train` of a Stable-Baselines3 algorithm. All critics are evaluated as one
 batched network, both batches of an update pass the actor at once, the parameters of a network are in one buffer, and
-the gradients are written out, so that no unused gradient is computed. `FastSac` and `FastTqc` are the two algorithms
-with this mixin. `python -m research.benchmarks learner` compares their duration with Stable-Baselines3's; a test
-compares the parameters.
+the gradients are explicit formulas, so that no unused gradient is computed. `FastSac` and `FastTqc` are the two
+algorithms with this mixin. `python -m research.benchmarks learner` compares their duration with Stable-Baselines3's; a
+test compares the parameters.
 """
 
 import math
@@ -26,7 +26,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")  # names in the state dictionary of `torch.
 
 
 class Linear:
-    """The same affine layer of n networks, each with its own weights.
+    """Affine layer of n networks with equal sizes and separate weights, evaluated as one batch.
 
     Attributes:
         weight: Weights (n, outputs, inputs).
@@ -60,7 +60,7 @@ class Linear:
         torch.sum(d, 1, out=self._bias_gradient)
 
     def input_gradient(self, d: torch.Tensor, shared: bool, columns: slice = slice(None)) -> torch.Tensor:
-        """Return the gradient of the loss by `columns` of the input, (n or 1, batch, columns), summed if shared."""
+        """Return the gradient with respect to `columns` of the input, (n or 1, batch, columns); summed if `shared`."""
         by_network = torch.bmm(d, self.weight[:, :, columns])
         return by_network.sum(0, keepdim=True) if shared and self._networks > 1 else by_network
 
@@ -86,7 +86,7 @@ class ForwardCache:
 
 
 class BatchedMLP:
-    """Networks with rectified hidden layers and an affine output; later layers may have more networks than earlier."""
+    """Multilayer perceptrons with ReLU hidden layers, evaluated as one batch; the first layers may be shared."""
 
     def __init__(self, layers: Sequence[Linear], layer_norm: bool):
         """Construct the networks.
@@ -94,7 +94,7 @@ class BatchedMLP:
         Args:
             layers: Layers from input to output. A layer of one network is shared by all networks of the layers after
                 it.
-            layer_norm: Normalize hidden layers, without learned parameters, before they are rectified.
+            layer_norm: Apply layer normalization, without learned parameters, before each ReLU.
         """
         self._layers = list(layers)
         self._layer_norm = layer_norm

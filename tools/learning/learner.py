@@ -102,7 +102,7 @@ class Learner(Callback, ABC):
         """
 
     def submit_episode(self) -> None:
-        """Continue after an episode; its checkpoint, if one is due, has been written."""
+        """Submit the finished episode to training; called after its checkpoint, if one is due, has been written."""
 
     def finish(self) -> None:
         """Block until everything is learned; called after the last episode."""
@@ -266,7 +266,7 @@ class LearningLog:
 
 
 def _make_wandb_output(folder: str) -> Any:
-    """Return an output format of Stable-Baselines3's logger that writes to Weights & Biases and resumes its run."""
+    """Return an output format that logs to Weights & Biases; the same folder always continues the same W&B run."""
     import wandb
     from stable_baselines3.common.logger import KVWriter
 

@@ -128,7 +128,7 @@ def pack_observation(observation: np.ndarray, shape: tuple[int, int, int]) -> np
 
 
 class ImageFeatures(BaseFeaturesExtractor):
-    """Features of a packed observation: those of its image, and its state.
+    """Features of a packed observation: the features of the image, followed by the state.
 
     The image's features are the averages of squares of pixels (thesis, 4.4.1), or the outputs of convolutions. In
     training mode, the image of a convolutional extractor is shifted at random (DrQ; Yarats et al., 2021).

@@ -1,9 +1,9 @@
 """Off-policy learners: any algorithm with the interface of Stable-Baselines3.
 
 Stable-Baselines3 supplies the networks, the replay buffer and the training step. Acting, exploring and the schedule of
-trainings are here, so that all state that a run depends on can be written to a checkpoint. Another algorithm is one
-file: a subclass of `OffPolicyLearner` that names the algorithm's class and is registered by `register_learner`. It is
-trained by the algorithm's own training step. SAC and TQC use an equivalent faster step
+trainings are here, so that all state that a run depends on can be written to a checkpoint. To add an algorithm, derive
+a class from `OffPolicyLearner`, set its attribute `algorithm` and register it by `register_learner`. The learner
+then uses the algorithm's own training step. SAC and TQC use an equivalent faster step
 (`guiderail.tools.learning.fast_sb3`) unless the setting `training_step` is "sb3".
 """
 
@@ -163,7 +163,7 @@ class OffPolicyLearner(Learner):
             self._start_from(*initial, seed)
 
     def _start_from(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any], seed: int) -> None:
-        """Start with the state of another run, but with random generators and a checkpoint selection of its own."""
+        """Load the state of another run, except its random generators, greedy successes and checkpoint selection."""
         generators = random_state()
         try:
             self.restore(arrays, values)
@@ -267,7 +267,7 @@ class OffPolicyLearner(Learner):
         return self.model.predict(observation, deterministic=False)[0]
 
     def _temporally_extended(self) -> np.ndarray | None:
-        """Return a uniform action that lasts for several transitions; None if none is in progress.
+        """Return a uniformly sampled action that is repeated for several transitions; None if no repetition is active.
 
         The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves states in
         which a policy has settled, such as free space, and shows the value of continuing in one direction.
@@ -289,9 +289,9 @@ class OffPolicyLearner(Learner):
     def store(self, transition: Transition) -> None:
         """Add a transition, and its symmetric copies, to the replay buffer.
 
-        A time limit does not terminate the task: its last transition is bootstrapped (partial-episode bootstrapping,
-        Pardo et al., 2018), because the value of a state must not depend on the time left. The observed clock tells the
-        phases of a skill apart; it is not the time left.
+        A time limit does not terminate the task: the episode's last transition is bootstrapped (partial-episode
+        bootstrapping, Pardo et al., 2018), because the value of a state must not depend on the time left. The observed
+        clock identifies the phase of a skill, not the time left.
         """
         infos = [{"TimeLimit.truncated": transition.truncated and not transition.terminated}]
         observation, following = transition.observation, transition.next_observation

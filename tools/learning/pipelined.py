@@ -29,7 +29,7 @@ from guiderail.tools.learning.off_policy import OffPolicyLearner
 
 
 class PipelinedLearner(Learner):
-    """Learner that acts in this process and trains in a second one, on each episode during the next.
+    """Learner that acts in this process while a second process trains on the previous episode.
 
     Episode k uses the weights learned from the episodes before k − 1, so training on an episode may take as
     long as an episode. With `waits`, an episode waits for these weights, so that the same seed gives the same run
@@ -58,10 +58,10 @@ class PipelinedLearner(Learner):
         Args:
             acting: Learner that acts; its weights are replaced as they are learned.
             arguments: Positional and keyword arguments of the learner in the training process, configuration first.
-            waits: Start an episode only when the weights that it should have are learned.
+            waits: Wait at the start of an episode until its weights, described above, are learned.
             excluded: Terminations of episodes that are not learned from.
             niceness: Niceness of the training process.
-            imports: Modules or files (.py) that register entries of no installed package, such as a learner.
+            imports: Modules or files (.py) that the training process imports, such as one that registers the learner.
 
         Raises:
             InputError: If the learner is not an `OffPolicyLearner`.
@@ -107,7 +107,7 @@ class PipelinedLearner(Learner):
         self._acting.on_episode_start()
 
     def on_step(self, transition: Transition) -> None:
-        """Keep a transition until the end of the episode, when it is known whether the episode is learned from."""
+        """Buffer a transition until the episode ends, because the episode may be excluded from learning."""
         self._acting.transitions += record_transition(self._transitions, transition)
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -235,7 +235,7 @@ def _serve(
     os.nice(niceness)
     torch.set_num_threads(1)
     requests: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
-    # Requests are read at once: two processes that write into full pipes would deadlock, and a robot must not wait.
+    # A thread reads requests immediately: two processes writing to full pipes would deadlock, and a robot cannot wait.
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     if imports:
         from guiderail.tools.imports import import_modules  # imports Drake, which takes a second

@@ -33,7 +33,7 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
             self.pos = self.num_demonstrated
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Return a batch; demonstrated rows are spread evenly, so that equal parts of it have equally many."""
+        """Return a batch; its demonstrated rows are evenly spaced, so that equal slices contain equally many."""
         size, first = self.size(), self.num_demonstrated
         if not 0 < first < size:
             return super().sample(batch_size, env)

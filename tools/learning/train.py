@@ -205,8 +205,8 @@ def configure(
 ) -> RunConfig:
     """Return a checked configuration with everything resolved.
 
-    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. The algorithm
-    defaults to the preset's, and the preset to the algorithm's; `with_defaults` supplies the task's.
+    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. By default, the
+    algorithm is the preset's, and the preset is that of `default_preset`; `with_defaults` supplies the task's learner.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.

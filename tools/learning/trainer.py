@@ -60,8 +60,8 @@ def run_training(
         config: Configuration; with `resume` it must agree with the folder's.
         resume: Continue the run from its checkpoint.
         report: Called with the row of each episode.
-        demonstrator: Function from an environment to the policy of the learner's `demonstration_episodes`,
-            independent of earlier episodes. Off-policy learners learn from demonstrations (Vecerik et al., 2017).
+        demonstrator: Function from an environment to the policy of the learner's `demonstration_episodes`. The policy
+            must not depend on earlier episodes. Off-policy learners learn from demonstrations (Vecerik et al., 2017).
         supervisor: Supervisor of a run that is configured `human_in_the_loop`.
         log: Formats of the learning log: tensorboard, wandb, csv, json, log or stdout.
         sb3_callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after

@@ -74,7 +74,7 @@ class _Worker:
     """Worker process with its current job."""
 
     def __init__(self, work: Work):
-        # A forked process would inherit the threads and random generators of this one.
+        # A fork would copy the random generators of this process, and locks that its other threads hold.
         context = multiprocessing.get_context("spawn")
         self.connection, child_connection = context.Pipe()
         self.key: int | None = None
