@@ -54,9 +54,9 @@ def certify_skill(
         subject: Folder of a run, or name of a task.
         environment: Options that replace options of the run's or the task's environment.
         out: Folder to write; `certificate` in the run's folder by default.
-        start_within: Largest start offset of the robot in any output [unit of the output]; by default the one that
-            the task declares, plus the error of a measured pose.
-        attack: Number of steps in which an adversary tries to leave the bounds; its results are written to
+        start_within: Largest start offset of the robot in any output [unit of the output]; by default the task's
+            declared offset plus the error of the pose measurement.
+        attack: Number of steps in which an adversary tries to leave the bounds; the results are written to
             `attack.csv`.
         key: File of the key that signs the certificate; None: no signature.
 
@@ -118,7 +118,8 @@ def verify_certificate(
     """Check a certificate, and compare its assumptions with a skill.
 
     The checker proves that the bounds follow from the primitive, the constraints, the impedance and the budget in the
-    files. This function computes all four again from the skill and repeats the search for the budget.
+    files. This function also computes the first three from the skill and compares them with the files. It then repeats
+    the search for the worst corrections, which must not exceed the budget.
 
     Args:
         subject: Folder of a run, or name of a task.
@@ -182,7 +183,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
 
 
 def _search_budget(loop: CertifiedLoop) -> AttackResult:
-    """Return the worst corrections of a loop with a history that an adversary finds in `SEARCH_STEPS` steps."""
+    """Return the worst corrections that an adversary finds in `SEARCH_STEPS` steps; the loop has a history."""
     every_step = np.ones(loop.primitive.num_steps, bool)
     return Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
 
@@ -272,7 +273,7 @@ def _find_corrected_steps(loop: CertifiedLoop, certified: CertifiedBounds) -> np
 
 
 def _declared_start(config: EnvConfig, size: int) -> np.ndarray:
-    """Return the largest start offset (O,) of the environment's history: the offset of a reset plus a pose's error."""
+    """Return the largest measured start offset (O,): the offset of a reset plus the error of the pose measurement."""
     declared = config.make_task().start_within()
     try:
         within = np.array(np.broadcast_to(declared, size), dtype=float)

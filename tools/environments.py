@@ -117,8 +117,8 @@ def check_reset(task: str, options: Mapping[str, Any]) -> None:
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of an environment that differ from the defaults.
 
-    These are guidance, station and difficulty if they are not the task's defaults, and other arguments that differ from
-    the defaults for these three.
+    Guidance, station and difficulty are compared with the task's defaults, and all other arguments with the defaults
+    for these three.
 
     Raises:
         InputError: If the task or one of the three is unknown.

@@ -76,7 +76,7 @@ def _check_ending(path: Path, kind: str, endings: tuple[str, ...]) -> None:
 def check_writable(path: Path) -> None:
     """Raise an InputError if a file, or a new folder, cannot be written.
 
-    The path may be an existing folder, below a file or a folder without write permission, or too long.
+    Causes are an existing folder at the path, a parent that is a file or has no write permission, or too long a path.
     """
     try:
         if path.is_dir():
@@ -141,7 +141,7 @@ ENDINGS = (".npz", ".csv")
 def load_demonstrations(path: Path) -> Demonstrations:
     """Return the demonstrations of a file, or of all .npz and .csv files of a folder.
 
-    Files are read by `Demonstrations.load`, so that validated and exported demonstrations can be learned from.
+    Files are read by `Demonstrations.load`, as in training: what is valid here is also valid there.
 
     Raises:
         InputError: If there are none, or a file is invalid.

@@ -1,7 +1,7 @@
 """Imports of user code by name: modules, files and task folders that register tasks, guidance, stations or learners.
 
-A name that the user gives is imported by `import_modules`. A name that a file holds, such as the configuration of a
-run, is imported by `import_stored` only while `trust_imports` is active, because importing executes code.
+Importing executes code. `import_modules` imports what the user names. `import_stored` imports what a file names, such
+as the configuration of a run, and executes new code only while `trust_imports` is active.
 """
 
 import sys

@@ -67,7 +67,7 @@ def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
     """Check the sizes that the footers of Parquet files claim, before anything is allocated for their rows.
 
     Raises:
-        InputError: If one is not a readable Parquet file, or together they have too many rows, or values in lists.
+        InputError: If a file is not a readable Parquet file, or all files together have too many rows or list elements.
     """
     import pyarrow as arrow
     import pyarrow.parquet as parquet

@@ -135,7 +135,7 @@ def expand_choices(text: str) -> str:
 def command(
     example: str, name: str | None = None, group: typer.Typer = app
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a command of a group, by default by the function's name; the example follows the word `guiderail`."""
+    """Register a command of a group; `name` is the function's name by default, and `example` omits `guiderail`."""
     return group.command(name, cls=Command, epilog=f"Example: guiderail {example}")
 
 
@@ -147,12 +147,12 @@ def command_group(name: str, text: str) -> typer.Typer:
 
 
 def option(text: str, *names: str, choices: str | None = None, **more: Any) -> Any:
-    """Return an option with its help text; `choices` is the key of `CHOICES` that a shell completes."""
+    """Return an option with its help text; `choices` is the key in `CHOICES` for shell completion."""
     return typer.Option(*names, help=text, autocompletion=_completion(choices), **more)
 
 
 def argument(text: str, metavar: str, choices: str | None = None) -> Any:
-    """Return an argument with its help text; `choices` is the key of `CHOICES` that a shell completes."""
+    """Return an argument with its help text; `choices` is the key in `CHOICES` for shell completion."""
     return typer.Argument(help=text, metavar=metavar, autocompletion=_completion(choices))
 
 
@@ -270,7 +270,7 @@ def parse_floats(text: str, count: int, option: str) -> list[float]:
     """Return `count` finite numbers from a comma-separated list.
 
     Raises:
-        InputError: For another number of values, or one that is not finite.
+        InputError: If the number of values is not `count`, or a value is not finite.
     """
     try:
         numbers = [float(number) for number in text.split(",")]
@@ -311,7 +311,7 @@ def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]
 
 
 def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
-    """Import what registers a task, typed as name or folder; return its name, and the imports that a run has to store.
+    """Register a task, given by its name or folder; return its name and the imports that a run must store.
 
     Raises:
         InputError: If an import fails or the task folder is invalid.

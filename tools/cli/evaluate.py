@@ -119,7 +119,7 @@ def evaluate(
 
 
 def _split(names: str | None) -> list[str] | None:
-    """Return names of baseline policies, comma-separated in `names`; None for None, the default set."""
+    """Split comma-separated names of baseline policies; "none" is an empty list, and None means the default set."""
     if names is None:
         return None
     return [] if names == "none" else [name.strip() for name in names.split(",")]

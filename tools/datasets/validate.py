@@ -24,7 +24,7 @@ from guiderail.tools.files import (
     write_atomically,
 )
 
-UNIT_RATIO = 20.0  # demonstrations of one motion differ by less in size; mm instead of m is 1000, cm 100
+UNIT_RATIO = 20.0  # larger size ratios indicate another unit: mm instead of m gives 1000, cm gives 100
 
 
 def fit_bounds(
@@ -183,7 +183,7 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
 
 
 def _other_units(outputs: np.ndarray) -> list[str]:
-    """Return a sentence for each demonstration (M, N, O) that is `UNIT_RATIO` times as long or short as the median."""
+    """Return a sentence for each demonstration (M, N, O) over `UNIT_RATIO` times larger or smaller than the median."""
     lengths = np.linalg.norm(np.ptp(outputs, axis=1), axis=1)
     median = float(np.median(lengths))
     return [
@@ -207,7 +207,7 @@ def _default_deviation(common: Demonstrations) -> dict[str, Any]:
 
 
 def _fit_reference(common: Demonstrations, components: int | None) -> ReferenceTrajectory:
-    """Return the reference of demonstrations; a single one has the standard deviation `_variance_floor`."""
+    """Return the reference of demonstrations; a single demonstration has the standard deviation `_variance_floor`."""
     floor = _variance_floor(common)
     if common.num_demonstrations == 1:
         return ReferenceTrajectory.from_demonstrations(common, components, prior_std=floor)

@@ -186,8 +186,8 @@ def _adapt_settings(
 ) -> list[Choice]:
     """Return the choices tried; the settings of each follow from the penetration of the previous one.
 
-    Penetration that remains while the plug is pushed at rest needs a larger modulus. Transient penetration is an
-    overshoot proportional to the time step. The dissipation is that of `Piece`, because less would eject the plug.
+    Penetration that remains while the resting plug is pushed requires a larger modulus. Transient penetration is an
+    overshoot proportional to the time step. The dissipation stays at its default, because less would eject the plug.
     """
     choices: list[Choice] = []
     start = cpu_time()

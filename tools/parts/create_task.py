@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from guiderail.diagrams.tasks.part.file import PartTaskFile, SearchNumbers
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
-DENSITY = 2700.0  # density of a part, that of aluminum [kg/m³]; a gantry is weightless
+DENSITY = 2700.0  # assumed density of the parts, that of aluminum [kg/m³]; a gantry has no gravity
 CLEAR = 3.0 * MM  # height of the start above the rim
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
@@ -60,7 +60,7 @@ def read_parts(
         plug: Mesh file of the part in the tool.
         socket: Mesh file of the part in the world.
         unit: Unit of both files; None if their formats state it.
-        plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the files' unit, [rx ry rz] in degrees.
+        plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the socket's unit, [rx ry rz] in degrees.
         axis: Direction in which the plug is removed, in the socket's file.
         center: Point on the axis, in the socket's file; the plug's center of mass by default.
 
@@ -133,8 +133,8 @@ def create_task(
         axis: See `read_parts`.
         center: See `read_parts`.
         out: Folder; it must not exist.
-        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; the files show
-            the plug after it.
+        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; the mesh files
+            show the plug after this rotation.
         search_turn: Largest unknown turn of the socket [degrees]; if positive, actions also turn the plug, for example
             to find the teeth of gears.
         shrink: Distance by which the plug's surface is moved inwards [m].
@@ -172,7 +172,7 @@ def create_task(
     surfaces = dict(zip(("plug", "socket"), both, strict=True))
     deviation = max(part.repair.moved + surface.deviation for part, surface in zip(parts, both, strict=True))
     log(_describe_surfaces(parts, both, deviation, clearance))
-    # Symmetries leave a turn unchanged, but a reflection would reverse the one that a policy searches.
+    # Symmetry augmentation leaves turns unchanged, but a reflection reverses the turn that the policy searches for.
     sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path)
     log(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
     prepared = {
@@ -396,7 +396,7 @@ def _task_file(
             },
             "a motion",
         ),
-        # Without a turn at the end, the walls accept the orientation of a plug at full depth, or any orientation fits.
+        # Without a turn at the bottom, either the walls fix the turn of a seated plug, or a plug fits at any turn.
         tolerance=Tolerance.model_validate({} if path.turn else {"turn": MAX_SEATED_TURN}),
         force_limit=values["force_limit"],
         time_step=contact.time_step,

@@ -26,7 +26,7 @@ MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates of random actions and of th
 SEED = 3_000_000  # seed of the first episode; conditions are sampled as in training
 REACH = 1.9 * MM  # displacement of the command by an action of 1 at action_scale 1 [m]
 MARGIN = 0.75 * MM  # distance from the offset to the bound of commands [m]
-MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # least force limit [N]; force limit over the peak force of an aligned insertion
+MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # smallest force limit [N]; ratio of force limit to peak force when aligned
 MAX_TURN = 3.0  # largest turn of the socket [degrees]
 MAX_SECONDS = 300  # CPU time after which a calibration is stopped [s]
 SEARCH_END = 3  # index of the end of the search in the times of `plan_search`
@@ -72,7 +72,7 @@ class Score:
     random: int  # number of successes of uniform random actions
     random_episodes: int  # number of episodes of random actions; fewer than requested if the result was clear earlier
     scripted: int  # number of successes of the scripted search
-    scripted_episodes: int  # number of its episodes; 0 if it was not run because random actions succeed too often
+    scripted_episodes: int  # number of episodes of the search; 0 if random actions succeed too often
 
     @property
     def is_too_easy(self) -> bool:
@@ -100,9 +100,9 @@ class Score:
 def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, bool]:
     """Return one of `SETTINGS` with its score, and whether it has the required success rates.
 
-    Starting at the index `FIRST`, settings are tried in the direction of the required success rates until one has them,
-    the direction changes, or no setting is left. If none has them, the setting with the largest `margin` is returned;
-    of several, the easiest.
+    The first setting has the index `FIRST`. After a setting that is too easy the next harder one is tried, and after
+    one that is too hard the next easier one, until one has the required rates or was already tried, or none is left.
+    If none has the required rates, the setting with the largest `margin` is returned; of several, the easiest.
     """
     tried: dict[int, Score] = {}
     number = FIRST
@@ -133,7 +133,7 @@ def count_successes(
 
 
 class StopOnRim(gymnasium.Wrapper):
-    """Wrapper that truncates an episode if the plug is still on the rim `PATIENCE` after the search."""
+    """Wrapper that truncates an episode if the plug is still on the rim `PATIENCE` seconds after the search."""
 
     def __init__(self, env: gymnasium.Env, file: PartTaskFile):
         super().__init__(env)
@@ -143,7 +143,7 @@ class StopOnRim(gymnasium.Wrapper):
         self._height = 2.0 * (numbers.rim - IN_SOCKET) / numbers.travel - 1.0
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Return the result of the environment's step, truncated if the plug is too late."""
+        """Return the result of the environment's step, truncated if the plug is still on the rim."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         is_late = observation[TIME] > self._progress and observation[Z] > self._height
         return observation, reward, terminated, truncated or bool(is_late), info
@@ -193,14 +193,14 @@ def calibrate(
 ) -> PartTaskFile:
     """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
 
-    The file is in the task's folder. The radius is the largest distance of the plug from the axis [m], and each policy
-    runs at most `episodes` episodes with each setting. A sentence on the result is logged.
+    The task folder already contains `file`. The radius is the largest distance of the plug from the axis [m]. Each
+    policy runs at most `episodes` episodes with each setting. A sentence on the result is logged.
     """
     clearance = file.measured.get("clearance_mm")
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = file.motion.search_turn or turn_of(None if clearance is None else clearance * MM, radius)
     try:
-        read_task_file(folder).demonstrations.reference(folder)  # with the file's rounded numbers; cached for the child
+        read_task_file(folder).demonstrations.reference(folder)  # fits the written file; the child inherits the cache
         setting, score, is_hard = run_isolated(
             _choose_for, folder, force_limit, turn, episodes, cpu_seconds=MAX_SECONDS
         )

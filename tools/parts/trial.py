@@ -50,7 +50,7 @@ class Trial:
     lowest: float  # smallest height of the plug above the target [m]
     peak_force: float  # largest contact force [N]
     penetration: float  # largest penetration of the parts [m], without snapping pieces
-    resting_penetration: float  # penetration at the end of the motion, while the plug is pushed at rest [m]
+    resting_penetration: float  # largest penetration at the end of the motion, while the resting plug is pushed [m]
     snap: float  # largest penetration of snapping pieces [m]
     real_time_factor: float  # simulated time per CPU time
     recording: Recording  # poses, wrench and force at the control steps
@@ -78,7 +78,7 @@ class Depths:
             station: Station with the parts.
             surfaces: Surface [m] of each compliant body by name, in its own frame.
             snapping: Names of geometries that overlap on purpose.
-            rest_from: Time from which the plug is at rest, apart from the push [s].
+            rest_from: Time from which the plug rests, although it is still pushed [s].
         """
         self._station, self._surfaces, self._snapping = station, surfaces, snapping
         self._rest_from = rest_from
@@ -236,7 +236,7 @@ def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
 
 
 DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are no longer checked [s]
-MAX_SESSIONS = 3  # largest number of attempts of each demonstration; they end once one has seated the plug
+MAX_SESSIONS = 3  # largest number of attempts at each demonstration; the first that seats the plug is used
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
@@ -265,7 +265,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, socket: np.ndarray) -> bool:
     """Return whether a motion seats the plug in a socket at (x, y, Rz) [m, rad]."""
-    in_socket = motion.copy()  # on a gantry, the motion in the socket's frame is the same as displacing the socket
+    in_socket = motion.copy()  # on a gantry, moving the plug by the inverse is equivalent to displacing the socket
     cosine, sine = np.cos(socket[2]), np.sin(socket[2])
     in_socket[:, :2] = (motion[:, :2] - socket[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
     in_socket[:, 3] -= socket[2]
@@ -274,7 +274,7 @@ def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarr
 
 
 CHECK_SECONDS = 30  # largest CPU time of the insertions in MuJoCo [s]
-OFFSET = 3.5e-3  # offset of the socket at which it must block the plug [m]
+OFFSET = 3.5e-3  # lateral offset at which the socket must block the plug [m]
 
 
 def add_convex_pieces(

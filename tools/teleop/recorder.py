@@ -1,7 +1,7 @@
 """Recording of demonstrations: an operator moves the compliant target of a running simulation.
 
 Sliders of the page set the target, each with two keys; a gamepad moves the sliders. The command follows the sliders at
-limited speed and the robot follows the command by its impedance, so that pushing means to command beyond an obstacle.
+limited speed, and the robot follows the command by its impedance. To push, the operator commands a pose beyond contact.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ PATH = "/guiderail/force"
 SIDE_OFFSET, DOWN_OFFSET, LENGTH, THICKNESS = 0.3, 0.05, 0.3, 0.012
 WARNING_SHARE = 0.7  # share of the limit above which the gauge is red
 BLUE, RED, GRAY = (0.1, 0.5, 0.9, 1.0), (0.9, 0.15, 0.1, 1.0), (0.35, 0.35, 0.35, 0.25)
-MIN_FORCE = 1e-6  # below it a force has no direction [N]
-MIN_LENGTH = 1e-3  # share of the full length, because an arrow without length has no direction
+MIN_FORCE = 1e-6  # smallest force for which a direction is shown [N]
+MIN_LENGTH = 1e-3  # smallest share of the full length, because an arrow of length zero has no direction
 
 
 class ForceGauge:
@@ -94,7 +94,7 @@ class ForceGauge:
 
 
 def _scaled_pose(R: np.ndarray, p: np.ndarray, length: float = 1.0) -> np.ndarray:
-    """Return the transform (4, 4) of an object that is 1 m long in z and is to be `length` [m] long."""
+    """Return the transform (4, 4) that scales an object 1 m long in z to `length` [m] and moves it to a pose."""
     X = np.eye(4)
     X[:3, :3] = R @ np.diag([1.0, 1.0, length])
     X[:3, 3] = p
@@ -114,11 +114,11 @@ SLOW, END = "slow motion (M)", "end (Escape)"
 BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END: "Escape"}
 # Largest speed of the command [m/s], [rad/s].
 MAX_SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])
-SLOW_RATE = 0.25  # of real time, in slow motion
+SLOW_RATE = 0.25  # rate of slow motion relative to real time
 UNDO_TIME = 1.0  # motion that one undo takes back [s]
 MAX_UNDOS = 60  # consecutive undos: each needs a copy of the simulation's state
-FORCE_STEPS = 5  # control steps between updates of the gauge: more would delay the page
-MIN_STEPS = 10  # control steps of a demonstration
+FORCE_STEPS = 5  # control steps between updates of the gauge: more frequent updates would delay the page
+MIN_STEPS = 10  # smallest number of control steps of a demonstration
 MAX_REST = 0.1  # longest rest of the command in a demonstration [s]
 
 
@@ -170,12 +170,12 @@ class DemonstrationRecorder:
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any], out: Path, meshcat: Any = None):
-        """Build the simulation and open the page, a new one on this machine by default.
+        """Build the simulation and show it on the page `meshcat`, by default on a new page on this machine.
 
         The task is a name or a task folder. The file `out` of the demonstrations, .npz or .csv, must not exist.
 
         Raises:
-            InputError: If the task's station has no pose of six numbers, or the file exists or cannot be written.
+            InputError: If the task is no insertion, the station is hardware, or the file exists or cannot be written.
         """
         check_new(out, "file")
         if out.suffix not in (".npz", ".csv"):
@@ -273,7 +273,7 @@ class DemonstrationRecorder:
             A sentence on the demonstration.
 
         Raises:
-            InputError: If it is too short, or the file cannot be written; it is not kept then.
+            InputError: If the demonstration is too short or cannot be written; it is then not kept.
         """
         if self.steps < MIN_STEPS:
             raise InputError("nothing was shown yet: move the sliders or press the keys first")
@@ -380,7 +380,7 @@ def _to_demonstrations(recorded: list[tuple[np.ndarray, np.ndarray]]) -> Demonst
 def record_demonstrations(
     task: str, environment: Mapping[str, Any], out: Path, log: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Open the page, wait for a browser, and record demonstrations until the operator ends it.
+    """Open the page, wait for a browser, and record demonstrations until the operator ends the session.
 
     Returns the file, and statistics of the demonstrations.
 

@@ -134,7 +134,7 @@ class MeshcatSupervisor(Supervisor):
     """
 
     def __init__(self, log: Callable[[str], None], meshcat: Any = None):
-        """Open the page, a new one on this machine by default."""
+        """Add the controls to the page `meshcat`, by default to a new page on this machine."""
         meshcat = open_meshcat()[0] if meshcat is None else meshcat
         self.panel = MeshcatPanel(meshcat, {}, {**LABEL_KEYS, RELEASE: RELEASE_KEY})
         self._log = log
@@ -170,7 +170,7 @@ class MeshcatSupervisor(Supervisor):
         return values if values.any() else None
 
     def label(self) -> str | None:
-        """Return a label that was clicked since the last call, the last one in `LABELS` of several, or None."""
+        """Return the label clicked since the last call, or None; of several labels, the last one in `LABELS`."""
         label, self._is_stop_pending = "stop" if self._is_stop_pending else None, False
         for button, clicked in LABELS.items():
             if self.panel.take_clicks(button):

@@ -46,7 +46,7 @@ class EpisodeSpec:
             trust_policy: True to read a policy file that can execute code.
 
         Raises:
-            InputError: If there is no such policy, or `environment` has another guidance than its run.
+            InputError: If there is no such policy, or `environment` has another guidance than the run.
         """
         subject = find_subject(policy, task, environment, trust_policy=trust_policy)
         config, folder = subject.config, subject.folder

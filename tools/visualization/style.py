@@ -1,4 +1,4 @@
-"""Style of all pictures: one color for each guidance, figures without a window, files written whole."""
+"""Style of all pictures: one color for each guidance, figures without a window, files written atomically."""
 
 import io
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from guiderail.tools.files import check_picture, write_atomically
 
 
 def is_demonstrated(guidance: str | None) -> bool:
-    """Return True if an action of zero gives the demonstration, which shows the success without learning."""
+    """Return True if an action of zero reproduces the demonstration and so shows the success without learning."""
     return guidance in GUIDANCE.names() and GUIDANCE.get(str(guidance)).demonstrates
 
 

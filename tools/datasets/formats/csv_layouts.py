@@ -41,7 +41,7 @@ _PERIODS = (1e-4, 1.0)  # range of plausible sampling periods of a robot [s]; a 
 _PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
 _NO_POSE = re.compile(
     r"(?:.*[._/ ])?(v|vel|velocity|speed|twist|omega|gyro|acc|accel|acceleration|f|force|torque|wrench)[._/ ].*"
-)  # names of axes of other quantities than a pose
+)  # column names of quantities other than a pose, such as velocity and force
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
 _EULER = (("roll", "pitch", "yaw"), ("rx_rpy", "ry_rpy", "rz_rpy"))
 _UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
@@ -83,7 +83,7 @@ def read_csv_files(
         target: See `poses_in_target`.
 
     Raises:
-        InputError: If a file is invalid, a unit is neither stated nor given, or both are and differ.
+        InputError: If a file is invalid, a unit is neither stated nor given, or the stated and the given unit differ.
     """
     for option, given, known in (
         ("--unit", unit, UNITS),
@@ -184,7 +184,7 @@ def _table(file: Path) -> list[_Column]:
 def _units(
     file: Path, columns: Sequence[_Column], known: Collection[str], given: str | None, option: str
 ) -> list[str | None]:
-    """Return the unit of each column: the one in its name, else the given one, from which no name may differ."""
+    """Return the unit of each column: the one in its name, otherwise `given`; the two must not differ."""
     units = []
     for column in columns:
         unit = _unit_of_name(file, column.name, known) or given

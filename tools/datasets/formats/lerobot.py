@@ -29,7 +29,7 @@ _CLOCKS = {
 
 
 def read_lerobot(folder: Path, signal: str | None) -> Recorded:
-    """Return one demonstration per episode of a dataset: a feature of one dimension, by default the only candidate.
+    """Return one demonstration per episode of a dataset; `choose_signal` selects one of the vector-valued features.
 
     Raises:
         InputError: If the folder is not such a dataset, or several features could be imported.

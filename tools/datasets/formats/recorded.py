@@ -88,8 +88,8 @@ def is_commanded(name: str) -> bool:
 def choose_signal(candidates: Sequence[str], given: str | None, where: str, option: str) -> tuple[str, list[str]]:
     """Return the signal that is imported, with the assumption made.
 
-    It is the given one, else the only candidate, else the only commanded one, because primitives should learn commands.
-    Messages name the file by `where`, and the option that takes the name.
+    It is `given`, or else the only candidate, or else the only candidate that was commanded, because primitives should
+    learn commands. `where` and `option` name the file and the command-line option in messages.
 
     Raises:
         InputError: If these rules do not determine one signal.

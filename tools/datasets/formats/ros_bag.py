@@ -49,7 +49,7 @@ def find_bags(path: Path) -> list[Path]:
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
-    """Return one demonstration per bag of a path, in the target of `poses_in_target`; the only topic by default.
+    """Return one demonstration per bag; `target` is that of `poses_in_target`, and `choose_signal` selects the topic.
 
     Raises:
         InputError: If a bag cannot be read, or several topics could be imported.
