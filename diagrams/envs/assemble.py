@@ -44,7 +44,7 @@ from guiderail.systems.reward_system import RewardSystem
 if TYPE_CHECKING:
     from guiderail.models.primitives.stepper import StateProgress
 
-HALF_TURN_MARGIN = 0.1  # smallest distance of demonstrated angles from ±180° [rad]; actions and contact turn further
+HALF_TURN_MARGIN = 0.1  # margin of demonstrated angles to ±180° [rad]: actions and contact turn the tool further
 
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:

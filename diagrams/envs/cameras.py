@@ -136,7 +136,7 @@ def add_observation_camera(builder: DiagramBuilder, station: Any, camera: Camera
 
 
 def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, task: str) -> None:
-    """Add the camera of the pictures of a task, given its name, and export its image.
+    """Add the camera for pictures of a task and export its image; `task` is the name of the task.
 
     Raises:
         InputError: If the task has no camera, or as `add_camera`.

@@ -35,7 +35,7 @@ def declared_models(task: str) -> list[type[Options]]:
 
 
 def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
-    """Refuse an option that no guidance and no station has, and a value that is always out of range.
+    """Refuse an unknown option, and a value that every model with this option refuses.
 
     This is a quick check of single options; `EnvConfig.resolve` checks all of them. Nothing is checked if the task,
     a guidance or a station is not of this package, because it may have options of its own.
@@ -57,7 +57,7 @@ def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
         if not holders:
             known = {name for model in models for name in model.model_fields}
             raise InputError(f"{task} has no option {brief(option)} here: {did_you_mean(option, known)}")
-        checked = [option, *(KERNEL_OPTIONS if option in KERNEL_OPTIONS else ())]  # a kernel's options depend on it
+        checked = [option, *(KERNEL_OPTIONS if option in KERNEL_OPTIONS else ())]  # validated together
         values = {name: options[name] for name in checked if name in options}
         errors = []
         for model in holders:

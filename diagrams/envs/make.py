@@ -84,8 +84,8 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
 def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
     """Build the environment `gymnasium.make("guiderail/<Task>-v0", ...)`.
 
-    From this call on the process computes with one thread. Matrices are small here; where other processes use the
-    cores, threads that wait for each other take eighty times as long, and sums depend on the number of threads.
+    From this call on, numerical libraries use one thread in this process. Matrices are small here: if other processes
+    use the cores, threads that wait for each other take eighty times as long. Sums depend on the number of threads.
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.
@@ -107,8 +107,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     declared = config.make_task()
     key = _key(declared, exported)
     built = _IDLE[key].pop() if _IDLE[key] else _build(declared, exported)
-    # The sources that a reset sets are part of the diagram, so the new task adopts those of the task that built it.
-    # The hidden values of a run belong to the new task alone.
+    # A reset sets episode constants, which are systems of the diagram: the new task uses those of the task that built
+    # the diagram. The hidden values of a run belong to the new task alone.
     assert built.diagram.declaration is not None
     declared.episode_constants = built.diagram.declaration.episode_constants
     randomize = make_randomize(declared, built.station, built.guidance)
@@ -132,7 +132,7 @@ def make_skill(
 
     Args:
         task: Configuration, or name of the task that the policy was trained on.
-        policy: Saved `Policy`, function from an observation to an action, or system with these ports.
+        policy: Saved `Policy`, function from observation to action, or system with ports `observation` and `action`.
         render_mode: None, or "human" for a browser view.
         options: Options of the environment that the policy was trained in, if `task` is a name.
 

@@ -1,7 +1,7 @@
 """Meshcat page behind a gateway: a random token in its address, an allow-list of origins, and checked messages.
 
 Meshcat's own server accepts any connection and parses any bytes: a web page in the same browser could move the sliders,
-and one malformed byte ends the process. `MeshcatPage` lets the gateway connect to this server and then closes its port.
+and one malformed byte ends the process. `MeshcatPage` connects the gateway to this server and closes the server's port.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class _Gateway:
     """
 
     def __init__(self, meshcat_port: int):
-        """Start the gateway, and close the port of Meshcat's server when the gateway is connected to it."""
+        """Start the gateway, wait until it is connected to Meshcat's server, and close the port of that server."""
         self.token, self._num_browsers, self._rest = secrets.token_urlsafe(24), 0, b""
         program = [sys.executable, "-I", str(Path(__file__).with_name("page_gateway.py"))]
         self._process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)

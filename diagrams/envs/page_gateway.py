@@ -100,9 +100,9 @@ def _is_below(path: str, parent: str) -> bool:
 
 
 def parse_event(message: bytes | str, controls: Controls) -> dict[str, Any] | None:
-    """Return a browser's message, any bytes, as the event that Meshcat expects; None if the message is invalid.
+    """Convert a browser's message, which may be any bytes, to the event that Meshcat expects; None if it is invalid.
 
-    The controls are those that exist.
+    `controls` are the controls that exist.
     """
     if not isinstance(message, bytes) or len(message) > MAX_MESSAGE:
         return None
@@ -232,7 +232,7 @@ class Gateway:
             sender.cancel()
             del self._queues[browser]
             print(len(self._queues), flush=True)
-            if browser is self._gamepad_owner:  # no stick may stay deflected
+            if browser is self._gamepad_owner:  # else its sticks would stay deflected
                 self._gamepad_owner = None
                 with suppress(ConnectionClosed):
                     await self._meshcat.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": {}}))
@@ -307,7 +307,7 @@ def _response(status: HTTPStatus, kind: str, content: bytes) -> Response:
 
 def main() -> None:
     """Run the gateway."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the simulating program, and this one with its input
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the simulating program, which closes this one's input
     given = json.loads(sys.stdin.readline())
     asyncio.run(Gateway(**given).run())
 

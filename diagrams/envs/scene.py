@@ -18,7 +18,7 @@ class View:
     """Browser view of a scene; it is not a subsystem of the diagram that simulates the scene.
 
     A diagram with Python systems is never freed, so a publisher inside it would keep its network port, thread and file
-    descriptors open. Those of a view are released with the view.
+    descriptors open. A view that is deleted releases them.
 
     Attributes:
         meshcat: Meshcat page.

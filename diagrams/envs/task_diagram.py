@@ -82,9 +82,9 @@ class TaskDiagram:
     ``pose``                (O,) measured pose
     ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
     ``wrench``              (W,) of the surroundings on the tool; this port and the next four are optional
-    ``saturation``          nonzero while an actuator is at its limit; the size is the station's
+    ``saturation``          nonzero while an actuator is at its limit; its size depends on the station
     ``collision``           (1,) positive during a collision
-    ``privileged``          (m,) observation of a privileged critic, which the policy does not have
+    ``privileged``          (m,) observation for a privileged critic; the policy does not receive it
     ``command_timed_out``   (1,) 1 while the last safe pose is held because commands stopped or are not finite
     ``rgb_image``           an abstract `ImageRgba8U`; only if the diagram was built with a camera
     ======================= ================================================================================

@@ -101,7 +101,7 @@ class EpisodeTrace:
 
         Before the first control step, the largest violations are −∞ and the peak force is 0. The maximum of values that
         contain NaN is NaN. `collisions` counts uninterrupted sequences of control steps in collision, `collision_steps`
-        counts these control steps. Without its signal, a violation is −∞ and a count is 0.
+        counts these control steps. If its signal is not recorded, a violation is −∞ and a count is 0.
         """
         collision = self._is_positive("collision")
         return {

@@ -1,4 +1,4 @@
-"""Guidance around a base policy: its chunks are KGRL's or a residual's reference, or are executed with a guard."""
+"""Guidance around a base policy: its action chunks are a reference (KGRL, residual) or are executed with a guard."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
     def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False):
         """Construct the guidance; with `takes_window`, the chunks come from the input ``reference_window``.
 
-        Without it, they are those of the demonstrations' mean.
+        Without this input, the chunks are parts of the demonstrations' mean.
 
         Raises:
             InputError: If the guard does not support the limits and constraints, or the motion waits for the robot.

@@ -173,7 +173,7 @@ class SkgrlGuidance(PrimitiveGuidance):
     """Guidance by sKGRL: null-space actions with a history of outputs, so that exploration is smooth.
 
     With an adaptive history, the motion passes through fewer past outputs during contact, so that it reacts to forces
-    as quickly as KGRL. The shortest history is the last output, so every motion begins at this output.
+    as quickly as KGRL. The shortest history is the last output: every command starts where the previous one ended.
     """
 
     def __init__(self, prior: PriorKnowledge):

@@ -27,12 +27,12 @@ HISTORY_SOURCES = ("commanded", "measured")
 
 
 def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.ndarray:
-    """Return limits (O,), given O of them, or one for all positions and a second one for all angles.
+    """Return limits (O,), given O limits, or one limit for all positions and a second one for all angles.
 
-    Angles have no limit (infinity) if only that of the positions is given.
+    Angles have no limit (infinity) if only one limit is given.
 
     Raises:
-        InputError: If there are more than two limits, and not O; `name` is their name in the message.
+        InputError: If there are more than two limits but not O; `name` is their name in the message.
     """
     if len(limits) == outputs:
         return np.array(limits)
@@ -53,14 +53,14 @@ class PrimitiveConfig:
         history: P, number of past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
         adaptive_history: True if sKGRL's history halves, down to a single output, during contact.
-        history_source: "commanded" or "measured" poses. Use commanded poses under impedance control, where a long
-            measured history at a high rate would follow the robot, so that its force vanishes. Use measured poses if an
-            operator may push a robot that tracks well.
+        history_source: "commanded" or "measured" poses. Use commanded poses under impedance control: with a long
+            measured history at a high rate, commands would follow the robot, and the force would vanish. Use measured
+            poses if an operator may push a robot that tracks well.
         horizon: H, number of future points at which the constraints are satisfied.
         lambda_: λ of problem 4.5.
         beta: β of problem 4.5.
         kernel: k of the movement primitive.
-        action_scale: κ; a constant action of ±1 ends √3 κ demonstration standard deviations away.
+        action_scale: κ; a constant action of ±1 moves the outputs by √3 κ standard deviations of the demonstrations.
         action_dims: Indices of the outputs that an action moves, one entry each; default: all.
         gains: Null-space action per unit of the policy's action, (O,); default: computed from κ.
         isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all

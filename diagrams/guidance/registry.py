@@ -51,7 +51,7 @@ class GuidanceKind:
     options: type[Options] | None = None
 
     def missing_requirements(self, provided: Collection[str]) -> tuple[str, ...]:
-        """Return the missing requirements of the alternative that lacks the fewest; empty if one is complete.
+        """Return the missing requirements of the most complete alternative; empty if an alternative is complete.
 
         `provided` are the requirements that the task provides.
         """

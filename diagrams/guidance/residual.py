@@ -74,8 +74,8 @@ class ResidualGuidance(PrimitiveGuidance):
 
         Args:
             prior: Prior knowledge.
-            make_filter: Function of the primitive's configuration and the keep-out walls that returns a `SafetyFilter`
-                or `CommandFilter` of the sum, whose changes set ``fallback`` to 1; None for no filter.
+            make_filter: Function of the primitive's configuration and the keep-out walls. It returns a `SafetyFilter`
+                or `CommandFilter` for the sum; ``fallback`` is 1 while the filter changes the sum. None: no filter.
             takes_window: True takes the motion from the input ``reference_window`` instead of the demonstrations.
         """
         super().__init__()

@@ -49,8 +49,8 @@ class ActiveConstraintFilter(Diagram):
     ):
         """Construct the diagram.
 
-        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. While the robot is
-        farther than `max_tracking_error` [m] from its command, the last command is repeated.
+        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. If the robot is
+        farther than `max_tracking_error` [m] from its command, only commands closer to the robot replace the last one.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -95,9 +95,9 @@ class ActiveConstraintFilter(Diagram):
 class SctGuidance(Guidance):
     """Shared control: input mapping and active constraints of the template's current state.
 
-    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the distance of the
-    command from its projection, the larger of meters and radians; 0 inside. In addition to the ports of all guidance it
-    exports ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
+    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the largest violation
+    of an active constraint by the command, in meters or radians; 0 inside. In addition to the ports of all guidance
+    there are ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
 
     def __init__(

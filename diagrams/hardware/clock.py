@@ -64,7 +64,7 @@ class IntervalHistogram:
         self.longest = max(self.longest, seconds)
 
     def quantile(self, share: float) -> float:
-        """Return the quantile of the intervals at `share` [s], with a resolution of 0.1 ms; NaN without intervals."""
+        """Return the `share` quantile of the intervals [s], with a resolution of 0.1 ms; NaN without intervals."""
         total = self._counts.sum()
         if not total:
             return np.nan

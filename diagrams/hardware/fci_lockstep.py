@@ -1,9 +1,9 @@
 """Lockstep of a hardware station with a simulated Franka: each waits for the other, however slow the machine is.
 
-libfranka's protocol has no message with which a robot could be made to wait. The simulated robot therefore listens on a
-second port for requests, one JSON object a line, and answers each with its time [s]. ``{"advance": h}`` is answered
-when the robot's clock has advanced by h [s]; then the robot waits. ``{"parts": [fixture, workpiece]}`` moves the task's
-parts by their offsets.
+libfranka's protocol has no message that makes a robot wait. The simulated robot therefore listens on a second port
+for requests, one JSON object a line, and answers each with its time [s]. ``{"advance": h}`` is answered when the
+robot's clock has advanced by h [s]; then the robot waits. ``{"parts": [fixture, workpiece]}`` moves the task's parts by
+their offsets.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ LOCKSTEP_PORT = 1339  # the robot's own ports are 1337 and 1338
 class FciLockstepClock:
     """Clock that advances a hardware station in lockstep with a simulated Franka.
 
-    The station's time base advances with the robot's clock, so that delays of either process are no delays of a status.
-    A robot that does not answer is noticed by the station's watchdog: the time base then advances without statuses.
+    The station's time base advances with the robot's clock, so that a delay of either process does not make a status
+    late. If the robot does not answer, the time base advances without statuses, which the station's watchdog detects.
     """
 
     def __init__(self, host: str, timeout: float, period: float):
@@ -58,9 +58,9 @@ class FciLockstepClock:
         self._request({"parts": offsets})
 
     def _follow(self, seconds: float) -> None:
-        """Let the robot advance; advance the time base as much as the robot's clock, or without one by `seconds`."""
+        """Let the robot advance by `seconds`; add its progress to the time base, or `seconds` if it is unknown."""
         answer = self._request({"advance": seconds})
-        if answer is None or answer < self._robot_time:  # no robot, or another one
+        if answer is None or answer < self._robot_time:  # no answer, or the first one of a robot
             self._time += seconds
         else:
             self._time += answer - self._robot_time
@@ -71,7 +71,7 @@ class FciLockstepClock:
         try:
             if self._socket is None:
                 self._socket = socket.create_connection(self._address, self._timeout)
-            # The full timeout is waited only once for a silent robot, not in every step.
+            # Wait for the full timeout only once if the robot is silent, not in every step.
             self._socket.settimeout(self._period if self._has_timed_out else self._timeout)
             self._socket.sendall(json.dumps(message).encode() + b"\n")
             answer = self._socket.recv(4096)

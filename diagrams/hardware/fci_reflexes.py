@@ -1,4 +1,4 @@
-"""Reflexes of a Franka, for its simulator: the conditions on which the robot aborts a motion by itself."""
+"""Reflexes of a Franka, for its simulator: the conditions under which the robot aborts a motion by itself."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ReflexDetector:
         self._max_torque, self._max_wrench = np.asarray(torque), np.asarray(wrench)
 
     def begin(self) -> None:
-        """Begin a motion; its first commanded torque may differ from zero by a step."""
+        """Begin a motion; its first commanded torque may differ from zero by `MAX_TORQUE_STEP`."""
         self._last_command = np.zeros(7)
 
     def detect(

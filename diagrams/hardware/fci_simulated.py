@@ -40,10 +40,10 @@ from guiderail.models.common.errors import InputError
 
 ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # prefix of names in the simulator; from seventh link to flange [m]
 STEP = 0.001  # period of the protocol [s]
-# Steps of the engine in a period. With one step a contact of 2 ms lasts a single step: the tool bounces from it every
-# 5 ms, and joint velocities jump by 0.07 rad/s.
+# Steps of the engine in a period. With one step, a contact with a time constant of 2 ms lasts a single step: the tool
+# bounces from it every 5 ms, and joint velocities jump by 0.07 rad/s.
 SUBSTEPS = 4
-IDLE_RATE = 0.1  # rate of the clock of a robot without motion while its station computes
+IDLE_RATE = 0.1  # rate of the robot's clock without a motion, while the station computes
 REPEAT_INTERVAL = 0.2  # wall clock time after which the state of a waiting robot is sent again [s]
 RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "without gravity and friction"
 # A robot without motion is held by joint stiffness [Nm/rad] and damping [Nms/rad], in place of its brakes. With the
@@ -68,8 +68,8 @@ class SimulatedFranka(FrankaMujocoRobot):
         self._external, self._contact, self.external_wrench = np.zeros(7), np.zeros(7), np.zeros(6)
 
     def add_contact(self) -> None:
-        """Add the contact of one of the engine's steps to the mean of the period."""
-        # As libfranka's estimate, without the joint friction; with the forces of joint limits, which no task reaches.
+        """Add the contact torques of one engine step to their mean over the period."""
+        # No joint friction, like libfranka's estimate. Forces of joint limits are included; no task reaches a limit.
         self._contact += constraint_torques(self._model, self._data)[self._dof_addrs] / SUBSTEPS
 
     def _post_step(self) -> None:
@@ -132,7 +132,7 @@ class WorkcellSimulator(MujocoSimulator):
         option = root.find("option")
         assert option is not None
         option.attrib.update(cone="elliptic", impratio="10", ccd_tolerance="1e-9", ccd_iterations="100")
-        for joint in root.iterfind(".//joint[@frictionloss]"):  # the class's, and those of the wrist's joints
+        for joint in root.iterfind(".//joint[@frictionloss]"):  # in the default class, and in the wrist's joints
             joint.set("frictionloss", str(self._joint_friction))
         asset = root.find("asset")
         assert asset is not None
@@ -202,7 +202,7 @@ class _RobotServer(FrankaRobotServer):
 
     @property
     def is_controlled(self) -> bool:
-        """True if the client answers each state of a motion with a command; it does not answer the first states."""
+        """True once the client has answered a state of the current motion; it does not answer the first states."""
         return self.current_motion_id > 0 and self._answered_motion == self.current_motion_id
 
     @property
@@ -228,7 +228,7 @@ class _RobotServer(FrankaRobotServer):
         super().start_motion(controller_mode, motion_generator_mode, motion_id)
 
     def check_reflexes(self) -> Reflex | None:
-        """Abort the motion and return the reason if there is one for a reflex."""
+        """Abort the motion if there is a reason for a reflex; return the reason, or None."""
         if not self.is_controlled:
             return None
         reflex, motion = self.robot.detect_reflex(self.detector, self._command), self.current_motion_id
@@ -240,7 +240,7 @@ class _RobotServer(FrankaRobotServer):
         return reflex
 
     def repeat_state(self) -> None:
-        """Send the last state again, because the client ends its motion after a second without one."""
+        """Send the last state again, because the client ends its motion after a second without a state."""
         self._FrankaServer__message_id -= 1
         self.send_state()
 
@@ -272,8 +272,8 @@ def serve(
     """Simulate the robot and answer libfranka's protocol, in lockstep with a `FciLockstepClock` if one is connected.
 
     In lockstep the robot's clock waits for the station's requests, and for the client's answer to each state of a
-    motion. Without motion it runs on slowly, because libfranka waits for a new state whenever one is read.
-    Without a station in lockstep the clock follows the wall clock, or falls behind it on a slow machine.
+    motion. Without a motion the clock never stops, but runs slowly: every read of a state in libfranka waits for a new
+    state. Without a station in lockstep the clock follows the wall clock, or falls behind it on a slow machine.
 
     Args:
         simulator: Simulator of the robot and the parts.

@@ -117,7 +117,7 @@ class LcmDriver(Driver):
     command_type: ClassVar[Any]  # message class of the commands, with the field `joint_torque`
 
     def __init__(self, lcm: DrakeLcmInterface | str = ""):
-        """Open the connection on a bus, or on its URL.
+        """Open the connection on a bus, which is given as an object or by its URL.
 
         Raises:
             InputError: If the URL is unusable.
@@ -226,7 +226,7 @@ class LcmDriver(Driver):
     def _on_command(self, message: bytes) -> None:
         if message in self._written:
             return
-        # A safety monitor sends its heartbeat before its commands, which are not foreign.
+        # The commands of a safety monitor are not foreign. It sends its heartbeat before them.
         if not any(heartbeat.is_stopping for heartbeat in self.read_heartbeats()):
             self.num_foreign_commands += 1
             self._num_contested += bool(self._written)
@@ -239,7 +239,7 @@ class LcmDriver(Driver):
         if len(message) == HEARTBEAT_FORMAT.size:
             heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
             newest, _ = self._heartbeats.pop(heartbeat.sender, (heartbeat, number))
-            # A monitor that has changed its channel may have an older heartbeat unread on the channel before.
+            # After a monitor has changed its channel, an older heartbeat may still be unread on its previous channel.
             is_older = heartbeat.sequence < newest.sequence
             self._heartbeats[heartbeat.sender] = (newest if is_older else heartbeat), number
             while len(self._heartbeats) > MAX_SENDERS:

@@ -116,8 +116,8 @@ class LockstepClock:
     def __init__(self, driver: LcmDriver, command_timeout: float, period: float | None = None):
         """Construct the clock.
 
-        A step waits for its status for at most `command_timeout` [s of wall clock time]. It is then made without one,
-        which the station's watchdog detects. The period of a step [s] is the driver's by default.
+        A step waits at most `command_timeout` [s of wall clock time] for its status. After that the step is made
+        without a status, which the station's watchdog detects. The period of a step [s] is the driver's by default.
 
         Raises:
             InputError: If the driver cannot receive in this environment.
@@ -138,7 +138,7 @@ class LockstepClock:
         context = simulator.get_mutable_context()
         start = context.get_time()
         for step in range(steps):
-            # The full timeout is waited only once for a silent robot, not in every step.
+            # Wait for the full timeout only once if the robot is silent, not in every step.
             self._wait(self._period if self._has_timed_out else self._timeout)
             self._has_timed_out = self._driver.statuses.head == self._used
             self._used = self._driver.statuses.head

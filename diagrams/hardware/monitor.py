@@ -40,8 +40,8 @@ class SafetyMonitor:
     lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
     `StateEstimator` as the station, by a clock of its own, and sends a heartbeat with every check, so that a commanding
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
-    (`CommandSequence`): the arm is kept without torque until one of them is left. During a stop it sends torques even
-    if no status arrives, so that the driver never repeats a torque.
+    (`CommandSequence`): the arm is kept without torque until only one program sends. During a stop the monitor sends
+    torques even if no status arrives, so that the driver never repeats a torque.
 
     Attributes:
         state: Current state.
@@ -87,7 +87,7 @@ class SafetyMonitor:
     def check(self) -> None:
         """Check the newest status and the commands, stop the arm if needed, and send a heartbeat.
 
-        Without a new status nothing is done before a period has passed.
+        If there is no new status, the check is skipped until one period has passed since the last check.
         """
         status, now = self._driver.read(), self._clock()
         is_due = now - self._checked_at >= 0.99 * self._driver.period
@@ -129,7 +129,7 @@ class SafetyMonitor:
         self._commanded_at = self._clock()
         heartbeats = self._driver.read_heartbeats()
         if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
-            self._commands.add(torque, command_time, self._commanded_at)  # else it may be another monitor's
+            self._commands.add(torque, command_time, self._commanded_at)  # else the command may be another monitor's
         if self._is_stopping and self._command is not None and not self._is_holding:
             # The robot executes the last command, so the torque is sent again, up to a limit: two monitors could
             # answer each other endlessly.

@@ -1,4 +1,4 @@
-"""Driver on Universal Robots' RTDE: the controller's force mode at 500 Hz, wrenches of an impedance from here.
+"""Driver on Universal Robots' RTDE: sends the wrenches of an impedance to the controller's force mode (500 Hz).
 
 The client is ur-rtde (MIT license). Of its commands, `servoL` bounds no force, and `directTorque` would leave the loop
 of 500 Hz to Python and needs PolyScope 5.26. Force mode bounds the force by the commanded wrench, in the controller's
@@ -198,7 +198,7 @@ class RtdeDriver(PoseDriver):
             self._check_kinematics()
             self._check(self._control.setWatchdog(WATCHDOG_FREQUENCY), "watchdog")
             self._is_active = True
-        # The model is that of the station, so that both agree where the calibrated robot is elsewhere by a millimeter.
+        # Computed by the station's model, so that driver and station agree; the robot's pose may differ by 1 mm.
         X_BaseActual = self._calc_pose(status.positions)
         turn = (X_BaseTool.rotation() @ X_BaseActual.rotation().inverse()).ToAngleAxis()
         error = np.concatenate([X_BaseTool.translation() - X_BaseActual.translation(), turn.angle() * turn.axis()])
@@ -214,7 +214,7 @@ class RtdeDriver(PoseDriver):
         """Leave force mode and brake the tool; the controller then holds the arm."""
         if self._is_active:
             self._is_active = False
-            # The client waits until the arm has stopped, and this program's loop must not.
+            # In a thread, because the call blocks until the arm has stopped, and this program's loop must not block.
             self._stopping = threading.Thread(target=self._control.forceModeStop, daemon=True)
             self._stopping.start()
 

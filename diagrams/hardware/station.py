@@ -122,8 +122,8 @@ class HardwareStation(Station):
             robot: The arm, or its name.
             robot_url: Address of the robot: LCM's URL, or a host; LCM's default if empty.
             limits: Limits of measurements and torques; `safety_limits` by default.
-            status_limits: Limits of a status; by default they follow from the joints' velocities, the period and the
-                driver's hold-off.
+            status_limits: Limits of a status; by default they follow from the joints' velocity limits, the period and
+                the driver's hold-off.
             tare: True subtracts the wrench that is measured after the start, when the tool must be free, from the
                 output `wrench`. The safety limits apply to the wrench before the subtraction.
             control_period: Time between commands of a skill [s], a whole multiple of `period`.
@@ -266,7 +266,7 @@ class HardwareStation(Station):
     def receive(self, context: Context, clock: float | None = None) -> None:
         """Read the newest status and heartbeat before a step; `context` is the root context.
 
-        Without the wall clock time [s], each step counts as one period after the step before.
+        `clock` is the wall clock time [s]; without it, each step counts as one period after the previous step.
         """
         self.driver.receive()
         status, heartbeat = (system.GetMyMutableContextFromRoot(context) for system in (self._status, self._heartbeat))
@@ -292,10 +292,10 @@ class HardwareStation(Station):
         return self._heartbeat.is_alive(self.GetSubsystemContext(self._heartbeat, context))
 
     def copy_state_from(self, context: Context, other: HardwareStation, other_context: Context) -> None:
-        """Copy the state of another station on the same driver, so that it continues to control the arm without a gap.
+        """Copy the state of another station on the same driver, so that this station takes control without a gap.
 
-        The other station is a `clone` of this station, or the original of this clone. Both contexts are the stations'
-        own, and this one is initialized.
+        The other station is a `clone` of this station, or the original of this clone. Both contexts are those of the
+        stations, not root contexts; `context` is initialized.
         """
         context.SetStateAndParametersFrom(other_context)
         for mine, theirs, port in (
@@ -335,8 +335,8 @@ class HardwareStation(Station):
         """Return the largest joint torques of the impedance's wrench, as shares of their limits, (n,).
 
         The joint positions are (n,) [rad]. The wrench is limited along and about each axis of the target separately;
-        the worst corner of that box counts. The torque limiter clips at 1; without it, the driver's reflex would stop
-        the arm at 1 / `TORQUE_SHARE`.
+        the worst corner of this box of wrenches counts. The torque limiter clips at 1; without it, the driver's reflex
+        would stop the arm at 1 / `TORQUE_SHARE`.
         """
         J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
         limits = to_wrench_order(self.impedance.limits)
@@ -371,8 +371,8 @@ def make_robot_impedance(model: ArmControllerPlant, impedance: Impedance) -> Rob
     """Return the impedance for a robot's own controller, with the damping matrix of the nominal posture.
 
     Raises:
-        InputError: If the axes of target and base differ: the wrench is limited along the target's, the robot uses the
-            base's.
+        InputError: If the axes of target and base differ, because the wrench is limited along the target's axes, but
+            the robot uses those of its base.
     """
     plant, arm = model.plant, model.arm
     context = plant.CreateDefaultContext()

@@ -152,8 +152,8 @@ def add_gripper_control(
 class ArmStation(Station):
     """Arm under a Cartesian impedance controller, and a workcell.
 
-    The rotors' reflected inertia makes the arm slower than the gantry, so that it is stable with a controller that is
-    evaluated only once per plant step. With a gripper as the end effector, the station has two more ports:
+    The rotors' reflected inertia makes the arm slower than the gantry. Control of the arm is therefore stable although
+    the controller is evaluated once per plant step. With a gripper as the end effector, the station has two more ports:
 
     ==================  =========  ====================================================================================
     port                size       meaning
@@ -301,7 +301,7 @@ class ArmStation(Station):
         }
 
     def set_payload(self, context: Context, mass: float) -> None:
-        """Add a mass [kg] to the tool that controller and sensor do not model; `context` is the root context."""
+        """Add a mass [kg], unknown to controller and sensor, to the tool; `context` is the root context."""
         own, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
         tool.SetMass(own, tool.default_mass() + mass)
         if self._joint_torque is not None:

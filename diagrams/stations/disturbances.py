@@ -88,7 +88,7 @@ class DisturbedStation(Station):
         builder.BuildInto(self)
 
     def _add_constant(self, builder: DiagramBuilder, name: str, port: OutputPort) -> OutputPort:
-        """Add a pose to `port` that a reset sets; return the port of the sum."""
+        """Add to `port` a constant pose, which a reset sets; return the port of the sum."""
         source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(POSE_SIZE)))
         total = add_system(builder, f"{name}_added", Adder(2, POSE_SIZE), port, source.get_output_port())
         self._calibration.append(source)
@@ -165,10 +165,10 @@ class DisturbedStation(Station):
         return any(further) or e.joint_torque is not None
 
     def _disturb_further(self, context: Context, rng: np.random.Generator) -> dict[str, Any]:
-        """Sample the errors that only a named setting has, and return them by name."""
+        """Sample wrench delay, wrench gradient, calibration and the inner station's errors; return them by name."""
         e = self._errors
         delay = int(rng.integers(e.wrench_delay[0], e.wrench_delay[1], endpoint=True))
-        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))  # nothing changes with the position within a few centimeters
+        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))  # position: negligible within a few centimeters
         gradient[:, 3:] = rng.uniform(-1.0, 1.0, (WRENCH_SIZE, 3)) * np.repeat(e.wrench_gradient, 3)[:, None]
         calibration = rng.uniform(-1.0, 1.0, POSE_SIZE) * np.repeat(e.calibration_error, 3)
         if self._delay is not None:
@@ -207,14 +207,14 @@ def disturbed(
     """Build a station with the impedance of a task, and with disturbances if there are any.
 
     Args:
-        build: Builder of the station, with a parameter `impedance` if that or its stiffness is to be set.
+        build: Builder of the station; it needs the parameter `impedance` for an `impedance` or a stiffness factor.
         disturbances: Disturbances.
         is_simulated: False for a robot.
         name: Name of the station, for messages.
         impedance: Impedance of the task; the station's own by default.
 
     Raises:
-        InputError: If the station does not have such a disturbance, or no impedance to set.
+        InputError: If the station does not support a disturbance, or has no impedance to set.
     """
     has_impedance = "impedance" in inspect.signature(build).parameters
     if impedance is not None and not has_impedance:

@@ -1,4 +1,4 @@
-"""Gantry station: tool center on six impedance-controlled joints, which simulate faster than an arm."""
+"""Gantry station: tool center on six impedance-controlled joints, faster to simulate than an arm."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def add_controller(
 ) -> tuple[CartesianImpedanceController, ImpedanceMonitor, EnergyTank | None]:
     """Add a robot's controller, sampled with `period` [s], and connect the monitor of its wrench and its energy tank.
 
-    There is a tank only if the impedance is bounded; it then receives the desired pose in place of the controller.
+    There is a tank only if the impedance is bounded. The tank, not the controller, then receives the desired pose.
     """
     limits = to_wrench_order(impedance.limits)
     gains = ImpedanceGains(
@@ -85,7 +85,7 @@ def add_energy_tank(
 def make_phase_wrench_limit(
     template: SharedControlTemplate, impedance: Impedance | None, period: float
 ) -> PhaseWrenchLimit | None:
-    """Return the system that limits the wrench by a template's state, or None if no state has a limit.
+    """Return the system that limits the wrench as the template's current state demands; None if no state has a limit.
 
     Args:
         template: Shared control template.
@@ -103,7 +103,7 @@ def make_phase_wrench_limit(
             f"state {limited[0]!r} of template {template.name!r} limits force or torque, and the impedance of this "
             "station has no bound: choose another station or bounded_force=true, or remove the limit"
         )
-    # A state without limits has the station's bound, from which changes to the limits of other states start.
+    # A state without limits has the station's bound, so that the ramp to another state's limits starts there.
     bounds = [impedance.bound.numbers] * len(template.states)
     for number, state in enumerate(template.states):
         given = [np.inf if limit is None else limit for limit in (state.max_force_n, state.max_torque_nm)]

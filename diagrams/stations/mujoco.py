@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 FIXTURE, TOOL, WORKPIECE = "fixture", "tool", "workpiece"
-"""Names of the model's bodies. The workpiece is the tool's child; the tool's six joints are the model's first."""
+"""Names of the model's bodies. The workpiece is the tool's child; the first six joints of the model are the tool's."""
 
 CENTERED: dict[str, Any] = {"ipos": [0.0, 0.0, 0.0], "explicitinertial": True}  # center of mass at a body's origin
 MAX_PAIRS = 31  # number of bits of a contact mask
@@ -129,7 +129,7 @@ def mujoco_parts(
 
 
 def _contact_masks(surfaces: Sequence[Surface], first_bit: int = 0) -> dict[str, int]:
-    """Return a contact mask with one bit for each pair of surfaces, by its name."""
+    """Return a contact mask of one bit for each pair of surfaces, by the name of the pair."""
     pairs = sorted({surface.pair for surface in surfaces})
     if len(pairs) > (most := MAX_PAIRS - first_bit):
         raise InputError(f"MuJoCo distinguishes at most {most} pairs of surfaces, and the workcell has {len(pairs)}")
@@ -189,8 +189,8 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
 class MujocoStation(Station):
     """`GantryStation` in MuJoCo, with the same ports, joints, impedance, watchdog and filter.
 
-    A Drake plant without joints and time step contains the visual geometry, and the poses of fixture and workpiece,
-    which a reset sets in the plant's context.
+    A Drake plant without joints and time step contains the visual geometry and the poses of fixture and workpiece. A
+    reset sets these poses in the plant's context.
     """
 
     def __init__(

@@ -142,8 +142,8 @@ class Disturbances(Options):
     def errors(self) -> SensorErrors:
         """Errors of the sensors: those of `sensing`, with the given ones in their place.
 
-        Joint torques have their own errors: a given scale replaces their gain, a bias their offset and the errors of
-        the arm's model, a drift and a noise their own.
+        Joint torques have errors of their own. A given `wrench_scale` replaces their gain, `wrench_bias` their offset
+        and the errors of the arm's model, `wrench_drift` their drift and friction, `wrench_noise` their noise.
         """
         errors = SENSING[self.sensing]
         given: dict[str, Any] = {
@@ -167,7 +167,7 @@ class Disturbances(Options):
 
     @property
     def is_named_only(self) -> bool:
-        """True if nothing but `sensing` and `tare` is given."""
+        """True if all options except `sensing` and `tare` have their defaults."""
         return self == type(self).model_validate({"sensing": self.sensing, "tare": self.tare})
 
     @property

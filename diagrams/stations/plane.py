@@ -35,9 +35,9 @@ OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
 class PlaneConfig:
     """Parameters of the robot and its time steps.
 
-    The robot is a light ball on two prismatic joints, each with a limited proportional force against viscous friction
-    that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
-    mm, is much less than a wall's thickness. Below saturation its position control is critically damped: the robot
+    The robot is a light ball on two prismatic joints. Each joint has a proportional force with a limit, and viscous
+    friction, which the plant integrates implicitly. At the limit the robot moves at `max_speed`: 20 mm in a plant step,
+    which is much less than a wall's thickness. Below the limit, position control is critically damped: the robot
     reaches a command within a control step and does not overshoot.
     """
 

@@ -239,7 +239,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
 
 
 def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
-    """Add the stand under the mug, which moves with it; its contact counts as the mug's."""
+    """Add the stand under the mug; the stand moves with the mug, and its contact counts as the mug's."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
         add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)

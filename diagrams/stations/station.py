@@ -6,7 +6,7 @@ A *station* is a diagram with a robot, its controller and the objects of a task.
 input              size   meaning
 =================  =====  ==========================================================================================
 `desired_pose`     6      desired pose X_TP of the tool center P, [x y z Rz Ry Rx] in meters and radians
-`command_time`     1      optional: time of `desired_pose` [s]; if it stops, the last safe pose is held
+`command_time`     1      optional: time of `desired_pose` [s]; if it stops increasing, the last safe pose is held
 `max_wrench`       8      optional, only if the impedance is bounded: largest [fx fy fz tx ty tz], norm of the force
                           and norm of the torque [N, Nm]; lowers the bound of the impedance
 =================  =====  ==========================================================================================
