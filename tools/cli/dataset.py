@@ -120,7 +120,7 @@ def create_task(
     out: Annotated[Path, option("Folder of the task; it must not exist.")],
     unit: Annotated[str | None, option("Unit of the meshes: mm, cm, m or inch.")] = None,
     plug_pose: Annotated[
-        str, option(f"{POSE}: motion of the plug's mesh to the assembled pose [unit of the meshes, degrees].")
+        str, option(f"{POSE}: motion of the plug's mesh to the assembled pose [unit of the socket, degrees].")
     ] = "0,0,0,0,0,0",
     axis: Annotated[str, option("Direction in which the plug is removed: +x, -x, +y, -y, +z or -z.")] = "+z",
     center: Annotated[str | None, option("x,y,z of a point on the axis.  [default: the plug's center of mass]")] = None,
