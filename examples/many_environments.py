@@ -12,7 +12,7 @@ if __name__ == "__main__":  # each process imports this file first
         "guiderail/NarrowPassage-v0",
         num_envs=2,
         vectorization_mode="async",
-        # Forks of a fresh process: forks of this one would share its threads' locks.
+        # Forks of a fresh process: forks of this process would copy locks that its threads hold.
         vector_kwargs={"context": "forkserver"},
         guidance="skgrl",
         action_repeat=5,

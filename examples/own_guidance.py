@@ -21,7 +21,7 @@ class AlongOptions(Options):
 
 @register_guidance("kgrl_along", needs=(("demonstrations",),), label="KGRL along a line", options=AlongOptions)
 class KgrlAlong(Guidance):
-    """action (1,) → direction · action (2,) → KGRL."""
+    """KGRL whose action (2,) is a direction times the action (1,) of this guidance."""
 
     def __init__(self, known: PriorKnowledge):
         super().__init__()

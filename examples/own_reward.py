@@ -1,4 +1,4 @@
-"""Change the reward of a task: override `reward_terms` of a subclass; each term is a column of the results."""
+"""Change the reward of a task: override `reward_terms` in a subclass; each term is a column of the results."""
 
 import numpy as np
 

@@ -46,7 +46,7 @@ BLOCK = 10  # episodes of a stored file
 class TaskSpaceTransitions(Callback):
     """Callback that gives the teacher's transitions to a student, with the equivalent displacement as action.
 
-    The displacement is the mean over the control steps of the action of the command minus the motion without actions,
+    The displacement is the command minus the motion without actions, averaged over the control steps of the action,
     divided by the student's gains and clipped to ±1.
 
     Args:
@@ -129,7 +129,7 @@ def evaluate_variant(out: Path, variant: str, episodes: int, seed: int, run_seed
 def times_per_action(out: Path) -> dict[str, float]:
     """Return the median time of an action, with all its commands, without simulation [ms].
 
-    The student's is that of its network, of the sum with the motion, and of the projection onto the constraints.
+    The student's time covers its network, the sum with the motion, and the projection onto the constraints.
     """
     repeat, prior = configure(TASK, TEACHER).action_repeat, make_prior_knowledge(TASK, **STUDENT).demonstrations
     teach, observations, _ = teacher_actions(TASK, TEACHER, repeat, Policy.load(out / "teacher"))

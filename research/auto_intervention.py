@@ -27,7 +27,7 @@ class AutoInterventionConfig(OffPolicyConfig):
     """Settings of TQC with automatic interventions."""
 
     algorithm: str = "auto_intervention"
-    window: Positive = 25  # control steps of the demonstration among which the nearest one is found
+    window: Positive = 25  # control steps ahead of the progress that are searched for the nearest one
     stall_actions: Positive = 6  # actions without progress after which the demonstration takes over
     intervention_actions: Positive = 6  # actions that an intervention lasts
     until_successes: Positive = 3  # consecutive greedy successes after which there are no interventions

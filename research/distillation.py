@@ -1,6 +1,7 @@
-"""Distillation of a KGRL policy (thesis, 6.2.3): teacher and student on the same held-out episodes, and their time.
+"""Distillation of a KGRL policy (thesis, 6.2.3): comparison of teacher and student on the same held-out episodes.
 
-The student is executed alone, behind the guard of chunks, and as the reference of KGRL, inside its projection.
+The student is executed in three ways: alone, with the guard of chunks, and as the reference of KGRL. The time that
+teacher and student need for an action is measured as well.
 
 Run it with `python -m research.distillation --teacher runs/teacher --student runs/student --out runs/distillation`.
 """
@@ -26,7 +27,7 @@ from research.command import Parser, print_result, run_program
 
 BLOCK = 10  # episodes of a stored file
 MEASURED = 300  # actions whose time is measured
-# Options of each way to execute the student; the teacher has its own.
+# Options of each way to execute the student. The teacher has the options of its own run.
 VARIANTS: dict[str, dict[str, Any]] = {
     "teacher": {},
     "student": {"guidance": "base_policy", "guard": "none"},
@@ -68,8 +69,8 @@ def evaluate_variant(teacher: RunFolder, student: Path, variant: str, episodes: 
 def time_per_action(teacher: RunFolder, student: Path) -> dict[str, float]:
     """Return the median time of an action, with all its commands, without simulation [ms].
 
-    The teacher's is that of its network and of a constrained primitive in every control step, the student's that of its
-    network.
+    The teacher's time covers its network and a constrained primitive in every control step. The student's time covers
+    only its network.
     """
     config, policy, base = teacher.config(), Policy.load(teacher.path), find_base_policy(str(student))
     options = beyond_defaults(config.task, config.environment)

@@ -101,7 +101,7 @@ def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: i
         if count % interval == 0:
             weights = rng.normal(size=(size, FEATURES))
         count += 1
-        # Divided by the noise's deviation in this state: gSDE's own scale would depend on the network.
+        # Normalize by the noise's standard deviation in this state, because gSDE's own scale depends on the network.
         return np.clip(RMS * weights @ features / np.linalg.norm(features), -1.0, 1.0)
 
     return act

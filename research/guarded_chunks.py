@@ -60,13 +60,13 @@ def check_commands(
 
 
 def evaluate_guard(guard: str, base_policy: str, episodes: int, seed: int) -> pd.DataFrame:
-    """Return the rows of held-out episodes with a guard, and how the commands meet the limits.
+    """Return the rows of held-out episodes with a guard, with the results of `check_commands` as columns.
 
     Args:
         guard: Value of the option `guard`.
         base_policy: Value of the option `base_policy`.
         episodes: Number of episodes.
-        seed: Seed of the first.
+        seed: Seed of the first episode.
     """
     options = {"guidance": "base_policy", "difficulty": "hard", "base_policy": base_policy, "guard": guard}
     env: Any = make_environment(TASK, {**options, "horizon": 15, "max_speed": MAX_SPEED, "max_jerk": MAX_JERK})

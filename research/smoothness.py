@@ -2,7 +2,7 @@
 
 Each method explores the connector with random actions, in free space (the jack is out of reach) and in contact: KGRL
 and sKGRL through their null space, the others as a residual on the demonstrations. The jerk of a command has two parts:
-that of the demonstrations, and that which exploration adds.
+the jerk of the demonstrations, and the jerk that exploration adds.
 
 Run it with `python -m research.smoothness --out studies`.
 """
@@ -36,7 +36,7 @@ from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, p
 def log_dimensionless_jerk(positions: np.ndarray, period: float) -> float:
     """Return the log dimensionless jerk of a motion; higher (less negative) is smoother.
 
-    −ln(T³/v² ∫|jerk|² dt) with duration T and largest speed v. It does not depend on tempo or unit.
+    The value is −ln(T³/v² ∫|jerk|² dt) with duration T and largest speed v. It does not depend on tempo or unit.
 
     Args:
         positions: Positions, (N, O).
@@ -104,8 +104,8 @@ class Method:
     Attributes:
         name: Name in the table.
         guidance: Kind of guidance.
-        explore: Makes the policy of an episode from a random generator, the number of steps and of actions.
-        action_repeat: Control steps of an action. The environment takes an action at every control step.
+        explore: Function of a random generator, the number of steps and the number of actions; returns a policy.
+        action_repeat: Control steps for which `explore` repeats an action. The environment's own action repeat is 1.
         environment: Further options of the environment.
     """
 
@@ -144,7 +144,7 @@ def smoothness(
         out: Folder; methods that are already measured in it are not measured again.
         episodes: Episodes of each method, in free space and in contact each.
         action_scale: Common exploration RMS, in demonstration standard deviations.
-        outputs: "all" six outputs, as in the thesis, or "xy", as the connector is learned.
+        outputs: "all" for all six outputs, as in the thesis, or "xy" for the outputs that the learned policies move.
         seed: Seed of the random actions and of the jack offsets, which are new in every episode.
 
     Raises:
@@ -191,7 +191,7 @@ def measure(
 
     Args:
         method: Exploration method.
-        action_dims: Indices of the outputs that it moves.
+        action_dims: Indices of the outputs that the method moves.
         quiet: Commands of the demonstrations without actions, (N, 6): see `quiet_commands`.
         episodes: Episodes in each place.
         action_scale: Exploration RMS, in demonstration standard deviations.
@@ -233,13 +233,13 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
     config = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
     assert config is not None
     indices = np.array(action_dims)
-    if method.guidance == "residual":  # one gain for all outputs of a unit; their deviations differ
+    if method.guidance == "residual":  # one gain for all outputs of a unit, although their deviations differ
         reached = RMS * (config.residual_gains() / deviation(config.reference))[indices]
         return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
     primitive = config.primitive(history=method.guidance == "skgrl")
     if not method.environment.get("adaptive_history"):
         return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
-    # One action scale sets the gains of every length of an adaptive history. In free space it has its full length.
+    # One action scale sets the gains for all lengths of an adaptive history. In free space the history is complete.
     reached = exploration_rms(primitive, config.null_space_gains(primitive), method.action_repeat)[indices]
     return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
 
@@ -277,7 +277,7 @@ def _row(
 
 
 def _ratios(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Compare sKGRL with KGRL at the same action repeat, and with every other method, with their success rates."""
+    """Return how many times the jerk of sKGRL is below that of KGRL and of residuals, with the success rates."""
     free = {row["method"]: row for row in rows if row["place"] == "free"}
     success = {row["method"]: row["success_rate"] for row in rows if row["place"] == "connector"}
     others = {name: row for name, row in free.items() if name.startswith("residual")}

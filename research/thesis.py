@@ -40,8 +40,8 @@ class Setting:
         options: Values of the environment's options; several where the thesis has several.
         preset: Name of the preset that holds the table of the learner's settings.
         algorithms: Names of the learners.
-        remarks: Differences that every run has, or every run for whose environment the predicate is true. The text is
-            a format string over the environment's options.
+        remarks: Pairs of a text and a predicate. The text is a difference of every run for whose environment the
+            predicate is true; it is a format string over the environment's options.
     """
 
     section: str
@@ -69,7 +69,7 @@ _PRIMITIVE = {
     "lambda_": (6.0,),
     "beta": (6.0,),
     "kernel": ("squared_exponential",),  # section 4.3.3, "the same kernel in all our experiments"
-    "length_scale": (0.5,),  # its l = 2 is 1 / (2 ℓ²)
+    "length_scale": (0.5,),  # the thesis's l = 2 is 1 / (2 ℓ²)
 }
 _IN_REMARKS = ("action_scale", "mouth_chamfer", "difficulty")  # options whose values the remarks have
 _SCALE = (

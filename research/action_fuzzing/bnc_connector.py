@@ -1,6 +1,6 @@
 """Fuzzing of the connector: random, repeated and saturated actions in x and y, and in all six outputs.
 
-Residual learning is not constrained: its episodes check the simulation.
+Residual learning is not constrained: its episodes test only the simulation.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) 
 
 
 def _lug_inside(d: BncDimensions, p_P: np.ndarray) -> float:
-    """Return the depth of a lug: it may be before the mouth's face or in one of the two slots."""
+    """Return the penetration depth of a lug [m]; 0 before the mouth's face and in the two slots."""
     beyond_face = p_P[2] + d.lug_radius
     if beyond_face <= 0.0:
         return 0.0
-    # Both slots are alike. An angle closer to the entry of the other slot than to the end of this one counts there.
+    # The slots are equal. An angle nearer to the other slot's entry than to this slot's end belongs to the other slot.
     angle = np.arctan2(p_P[1], p_P[0]) % np.pi
     if angle > 0.5 * (np.pi + d.detent_angle):
         angle -= np.pi
@@ -53,7 +53,7 @@ def _lug_inside(d: BncDimensions, p_P: np.ndarray) -> float:
 
 
 def _barrel_inside(d: BncDimensions, p_P: np.ndarray) -> float:
-    """Return the depth of the barrel's end: it may be before the mouth's face, in the bore or chamfer, or outside."""
+    """Return the penetration depth of the barrel's end [m]; 0 before the face, in bore and chamfer, and outside."""
     off_axis = float(np.hypot(p_P[0], p_P[1]))
     in_bore = d.bore_radius - d.barrel_radius + max(0.0, d.mouth_chamfer - p_P[2])
     outside_plug = d.ring_radius + d.barrel_radius
@@ -82,9 +82,9 @@ def _distance(corners: np.ndarray, point: np.ndarray) -> float:
 
 
 ACTION_DIMS = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
-STANDING_STEPS = 5  # control steps of penetration that are no longer an impact
+STANDING_STEPS = 5  # control steps after which a penetration is no longer an impact
 _D = BncWorkcell().dimensions
-# Compliant surfaces deform in an impact. Beyond these depths a body could leave a wall on the other side: a lug with
+# Compliant surfaces deform in an impact. Beyond these depths a body could pass through a wall: a lug with
 # its center inside the wall, or a barrel as deep in the ring as the ring is thick.
 LIMITS = {
     "lug_impact_mm": _D.lug_radius / MM,
@@ -109,7 +109,7 @@ class Penetration(EnvCallback):
         self._depths.append(interference(_D, X_JP.rotation().matrix(), X_JP.translation()))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the largest depths of lug and barrel, and the largest that lasted for `STANDING_STEPS`."""
+        """Return the largest depths of lug and barrel, and the largest depth that lasted for `STANDING_STEPS`."""
         depths = np.array(self._depths) / MM
         windows = np.lib.stride_tricks.sliding_window_view(depths.max(axis=1), min(STANDING_STEPS, len(depths)))
         return {

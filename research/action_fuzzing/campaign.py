@@ -45,7 +45,7 @@ class NonFiniteCounter(EnvCallback):
         self._count += int(np.sum(~np.isfinite(transition.next_observation))) + (not np.isfinite(transition.reward))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return `not_finite`, including those of the trace."""
+        """Return `not_finite`, which includes the values of the trace."""
         trace = self.base.trace
         recorded = (trace.commanded, trace.measured, trace.force)
         return {"not_finite": self._count + sum(int(np.sum(~np.isfinite(values))) for values in recorded)}
@@ -106,7 +106,7 @@ def run_campaign(
     environment: Mapping[str, Any] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Run an episode of every case with every kind of actions in turn.
+    """Run episodes until `is_done`, cycling through every case with every kind of actions.
 
     Args:
         campaign: Campaign to run.
@@ -114,7 +114,7 @@ def run_campaign(
         seed: Seed of the first episode; episode i has seed + i.
         out: Table that is written after every round of the cases. Episodes in it are not run again.
         step_log: Folder of a file per episode with every control step.
-        environment: Options that every case has besides its own.
+        environment: Options of every case, which override its own.
         report: Called with a line of text after every round.
 
     Returns:
@@ -165,7 +165,7 @@ def run_campaign(
 
 
 def _digest(task: str, environment: Mapping[str, Any]) -> str:
-    """Return a digest of the resolved environment, as a text that is never read as a number."""
+    """Return a digest of the resolved environment, with a prefix so that no reader parses it as a number."""
     resolved = json.dumps(check_environment(task, environment), sort_keys=True, default=str)
     return f"env-{hashlib.blake2b(resolved.encode(), digest_size=6).hexdigest()}"
 

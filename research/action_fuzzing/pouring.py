@@ -44,7 +44,7 @@ def noisy_pour(rng: np.random.Generator, spread: float = 1.5) -> PolicyFn:
 
 
 def random_walk(rng: np.random.Generator) -> PolicyFn:
-    """Return full inputs that change with a probability of 0.1 per action: they reach every corner of the workspace."""
+    """Return a policy of inputs ±1, resampled with a probability of 0.1 per action: they reach the whole workspace."""
     action = np.sign(rng.normal(size=3))
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ def random_walk(rng: np.random.Generator) -> PolicyFn:
 
 
 def noisy_approach(rng: np.random.Generator) -> PolicyFn:
-    """Return noisy inputs towards the mug, from everywhere."""
+    """Return a policy of noisy inputs towards the mug."""
 
     def act(observation: np.ndarray) -> np.ndarray:
         towards = -observation[:3] / np.linalg.norm(observation[:3])
@@ -67,7 +67,7 @@ def noisy_approach(rng: np.random.Generator) -> PolicyFn:
 
 
 def noisy_press(rng: np.random.Generator) -> PolicyFn:
-    """Return inputs that press down on the table, and sideways."""
+    """Return a policy that presses down on the table with random sideways inputs."""
 
     def act(observation: np.ndarray) -> np.ndarray:
         return np.array([*np.clip(rng.normal(size=2), -1.0, 1.0), -1.0])
@@ -85,7 +85,7 @@ ADVERSARIES: dict[str, PolicyMaker] = {
 
 
 def _three_inputs(make: PolicyMaker) -> BaselineFactory:
-    """Return an adversary of the template's three inputs; where there are six velocities, full deflection."""
+    """Return the adversary for the template's three inputs, and `bang_bang` for the six velocities without guidance."""
     return lambda rng, size: make(rng) if size == 3 else bang_bang(rng, size)
 
 

@@ -23,7 +23,7 @@ def nominal_frames(sampled: Mapping[str, Any]) -> Mapping[str, RigidTransform]:
 
 
 class RecomputedViolation(EnvCallback):
-    """Add `recomputed_violation` to an episode's row: the largest violation of its commands, −inf without constraints.
+    """Callback that adds `recomputed_violation`, the largest violation of an episode's commands; −inf if unconstrained.
 
     It is computed with NumPy from the recorded `desired_pose` and the task's constraints, or the template's active
     constraints in the state of each control step.
@@ -52,7 +52,7 @@ class RecomputedViolation(EnvCallback):
         poses = self.base.trace.commanded
         constraints = task.constraints()
         if constraints is not None:
-            # The command at the end of control step n is that of step n, counted from zero.
+            # Command n of the trace, counted from zero, has to satisfy the constraints of step n.
             G, c = constraints.window(np.arange(len(poses)))
             return (c - np.einsum("nfo,no->nf", G, poses)).max(axis=1, initial=-np.inf)
         if self._frames is None or "template" not in task.provides():

@@ -21,7 +21,7 @@ CONSTRAINED = ("kgrl", "skgrl", "sct")
 def grid_clamp() -> Campaign:
     """Return the campaign: every guidance must keep all commands in the template's cuboid, below the force limit.
 
-    A clamp that is held back makes the command wait, which counts as a fallback and is allowed.
+    While the clamp is blocked, the last command is repeated. This counts as a fallback, which is allowed.
     """
     cases = [
         Case(
@@ -41,7 +41,7 @@ def narrow_passage() -> Campaign:
     """Return the campaign: KGRL and sKGRL, at two action repeats, must satisfy the constraint and touch no wall.
 
     Safe residual learning may stop before walls. Residual learning and the demonstrations alone are not constrained:
-    their episodes check the simulation.
+    their episodes test only the simulation.
     """
     cases = [
         Case(
@@ -62,8 +62,8 @@ def narrow_passage() -> Campaign:
 def campaign_of(task: str) -> Campaign:
     """Return a campaign of every guidance of a task, with the default options.
 
-    The violation of a template is the one that the guidance reports, because the poses of its objects are unknown; that
-    of a task's constraints is recomputed. Waiting, or stopping before a wall, is not a failure.
+    The violation of a task's constraints is recomputed. The violation of a template is the one that the guidance
+    reports, because the poses of its objects are unknown. Waiting, or stopping before a wall, is not a failure.
 
     Args:
         task: Name of the task.
@@ -97,14 +97,14 @@ def fuzz(
     """Fuzz a task, or all tasks, for a number of episodes or control steps.
 
     Args:
-        task: Name of a task; one without a campaign gets that of `campaign_of`. "all": each of `CAMPAIGNS` gets the
-            same number of control steps.
+        task: Name of a task, or "all". A task that is not in `CAMPAIGNS` gets the campaign of `campaign_of`. With
+            "all", every task of `CAMPAIGNS` gets the same number of control steps.
         episodes: Number of episodes of one task, 1000 by default.
-        steps: Number of control steps, instead.
+        steps: Number of control steps, instead of `episodes`.
         seed: Seed of the first episode of each task.
         out: Table of one task; with "all", a folder with a table of each task and a folder with every control step.
             Episodes in it are not run again.
-        environment: Options that every case has besides its own.
+        environment: Options of every case, which override its own.
         report: Called with a line of text after every round.
 
     Returns:

@@ -1,7 +1,7 @@
 """Parallel actors: `python -m research.benchmarks actors [TASK --env ...]`.
 
-Short runs with 0 (on one core), 1 and 2 actors are trained. The wall-clock time of an episode is compared with a model
-of the processor time of its simulation and of its learning, which is extrapolated to more cores.
+Short runs with 0 (on one core), 1 and 2 actors are trained. The wall-clock time of an episode is compared with a model,
+which is then extrapolated to more cores. The model uses the processor times of simulation and learning.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from guiderail.tools.learning.train import configure, with_defaults
 from guiderail.tools.learning.trainer import run_training
 from research.benchmarks import with_progress
 
-EPISODES, SKIPPED = 12, 5  # of a run, and those of them that are not timed: learning begins in them
+EPISODES, SKIPPED = 12, 5  # episodes of a run, and untimed ones among them, in which learning begins
 MEASURED = ((1, 0), (2, 1), (2, 2))  # cores and actors
 EXTRAPOLATED = ((16, 4), (100, 4))
 
@@ -28,8 +28,8 @@ EXTRAPOLATED = ((16, 4), (100, 4))
 def seconds_per_episode(simulation: float, learning: float, cores: int, num_envs: int) -> float:
     """Return the wall-clock time of a training episode [s].
 
-    Without actors, a process simulates and learns in turn. With N actors, the longest of three decides: all work on all
-    cores, the learning of one process, and the simulation of N processes.
+    Without actors, a process simulates and learns in turn. With N actors, the time is the largest of three: all work
+    divided by the cores, the learning in one process, and the simulation divided by N.
 
     Args:
         simulation: Processor time of an episode's simulation [s].
@@ -49,7 +49,7 @@ def measure(task: str = "BncConnector", environment: Mapping[str, Any] | None = 
         (cores, num_envs): _run(task, environment, cores, num_envs)
         for cores, num_envs in with_progress(MEASURED, "actors")
     }
-    parallel = runs[2, 2]  # its processes measure simulation and learning apart
+    parallel = runs[2, 2]  # separate processes simulate and learn
     simulation, learning = parallel["actors"], parallel["learner"]
     rows = [
         {

@@ -1,8 +1,8 @@
 """Time from the start of the command to a trained policy: `python -m research.benchmarks cold_start`.
 
 Each run is `guiderail train` in a new process, timed from its start to its end, including imports, saving and drawing.
-The evaluation of its policy is not timed. Both kinds of a seed run one after the other, so that their ratio belongs to
-one state of the machine. No setting was chosen with these seeds.
+The evaluation of its policy is not timed. For each seed, both kinds run one after the other, so that the load of the
+machine is the same for both. No setting was chosen with these seeds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m research.benchmarks engines`: scripted motions and contact of a plug on the rim, in Drake and MuJoCo."""
+"""Drake compared with MuJoCo in scripted motions and contact on the rim: `python -m research.benchmarks engines`."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ COLORS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
 TASKS = ("BncConnector", "GridClamp")
 OFFSETS = (0.8, 1.25, 2.0, 3.0)  # offsets of a plug on the rim [mm]
 MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
-PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
+PRESSED = 7.8 * MM  # commanded height [m]: 2.7 mm below the rim, which presses with 4 N
 MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
 NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
-IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that dropped in, offset that is too large [m]
+IN, FARTHEST = 9.5 * MM, 0.4 * MM  # a plug below this height dropped in; offset at which none does [m]
 HALVINGS = 6  # bisection steps of the capture offset
 AROUND, SPEEDS = (
     3.0 * MM,
     (0.003, 0.02, 0.04),
-)  # circle on the rim [m], speeds [m/s]
-CAPTURES = {  # station, and whether Drake's polygons have their circles' areas
+)  # radius of a circle on the rim [m], speeds [m/s]
+CAPTURES = {  # station, and whether Drake's polygons have the area of their circles
     "Drake": ("gantry", False),
     "Drake, equal areas": ("gantry", True),
     "MuJoCo": ("mujoco", False),
 }
-CONTACTS = {  # station, step [s] and margin [m]
+CONTACTS = {  # station, time step [s] and margin [m]
     "Drake, 10 ms": ("gantry", PLANT_PERIOD, MARGIN),
     "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4, MARGIN),
     "Drake, 2.5 ms, no margin": ("gantry", PLANT_PERIOD / 4, 0.0),
@@ -74,7 +74,7 @@ def measure() -> dict[str, Any]:
 
 
 def rigid_lever(d: BncDimensions, offset: float) -> float:
-    """Return the distance of two rigid bodies' contact points from the plug's axis, the chord of their overlap [m]."""
+    """Return the distance between the plug's axis and the chord through the contact points of rigid bodies [m]."""
     mouth = d.bore_radius + d.mouth_chamfer
     return float((mouth**2 + offset**2 - d.barrel_radius**2) / (2.0 * offset))
 

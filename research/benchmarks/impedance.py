@@ -1,8 +1,8 @@
 """Comparison of the gantry's two impedances: `python -m research.benchmarks impedance`.
 
-`joint` consists of springs and dampers of the gantry's joints, which the plant solves with the contact. `cartesian` is
-the Cartesian impedance controller of the arm, whose forces are constant during a plant step. They have the same
-stiffness, damping ratio and limits. A scripted insertion at several time steps is compared with the insertion at the
+`joint` consists of springs and dampers in the gantry's joints, solved together with the contact. `cartesian` is the
+Cartesian impedance controller of the arm, whose forces are constant during a plant step. Both have the same stiffness,
+damping ratio and limits. A scripted insertion at several time steps is compared with the insertion at the
 finest one. The demonstration alone and the scripted policy act in the same held-out episodes with each impedance.
 """
 
@@ -99,7 +99,7 @@ def step_response(control: str, time_step: float | None = None) -> dict[str, Any
 
 
 def _difference(poses: np.ndarray, others: np.ndarray, name: str) -> dict[str, float]:
-    """Return the RMS distance [m] and the largest difference of an angle [rad] of two motions, columns `name`_…."""
+    """Return the RMS distance [m] and the largest angle difference [rad] of two motions, as columns `name`_…."""
     away = np.linalg.norm((poses - others)[:, :3], axis=1)
     turned = np.abs((poses - others)[:, 3:])
     return {f"{name}_position_rms": float(np.sqrt((away**2).mean())), f"{name}_angle_most": float(turned.max())}

@@ -3,11 +3,11 @@
 CPU time of one core. The two learners alternate, and the ratio is the median over the turns. Batches have 13
 observations and 2 actions, as those of the connector.
 
-Variants of TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64), relative
-to Stable-Baselines3: critics batched in PyTorch's autograd, with flat parameters and a fused optimizer 0.39;
-hand-written gradients 0.20 to 0.25. Relative to the latter: quantiles sorted by PyTorch instead of NumPy 1.02 to 1.08;
-preallocated memory for quantile errors 0.96 to 1.05; their sums as a matrix product 1.05 to 1.08; two threads on busy
-cores 40, because threads spin while waiting for each other.
+Variants of TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64) take this
+share of Stable-Baselines3's time: 0.39 with critics batched in PyTorch's autograd, flat parameters and a fused
+optimizer; 0.20 to 0.25 with hand-written gradients. Variants of the latter take this multiple of its time: 1.02 to 1.08
+with quantiles sorted by PyTorch instead of NumPy; 0.96 to 1.05 with preallocated memory for quantile errors; 1.05 to
+1.08 with their sums as a matrix product; 40 with two threads on busy cores, because waiting threads spin.
 
 With large batches and layers the matrix products dominate: SAC with 256 by 256 units and batches of 256
 (`table_4_1_simulation`) takes 0.68 of Stable-Baselines3's time.

@@ -2,7 +2,7 @@
 
 Gymnasium's vector environment (`gymnasium.make_vec`) waits for the slowest process at every step. It sends actions and
 reads results one environment after the other; this time per environment is the serial part. The rate for more cores
-than the machine has is extrapolated: n environments on n cores take the time of one and n − 1 times the serial part.
+than the machine has is extrapolated: n environments on n cores take the time of one plus n − 1 serial parts.
 """
 
 from __future__ import annotations

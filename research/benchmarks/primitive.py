@@ -1,10 +1,10 @@
 """Duration of a control step of an LC-NS-KMP: `python -m research.benchmarks primitive`.
 
-Every row is a closed loop (history → next point, uniform actions in ±1, gains calibrated by authority) in three
-regimes: constraints slack, sometimes active, and active at almost every step. The dense step is that of the thesis:
-K + ħΣ is inverted, and the dual of equation 4.20 over the whole window is given to PIQP, or to DAQP if PIQP is not
-installed. The difference is the largest one to the dense step, relative to the outputs' scales. Most of it is the error
-of the dense step: the tests compare both with extended precision.
+Every row is a closed loop (history → next point, uniform actions in ±1, gains calibrated by authority) in one of three
+regimes: constraints slack, sometimes active, or active at almost every step. The dense step computes as in the thesis:
+it inverts K + ħΣ and solves the dual of equation 4.20 over the whole window with PIQP, or with DAQP if PIQP is not
+installed. The difference is the largest deviation from the dense step, relative to the outputs' scales. Most of it is
+the numerical error of the dense step: the tests compare both with extended precision.
 """
 
 import gc

@@ -1,7 +1,7 @@
 """Speed of contact simulation: `python -m research.benchmarks simulation`.
 
-Best CPU time of several runs on one core, which depends least on other processes. Python's share is the time in
-callbacks of systems that are written in Python.
+The result is the best CPU time of several runs on one core, because it depends least on other processes. Python's share
+is the time in callbacks of systems that are written in Python.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def timed_callbacks() -> Iterator[Callable[[], float]]:
 
 
 def real_time_factor(name: str) -> dict[str, float]:
-    """Return the best of `REPEATS` runs of one of `REQUIRED_FACTOR`."""
+    """Return the best of `REPEATS` runs of a simulation in `REQUIRED_FACTOR`."""
     return max((_one_run(name) for _ in range(REPEATS)), key=lambda run: run["real_time_factor"])
 
 

@@ -1,8 +1,8 @@
 """Profile of a training run: `python -m research.benchmarks training TASK --env station=arm`.
 
-One short run as of `guiderail train`, whose learner starts early. Wall-clock time counts for the innermost measured
-part: time in a system's callback does not count for the simulation, nor time that Drake needs to evaluate a port for
-its reader. Drake's own computations (contact, solver, kinematics) are one part.
+The profiled run of `guiderail train` is short, and its learner starts early. Wall-clock time counts for the innermost
+measured part: time in a system's callback does not count for the simulation, and time that Drake needs to evaluate a
+port does not count for the callback that reads it. Drake's own computations (contact, solver, kinematics) are one part.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def timed_parts() -> Iterator[Profiler]:
 
 
 def _callbacks() -> Iterator[tuple[type, str]]:
-    """Yield the methods of every system and of its support classes, which are all that Drake calls."""
+    """Yield the methods of every system and of its support classes: Drake calls no other Python code."""
     for module_info in pkgutil.walk_packages(guiderail.systems.__path__, "guiderail.systems."):
         module = import_module(module_info.name)
         for kind in vars(module).values():

@@ -165,7 +165,7 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
 def _pouring(
     out: Path, algorithm: str, seeds: int, episodes: int | None, methods: tuple[str, ...] = tuple(METHODS)
 ) -> pd.DataFrame:
-    """Return a row for each run: of all seeds in the folder, and of new ones if those are fewer than `seeds`."""
+    """Return a row for each run: all finished seeds in the folder are used, and new ones are run up to `seeds`."""
     study = figure_study(f"pouring_{algorithm}", seeds=seeds, episodes=episodes, methods=methods, evaluate=False)
     selected = {}
     for method, known in study.methods.items():

@@ -57,8 +57,8 @@ def explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> np.ndarray:
 def figure_4_2(out: Path) -> dict[str, Any]:
     """Draw demonstrations with their mixture, and motions with one action and with random ones, inside bounds.
 
-    The table has the distance of each motion to the one without actions: at `MODULATED_AT`, and the largest one more
-    than `NEARBY` away from it.
+    The table has the distance of each motion from the motion without actions: at the time `MODULATED_AT`, and the
+    largest distance at times more than `NEARBY` before or after it.
     """
     demonstrations = synthetic_demonstrations()
     reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=COMPONENTS)

@@ -69,7 +69,7 @@ def figure_5_2(out: Path) -> dict[str, Any]:
             axis.plot(*windows[n].T, color="tomato", linewidth=0.8, alpha=0.8)
         axis.plot(*executed[:300].T, color="firebrick", linewidth=1.6)
         axis.set(title=f"{label(kind)} exploration", xlim=(0.2, 0.65), ylim=(0.03, 0.5))
-        # Distance between the next point of the last window and the executed point.
+        # Distance between an executed point and the point that the window of the step before predicted for it.
         jumps = np.linalg.norm(executed[1:] - np.array([window[1] for window in windows[:-1]]), axis=1)
         rows.append(
             {

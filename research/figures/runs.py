@@ -32,7 +32,7 @@ def figure_study(
         name: Name of the study.
         seeds: Number of seeds, from the study's first.
         episodes: Episodes of each run; the study's own number by default.
-        methods: Methods; those of the study by default. A method that it lacks is guidance of that name.
+        methods: Names of methods; all of the study by default. A name that the study lacks is a kind of guidance.
         evaluate: True to evaluate its policies.
         changes: Other fields of the study.
     """
@@ -97,7 +97,7 @@ def save_results(out: Path, name: str, figure: Figure, rows: Any) -> dict[str, A
 
 
 def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], presets: Sequence[str]) -> dict[str, Any]:
-    """Write a table of learner settings: the thesis's, those of its presets, and further presets.
+    """Write a table that compares the thesis's learner settings with its presets and with further presets.
 
     Args:
         path: Path of the table, without its ending.

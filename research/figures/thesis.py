@@ -34,7 +34,7 @@ THESIS = {
     "table 4.1": "TQC in simulation and on the real robot",
 }
 
-# Settings by preset. An action lasts one control step there, so that gamma is that of a control step.
+# Settings by preset. As in the presets, gamma is per action in table 3.2 and per control step in table 4.1.
 TABLE_3_2 = {
     "table_3_2_iiwa": {
         "learning_rate": 8e-4, "buffer_size": 1_000_000, "gamma": 0.95, "tau": 0.02, "train_freq": 8,

@@ -29,7 +29,7 @@ class Session:
     """Set of demonstrated motions.
 
     Attributes:
-        motions: Returns the motions, (M, N, 6), of a seed and times, (N,).
+        motions: Function of a seed and times (N,) that returns the motions (M, N, 6).
         path: File of the shipped recording.
         station: Builds the station that is driven.
         source: Description of the recording.
@@ -79,7 +79,7 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
         "times": recordings[0].times,
         "outputs": stacked("desired_pose"),
         "names": np.array(NAMES),
-        # Measured values are stored in single precision, a nanometer.
+        # Measured values are stored in single precision, which resolves nanometers.
         "measured": stacked("pose").astype(np.float32),
         "wrench": stacked("wrench").astype(np.float32),
         "contact_force": stacked("contact_force")[..., 0].astype(np.float32),

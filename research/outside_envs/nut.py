@@ -1,6 +1,6 @@
 """`NutAssemblySquare` of robosuite with a Panda: a nut is put over a peg at an unknown offset.
 
-Outputs are the position of the gripper and its yaw; it points downwards. The yaw is 0 where the handle that it grasps
+The outputs are the position and the yaw of the gripper, which points downwards. The yaw is 0 if the grasped handle
 points along x.
 """
 
@@ -23,13 +23,13 @@ STEP, TURN = 0.05, 0.5  # displacement and rotation of an action of 1 [m, rad]
 OFFSETS = (0.01, 0.02)  # distance of the assumed peg from the true one in y, on either side [m]
 HANDLE = 0.054  # distance of the handle from the nut's center [m]
 MAX_YAW = np.radians(110.0)  # largest yaw of the gripper [rad], because of the range of the last joint
-MAX_LAG = 0.03  # height of the gripper above its command at which the first attempt ends: the nut lies on the peg [m]
+MAX_LAG = 0.03  # height above the command at which the first attempt ends, because the nut lies on the peg [m]
 LONGEST = 170  # steps of a recording
 OPEN, CLOSED = -1.0, 1.0
 
 
 def close_at_end(phase: float, is_held: bool) -> float:
-    """Return the gripper's command of a segment that closes it while its last point is held."""
+    """Return the gripper's command in a segment that closes the gripper while the last point is held."""
     return CLOSED if is_held else OPEN
 
 
@@ -44,7 +44,7 @@ PARTS = {
     "lift": Part(14, "object_start", CLOSED),
     "carry": Part(26, "assumed_goal", CLOSED),
     "insert": Part(16, "assumed_goal", CLOSED, dwell=4, until=is_blocked),
-    # The second attempt: the insertion backwards, and once more. The demonstrations are those of the first.
+    # Second attempt: retract along the insertion and insert again, with the demonstrations of the first insertion.
     "retract": Part(14, "assumed_goal", CLOSED, source="insert", is_reversed=True),
     "insert again": Part(16, "assumed_goal", CLOSED, dwell=14, source="insert"),
 }
@@ -144,7 +144,7 @@ class HiddenPeg(gymnasium.Env):
         return int(self._sim_env.robots[0].eef_site_id["right"])
 
     def _reseed(self, seed: int) -> None:
-        """Seed robosuite's generators; its samplers keep one of their own."""
+        """Give one generator with this seed to the environment, its placement samplers and its robots."""
         env = self._sim_env
         env.rng = np.random.default_rng(seed)
         env.placement_initializer.rng = env.rng
@@ -163,8 +163,8 @@ class HiddenPeg(gymnasium.Env):
     def _grasp(self) -> tuple[float, float, float]:
         """Return the yaw of the grasp, the yaw at the peg, and the direction of the handle there [rad].
 
-        The nut fits in four orientations. The handle points towards the robot or sideways where the yaw allows it: the
-        robot's reach ends behind the peg.
+        The nut fits in four orientations. If the yaw limit allows it, the handle points towards the robot or sideways,
+        because the robot's reach ends behind the peg.
         """
         offset = (self._handle() - self._nut())[:2]
         direction = float(np.arctan2(offset[1], offset[0]))
@@ -203,7 +203,7 @@ def to_action(env: Any, observation: Any, command: np.ndarray, grip: float) -> n
 
 
 class Script:
-    """Scripted policy, which observes the true peg: waypoints with a height, a speed and a state of the gripper."""
+    """Scripted policy, which observes the true peg: waypoints with a height, a gripper command and a waiting time."""
 
     # Frame, height [m], gripper, and steps at the waypoint.
     WAYPOINTS = (

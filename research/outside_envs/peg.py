@@ -21,7 +21,7 @@ from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
 OFFSETS = (0.025, 0.05)  # distance of the assumed hole from the true one in y, on either side [m]
 HEIGHT_OFFSET = 0.015  # largest distance in z [m]
-MAX_LAG = 0.035  # lag of the hand behind its command at which the first attempt ends: it presses on the box [m]
+MAX_LAG = 0.035  # lag of the hand at which the first attempt ends, because the peg presses on the box [m]
 MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table [m]
 
 
@@ -37,7 +37,7 @@ PARTS = {
     "grasp": Part(28, "object_start", close_at_end, dwell=22, lower=LOWER["object_start"]),
     "carry": Part(34, "assumed_goal", CLOSED, lower=LOWER["assumed_goal"]),
     "insert": Part(40, "assumed_goal", CLOSED, dwell=10, lower=LOWER["assumed_goal"], until=is_blocked),
-    # The second attempt: the insertion backwards, and once more. The demonstrations are those of the first.
+    # Second attempt: retract along the insertion and insert again, with the demonstrations of the first insertion.
     "retract": Part(30, "assumed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["assumed_goal"]),
     "insert again": Part(40, "assumed_goal", CLOSED, dwell=40, source="insert", lower=LOWER["assumed_goal"]),
 }
@@ -52,7 +52,7 @@ class _Env(SawyerPegInsertionSideEnvV3):
 
 
 class HiddenHole(HiddenGoal):
-    """Environment that requires a depth of 5 cm; metaworld requires 7 cm from the goal, which the mouth satisfies."""
+    """Environment that requires a depth of 5 cm; metaworld's limit of 7 cm to the goal already holds at the mouth."""
 
     def __init__(self, seed: int = 0, length: int = LENGTH):
         super().__init__(_Env(), seed, length, OFFSETS, HEIGHT_OFFSET, "box", 5.0)
@@ -63,7 +63,7 @@ class HiddenHole(HiddenGoal):
         return bool(depth < 0.015 and max(abs(y), abs(z)) < 0.03)
 
     def head(self) -> np.ndarray:
-        """Return the position of the peg's head (3,) from a point 6.6 cm inside of the true hole [m]."""
+        """Return the position of the peg's head (3,) relative to a point 6.6 cm inside the true hole [m]."""
         return self.unwrapped._get_site_pos("pegHead") - self.unwrapped._target_pos
 
     def observe(self) -> np.ndarray:
@@ -80,7 +80,7 @@ class HiddenHole(HiddenGoal):
 
 
 def _signal(env: HiddenHole) -> tuple[bool, bool, bool]:
-    """Return whether the hand is near the peg, near and low, and the peg in front of the hole."""
+    """Return whether the hand is near the peg, near, low and closing, and the peg is aligned with the hole."""
     raw = env.raw
     near = bool(np.linalg.norm(raw[:2] - raw[4:6]) <= 0.04)
     aligned = bool(np.linalg.norm((raw[4:7] - [0, env.unwrapped._target_pos[1], 0.16])[1:]) <= 0.03)

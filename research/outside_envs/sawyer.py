@@ -18,7 +18,7 @@ MIN_SAMPLES = 4  # smallest number of samples of a recorded part
 
 
 def close_at_end(phase: float, is_held: bool) -> float:
-    """Return the gripper's effort of a segment that closes it while its last point is held."""
+    """Return the gripper's effort in a segment that closes the gripper while the last point is held."""
     return CLOSED if is_held else OPEN
 
 
@@ -35,7 +35,7 @@ class HiddenGoal(gymnasium.Wrapper):
         offsets: Least and largest distance of the assumed goal from the true one in y, on either side [m].
         height_offset: Largest distance in z [m].
         obstacle: Body whose contact force is measured.
-        max_reward: Reward of metaworld before success; a larger one is clipped to it.
+        max_reward: Upper limit to which metaworld's reward is clipped before success.
 
     Attributes:
         true_goal: Position (3,) of the goal [m].
@@ -97,7 +97,7 @@ class HiddenGoal(gymnasium.Wrapper):
         raise NotImplementedError
 
     def observe(self) -> np.ndarray:
-        """Return the observation, of order one."""
+        """Return the observation, scaled to order one."""
         raise NotImplementedError
 
     def _force(self) -> float:

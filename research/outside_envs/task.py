@@ -12,7 +12,7 @@ from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.tools.guided.guide import Guide
 
 ACTION_REPEAT = 5  # steps of the environment for which an action is applied, with and without guidance
-# A larger share of the package's reward pays for pressing the part in front of its goal.
+# With a larger factor, the package's own reward would favor pressing the part in front of its goal over a success.
 SUCCESS_REWARD, REWARD_SCALE = 10.0, 0.01  # reward of a success, and factor of the package's own reward before it
 BOX_MARGIN, MIN_BOX_MARGIN = 0.15, 0.01  # margin of a segment's box, as a fraction of the demonstrated range and [m]
 FLOOR = 2e-3  # standard deviation added to every covariance [unit of the output]
@@ -24,12 +24,12 @@ class Part:
 
     Attributes:
         steps: Control steps.
-        frame: Attribute of the environment with the frame's origin (O,).
+        frame: Name of the environment's attribute that holds the frame's origin (O,).
         extra: Discrete output, as in `Segment`.
         dwell: Control steps for which the last point is then held.
         source: Name of the part whose recording is used, if not its own.
         is_reversed: True to run that recording backwards.
-        lower: Lower limits (O,) of the commands in the frame, where they are narrower than the demonstrated ones.
+        lower: Lower limits (O,) of the commands in the frame, used if they are above the demonstrated limits.
         until: (env, observation) → true to end the segment early.
     """
 
@@ -67,11 +67,11 @@ class OutsideTask:
         outputs: Names of the outputs.
         period: Duration of a step of the environment [s].
         make_env: (seed) → environment; its `info` has `is_success`, `side` and `peak_force` [N].
-        record: (count, seed) → successful recordings of the package's scripted policy, which observes what is hidden.
+        record: (count, seed) → successful recordings of the package's scripted policy, which observes the hidden goal.
         pose: (env, observation) → commanded pose (O,), at which a motion begins.
         to_action: (env, observation, command, extra) → the environment's own action.
-        scripted: (env) → the scripted policy's own action, which observes what is hidden.
-        schedule: Fixed action by the name of the segment; together they are a search without observations.
+        scripted: (env) → the environment's own action by the scripted policy, which observes the hidden goal.
+        schedule: Fixed action of each segment, by name; together the actions search without observations.
     """
 
     parts: Mapping[str, Part]
@@ -128,7 +128,7 @@ def num_steps(parts: Mapping[str, Part]) -> int:
 
 
 class RepeatedAction(gymnasium.Wrapper):
-    """The environment's own action, repeated; its commands are compared with the boxes of all segments together.
+    """Wrapper that repeats the environment's own action; a command is a violation if it is outside every segment's box.
 
     The time of the episode, from −1 to 1, is appended to the observation.
     """

@@ -1,1 +1,1 @@
-"""Benchmark of `create-task` on parts drawn by others: preparation, insertion, baselines and learning."""
+"""Benchmark of `create-task` on third-party meshes: preparation, insertion, baselines and learning."""

@@ -1,4 +1,4 @@
-"""Steps of the benchmark for one pair, each in processes of its own and stored when it is finished."""
+"""Steps of the benchmark for one pair. Each step runs in its own processes, and its result is stored."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ COMMAND = (sys.executable, "-m", "guiderail")
 
 
 class StepError(Exception):
-    """A command failed; the message is its last line."""
+    """Error of a failed step; for a failed command the message is the last line of its error output."""
 
 
 def run_guiderail(log: Path, timeout: float, *arguments: object) -> str:
-    """Run a command, append its output to a log, and return it.
+    """Run a `guiderail` command, append its output to a log, and return its standard output.
 
     Args:
-        log: File.
-        timeout: Wall time after which it is ended [s].
+        log: Log file.
+        timeout: Wall time after which the command is killed [s].
         arguments: Arguments of `guiderail`.
 
     Raises:
-        StepError: If it fails or takes too long.
+        StepError: If the command fails or takes too long.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
     with log.open("a", encoding="utf-8") as file:
@@ -79,10 +79,10 @@ def finish(stored: Path, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def prepare(pair: Pair, out: Path, timeout: float) -> dict[str, Any]:
-    """Prepare a pair and insert it aligned. The plug of parts that overlap is shrunk by the distance that is offered.
+    """Prepare a pair and insert it aligned. If the parts overlap, shrink the plug by the distance of `OverlapError`.
 
     Raises:
-        StepError: If it is refused, or takes more than `timeout` [s] of CPU time.
+        StepError: If the pair is refused, or needs more than `timeout` [s] of CPU time.
     """
     log = out / "logs" / f"{pair.name}.txt"
     try:
@@ -109,7 +109,7 @@ def _prepare(pair: Pair, folder: Path, log: Path) -> dict[str, Any]:
                 write(str(error))
                 if error.shrink is None or shrink + error.shrink > MAX_SHRINK:
                     raise StepError(str(error)) from error
-                shrink += error.shrink  # by a little more where that is not enough
+                shrink += error.shrink  # repeated until the parts no longer overlap
             except InputError as error:
                 write(str(error))
                 raise StepError(str(error)) from error
@@ -167,7 +167,7 @@ def learn(
 
 
 def describe_calibration(measured: dict[str, Any] | None) -> str:
-    """Return the calibration of `hard`, as `create-task` stored it, as a cell of the table."""
+    """Return a table cell that describes the calibration of `hard` that `create-task` stored."""
     if measured is None:
         return "not calibrated"
     nearest, farthest = measured["offset_mm"]

@@ -30,7 +30,7 @@ README_COLUMNS = (
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
 GUIDED = ("sct", "kgrl", "skgrl")
-MIN_SEEDS = 3  # of an interval over seeds
+MIN_SEEDS = 3  # number of seeds that an interval needs
 NO_DEMONSTRATION = ("zero action", *BASELINES[1:])  # a template has no demonstration
 
 
@@ -58,7 +58,7 @@ class Section:
     Attributes:
         title: Title of the table.
         rows: Methods, guided ones first.
-        guided: Names of the guided methods that the README's table has; empty if it leaves the section out.
+        guided: Names of the guided methods in the README's table; empty if that table omits the section.
     """
 
     title: str

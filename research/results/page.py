@@ -182,7 +182,7 @@ def _study_section(study: Study, rows: pd.DataFrame) -> str:
     lines += _sweep_lines(study, rows)
     if len(evaluated := _without_sweeps(study, rows)):
         lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
-    # The column is empty where a study evaluates nothing; empty cells are read as NaN.
+    # `eval_set` is empty if a study evaluates nothing, and an empty cell is read as NaN: keep such groups.
     for (method, after, eval_set), group in evaluated.groupby(
         ["method", "after_episodes", "eval_set"], sort=False, dropna=False
     ):
@@ -234,7 +234,7 @@ def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
 
 
 def _without_sweeps(study: Study, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of evaluation sets; of a study that has sweeps alone one row a run, about its training."""
+    """Return the rows of evaluation sets; if a study has only sweeps, one row per run with its training results."""
     if study.eval_set or not study.sweeps:
         return rows[~rows["eval_set"].isin([s.eval_set(value).name for s in study.sweeps for value in s.at])]
     once = rows.drop_duplicates(["method", "after_episodes", "seed"])

@@ -23,7 +23,7 @@ def interquartile_mean(scores: Scores) -> np.ndarray:
 def probability_of_improvement(first: Scores, second: Scores) -> np.ndarray:
     """Return the probability that a seed of the first method scores higher than one of the second on the same task.
 
-    Ties count half. It is averaged over the tasks, (…).
+    Ties count half. The probability is averaged over the tasks, (…).
     """
     pairs = zip(first, second, strict=True)
     signs = [np.sign(x[..., :, None] - y[..., None, :]).mean(axis=(-2, -1)) for x, y in pairs]

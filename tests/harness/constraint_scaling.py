@@ -52,7 +52,7 @@ def half_spaces(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.nda
 
 
 def actions(rng: np.random.Generator) -> np.ndarray:
-    """Return actions of ±1 (N, 2) with no, few or many changes of sign, or one at every step."""
+    """Return actions (N, 2) of one size, from 1 to 1e5, whose sign changes never, seldom, often or at every step."""
     turns = np.cumsum(rng.uniform(size=(STEPS, 2)) < rng.choice([0.0, 0.05, 0.3, 1.0]), axis=0) % 2
     return (1.0 - 2.0 * turns) * rng.choice([-1.0, 1.0], 2) * 10.0 ** rng.uniform(0.0, 5.0)
 

@@ -1,8 +1,8 @@
 """Robot that is held for two seconds: `python tests/harness/held_robot.py [--episodes N] [--held-from T]`.
 
-The hard connector on the gantry, guided by KGRL with the scripted policy. From a given instant on an external hold
-locks all joints of the plant for two seconds; then the robot is free again. The motion is driven by the clock or by the
-robot's state; the episodes of both have the same length and the same conditions.
+The scripted policy acts on the hard connector on the gantry, guided by KGRL. At a given instant all joints of the
+gantry are locked for two seconds; then the robot is free again. The motion advances with the clock or with the robot's
+state. The episodes of both have the same length and the same conditions.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import scripted_center_of_press
 from guiderail.models.common.arrays import round_period
 
 PROGRESS = {
-    # The clock in episodes as long as the others: a tolerance that no robot exceeds.
+    # Progress by the clock, with episodes as long as those of "state": no robot exceeds this tolerance.
     "clock": {"progress": "state", "progress_tolerance": (1e3, 1e3)},
     "state": {"progress": "state"},
 }

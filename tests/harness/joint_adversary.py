@@ -1,8 +1,7 @@
 """Adversary against the joint limits of an arm: `python tests/harness/joint_adversary.py [STEPS [SEED]]`.
 
 An iiwa under impedance control follows desired poses anywhere around the workcell, in all orientations, behind a
-`MotionConstraintFilter` with a `JointRange`. Neither the joint positions of a command nor those that the simulated arm
-has may exceed a limit.
+`MotionConstraintFilter` with a `JointRange`. Neither commanded nor simulated joint positions may exceed a limit.
 """
 
 import sys
@@ -32,9 +31,9 @@ class Result:
 
     Attributes:
         steps: Number of control steps.
-        commanded: Largest excess of a joint over its limits and margin at a command [rad].
+        commanded: Largest excess of a commanded joint position over a limit reduced by the margin [rad].
         measured: Largest excess of a simulated joint over its limits [rad]; negative inside.
-        near: Number of commands within 0.01 rad of a limit and its margin.
+        near: Number of commands within 0.01 rad of a limit reduced by the margin.
         fallbacks: Number of steps at which only braking was left.
     """
 
@@ -46,7 +45,7 @@ class Result:
 
 
 def attack(steps: int, seed: int = 0, *, constrained: bool = True) -> Result:
-    """Command `steps` steps with or without the constraints of the joints; return what was found."""
+    """Run `steps` control steps with or without the joint constraints; return the result."""
     rng, result, builder = np.random.default_rng(seed), Result(), DiagramBuilder()
     station = builder.AddNamedSystem("station", ArmStation(BncWorkcell()))
     joints = station.joint_range(MARGIN, 0.05)

@@ -1,8 +1,8 @@
 """Adversary against shapes, speed and acceleration: `python tests/harness/motion_adversary.py [STEPS [SEED]]`.
 
-Spherical obstacles in the narrow passage, at sampled positions. Actions push against an obstacle at full deflection or
-change at random. No command, fallbacks included, and no straight line between two commands may enter an obstacle, which
-is checked by formulas that share no code with the constraints.
+Spherical obstacles are placed at sampled positions in the narrow passage. Actions push against an obstacle at full
+deflection or change at random. No command, fallbacks included, and no straight line between two commands may enter an
+obstacle. This is checked by formulas that share no code with the constraints.
 """
 
 import sys
@@ -65,7 +65,7 @@ class Result:
     outside: float = -np.inf
 
     def add(self, commands: np.ndarray, center: np.ndarray, radius: float, period: float, outside: float) -> None:
-        """Add the commands (N, D) of an episode, its first pose before them."""
+        """Add the commands (N, D) of an episode; the first row is only the start of the first move."""
         moves = np.diff(commands, axis=0)
         share = ((center - commands[:-1]) * moves).sum(axis=1) / np.maximum((moves**2).sum(axis=1), 1e-300)
         between = commands[:-1] + np.clip(share, 0.0, 1.0)[:, None] * moves
@@ -105,7 +105,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
     """Execute episodes of KGRL, or sKGRL with a smooth kind, around one obstacle at a sampled place of the motion."""
     reference, history = config.reference, 4 if kind == "command, smooth" else 0
     step = int(rng.integers(30, reference.num_steps - 30))
-    # On one side of the mean, or (at the commands' constraints) exactly in its way.
+    # To the side of the mean; if commands are constrained, the obstacle may also be exactly in the way.
     aside = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.5 if kind == "reference" else 0.0, 1.5, 2) * radius
     sphere = Sphere(reference.means[step] + aside, radius)
     if sphere.distance(reference.means[0]) < 0.1:
@@ -125,7 +125,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
         stepper = primitive.start(start, gain, motion=motion)
         commands, outside = [start] if motion else [], -np.inf
         for n in range(reference.num_steps):
-            if style == 0:  # such that the primitive without constraints commands the center
+            if style == 0:  # action at which the primitive without constraints commands the center
                 _, effect, mean = primitive.linear_response(n)
                 action = np.linalg.solve(effect, sphere.center - mean) / gain if not history else action
                 action = np.clip(action + 0.1 * rng.standard_normal(2), -30.0, 30.0)

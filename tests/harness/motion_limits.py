@@ -37,7 +37,7 @@ def jumps(rng: np.random.Generator) -> Iterator[np.ndarray]:
 
 
 def white(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Command another pose in every period."""
+    """Command a new random pose in every period."""
     scale = 0.3
     while True:
         if rng.random() < 0.002:
@@ -46,7 +46,7 @@ def white(rng: np.random.Generator) -> Iterator[np.ndarray]:
 
 
 def reversals(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Alternate between two far corners with a period of motion that is swept over all of them."""
+    """Alternate between two far corners, after random half periods of 1 to 199 commands."""
     while True:
         half, corner = int(rng.integers(1, 200)), rng.choice([-1.0, 1.0], 6) * [0.5, 0.5, 0.5, 1.0, 0.5, 1.0]
         for k in range(10 * half):

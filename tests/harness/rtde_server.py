@@ -1,10 +1,10 @@
 """Double of a UR5e's controller: RTDE, dashboard and script ports, with time that a test advances.
 
-Written from Universal Robots' "Real-Time Data Exchange Guide" and "Dashboard Server" manual, and from the commands of
-the client's program for the controller. Of that program it emulates force mode, tool center, payload, zeroing of the
-force sensor and watchdog. In force mode the tool moves with a speed in proportion to the missing force; a horizontal
-plane is in its way. It shows that messages arrive and have the meaning and signs that the documentation describes, not
-how a robot moves.
+The double follows Universal Robots' "Real-Time Data Exchange Guide" and "Dashboard Server" manual, and the commands of
+the client's program for the controller. It emulates that program's force mode, tool center, payload, zeroing of the
+force sensor and watchdog. In force mode the tool's speed is proportional to the sum of commanded and measured wrench,
+and a horizontal plane blocks the tool. Tests with this double show that messages arrive and have the documented meaning
+and signs. They do not show how a robot moves.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class RtdeServer:
         self._send()
 
     def wait_for_input(self, number: int) -> None:
-        """Wait until so many input messages have arrived."""
+        """Wait until `number` input messages have arrived."""
         with self._changed:
             assert self._changed.wait_for(lambda: self.num_inputs >= number, 10.0)
 
@@ -387,7 +387,7 @@ def _frames(positions: np.ndarray, tcp: np.ndarray) -> list[np.ndarray]:
 class RtdeProcess:
     """`RtdeServer` in a process of its own, because some calls of the client hold the GIL.
 
-    Attributes of the server are read and written by their names, and its methods are called.
+    Attributes and methods of the server are accessed by their names.
     """
 
     def __init__(self, host: str, positions: np.ndarray):

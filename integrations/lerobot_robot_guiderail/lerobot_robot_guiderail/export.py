@@ -1,4 +1,4 @@
-"""Export of guiderail's policy as one of LeRobot: `python -m lerobot_robot_guiderail.export RUN OUT`."""
+"""Export of a guiderail policy as a LeRobot policy: `python -m lerobot_robot_guiderail.export RUN OUT`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Guard of chunks as a step of LeRobot's processors: bounds, velocity and jerk limits of the actions of any policy.
 
-`add_guard` puts the step at the end of a stored policy's postprocessor, which `lerobot-rollout` then applies. It needs
-the core of guiderail in LeRobot's environment (`pip install guiderail`), not the simulation.
+`add_guard` puts the step at the end of a stored policy's postprocessor, which `lerobot-rollout` then applies. The step
+needs the core of guiderail in LeRobot's environment (`pip install guiderail`), not the simulation.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry, TransitionKey
 
-HORIZON = 16  # steps of the chunk that holds a single action
+HORIZON = 16  # steps for which a single action is repeated to form a chunk
 
 
 @ProcessorStepRegistry.register("guiderail_chunk_guard")
@@ -23,9 +23,9 @@ HORIZON = 16  # steps of the chunk that holds a single action
 class ChunkGuardProcessorStep(ProcessorStep):
     """Step that changes actions as little as possible so that they are within the limits (`ChunkGuard`).
 
-    A chunk (1, K, A) is limited as a whole. A single action, (A,), (1, A) or by name, is limited as a chunk that holds
-    it. All returned actions have to be executed, one a control period. An action that is not finite is refused. The
-    limits hold up to the rounding of the action's type.
+    A chunk (1, K, A) is limited as a whole. A single action, (A,), (1, A) or by name, is limited as a chunk that
+    repeats it. All returned actions have to be executed, one per control period. An action that is not finite is
+    refused. The limits hold up to the rounding of the action's type.
 
     Attributes:
         lower: Lower bounds of the A numbers of an action; None for no bound.

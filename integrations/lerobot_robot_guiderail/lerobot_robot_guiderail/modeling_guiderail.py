@@ -15,7 +15,7 @@ from lerobot_robot_guiderail.configuration_guiderail import GuiderailConfig
 
 
 class GuiderailPolicy(PreTrainedPolicy):
-    """Deterministic policy; its observation is the first part of `observation.state`, as the robot orders it."""
+    """Deterministic policy, whose observation is the first part of the robot's `observation.state`."""
 
     config_class = GuiderailConfig
     name = "guiderail"

@@ -57,7 +57,7 @@ class GuiderailRobot(Robot):
 
     @cached_property
     def _description(self) -> dict[str, Any]:
-        """First line of guiderail's process; starts and ends one if there is none."""
+        """First line that guiderail's process prints. If no process runs, one is started and ended for it."""
         if self._process is not None:
             return self._receive()
         self._start()
@@ -164,7 +164,7 @@ class GuiderailRobot(Robot):
     def _stop(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            process.communicate()  # closes its input, at which it ends
+            process.communicate()  # closes the input of the process, which then ends
             process.wait(STOP_TIME)
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class KilledRobot(RobotConnection):
 
     @contextmanager
     def simulated_driver(self, task: str, url: str, imports: Sequence[str] = ()) -> Iterator[None]:
-        """Run the simulated driver in a child of its own for each life of the robot."""
+        """Run the simulated driver; each restart of the robot is a new child process."""
         ended, start = threading.Event(), time.monotonic()
 
         def live() -> None:
@@ -65,14 +65,14 @@ class KilledRobot(RobotConnection):
 
 
 def delay_references(jitter: float) -> None:
-    """Let the references of every driver fci arrive after a random delay [s]."""
+    """Delay the references of every `FciDriver` by a random time of at most `jitter` [s]."""
     rng, send = np.random.default_rng(0), FciDriver.write_pose
     queue: list[tuple[float, float, RigidTransform]] = []  # time of sending, time of arrival, pose
     last = -np.inf
 
     def write_pose(driver: FciDriver, X_BaseTool: RigidTransform, now: float) -> None:
         nonlocal last, queue
-        if now < last:  # another simulator of a station begins at zero
+        if now < last:  # the time of a new simulator begins at zero
             queue, last = [], -np.inf
         if now - last > REFERENCE_PERIOD - 1e-6:
             last = now

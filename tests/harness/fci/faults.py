@@ -95,7 +95,7 @@ class Campaign:
         self.driver: FaultyDriver = self.run.station.driver
 
     def step(self, phase: float | None = None) -> None:
-        """Advance by a status period, along the motion or where the arm is commanded."""
+        """Advance by a status period; with `phase`, move the desired pose along the motion, scaled by it."""
         if phase is not None:
             angle = 2.0 * np.pi * FREQUENCY * PERIOD * self.steps
             self.run.pose = CENTER + phase * AMPLITUDE * np.sin(
@@ -120,7 +120,7 @@ class Campaign:
         return speed
 
     def inject(self, kind: Kind, rng: np.random.Generator) -> str:
-        """Inject a fault and continue the motion after it; return the failed requirements, printed with the result."""
+        """Inject a fault, continue the motion and print the result; return the failed requirements."""
         reference = self.move(1.0 + float(rng.uniform(0.0, 0.5)))  # a whole period
         self.driver.begin(kind, rng)
         elapsed, detected, late, fastest, steps = 0.0, np.nan, 0.0, 0.0, 0

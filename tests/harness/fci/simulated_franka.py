@@ -1,7 +1,7 @@
 """Run of a simulated Franka through its own protocol: insert, lock, stop, the loss of the robot, and a reflex.
 
 Run by `make fci`, in an environment with franky and franky-sim. The robot is a process of its own that answers
-libfranka's network protocol. It runs in lockstep with the station, so that the speed of the machine does not count.
+libfranka's network protocol. It runs in lockstep with the station, so that the machine's speed does not matter.
 """
 
 from __future__ import annotations

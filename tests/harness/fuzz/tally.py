@@ -15,7 +15,7 @@ measuring = False  # limits are checked by fuzz.py only, not in tests
 
 
 class TooSlowError(BaseException):
-    """An input took too long. Not an `Exception`, so that the code under test does not handle it."""
+    """Error of an input that takes too long; no `Exception`, so that the code under test does not handle it."""
 
 
 def attempt(target: str, refusal: type[Exception], call):

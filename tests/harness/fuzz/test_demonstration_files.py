@@ -1,6 +1,6 @@
-"""Files of demonstrations, made and mutated at random: exactly what they say, or one sentence.
+"""Random and mutated files of demonstrations: each is read exactly, or refused with one sentence.
 
-`python -m pytest tests/fuzz --hypothesis-profile=long` tries thousands, and says what came of them.
+`python -m pytest tests/harness/fuzz --hypothesis-profile=long` tries thousands of inputs, and prints their outcomes.
 """
 
 import io
@@ -66,7 +66,7 @@ KINDS = ["<f8", ">f8", "<f4", "<f2", "<i8", "<u8", "<i4", "|u1", "|b1", "<c16", 
 
 @st.composite
 def members(draw):
-    """The arrays of a file, one after the other or stacked, with a few of them replaced or missing."""
+    """Draw the arrays of a file: demonstrations concatenated or stacked, with a few arrays replaced or missing."""
     counts = draw(st.lists(st.integers(2, 4), min_size=1, max_size=3))
     width, stacked = draw(st.integers(1, 3)), draw(st.booleans())
     if stacked:
@@ -116,7 +116,7 @@ ARCHIVES = [archive(False), archive(True)]
 
 @given(st.sampled_from(ARCHIVES), edits(), st.lists(st.tuples(st.floats(0, 1), st.integers(0, 7)), max_size=4))
 def test_archives_with_bytes_changed(folder, data, changes, flips):
-    """Most of these meet a checksum: what is read nevertheless is what was there."""
+    """Most of these files fail a checksum; one that is still read has the values that an independent reader finds."""
     mutated = bytearray(edited(data, changes) if len(flips) % 2 else data)
     for where, bit in flips:
         mutated[min(int(where * len(mutated)), len(mutated) - 1)] ^= 1 << bit

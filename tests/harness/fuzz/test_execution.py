@@ -1,4 +1,4 @@
-"""Files with code in them: no command executes them.
+"""Files that contain code: no command executes the code.
 
 Each input is a valid file with code in some places: as a name to import, a tag, an expression, a format, or a pickled
 object. Executed code would touch a file. An audit hook of the interpreter also reports unpickled objects, started
@@ -79,7 +79,7 @@ class Touch:
 
 @pytest.fixture(scope="module")
 def canary(tmp_path_factory):
-    """Return the file that executed code would touch; a module of the name is on the path."""
+    """Return the file that executed code would touch; a module named `MODULE` is on the import path."""
     folder = tmp_path_factory.mktemp("canary")
     (folder / f"{MODULE}.py").write_text(f"open({str(folder / 'touched')!r}, 'w')\n")
     sys.path.insert(0, str(folder))
@@ -268,7 +268,7 @@ def check_certificate(folder):
         return
     try:
         checker.check(folder)
-    except Exception:  # its program prints any of them as a reason to refuse
+    except Exception:  # the checker's program prints any exception as the reason of a refusal
         return
 
 

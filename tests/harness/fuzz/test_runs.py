@@ -214,7 +214,7 @@ def test_policies_with_entries_changed_that_have_their_digest(folder, data):
 
 @pytest.fixture(scope="module")
 def resumable(folder):
-    """Return a small learner with transitions, and the content of its checkpoint."""
+    """Return an environment, a small learner, and the arrays and values of its checkpoint."""
     env = Line()
     settings = {"net_arch": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_freq": 1}
     learner = LEARNERS.get("tqc")(

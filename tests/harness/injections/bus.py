@@ -25,8 +25,8 @@ from guiderail.tools.hardware.sim_driver import START
 
 PERIOD = IiwaDriver.period
 STOPPED_WITHIN = 0.05  # time from the detection of a fault to standstill [s]
-STANDSTILL = 0.05  # speed of the fastest joint, after up to 1 rad/s before [rad/s]
-STANDSTILL_WITHOUT_STATUS = 0.15  # the same if no status arrived while the arm was stopped [rad/s]
+STANDSTILL = 0.05  # largest joint speed of an arm at rest, which moved at up to 1 rad/s before [rad/s]
+STANDSTILL_WITHOUT_STATUS = 0.15  # the same if no status arrived during the stop [rad/s]
 RADIUS, TURN, FREQUENCY = 0.01, 0.15, 1.0  # of the arm's motion [m], [rad], [Hz]
 HEARTBEAT_CHANNEL = IiwaDriver.heartbeat_channel()
 
@@ -87,7 +87,7 @@ class Bus:
         self.near_station.Subscribe(IiwaDriver.command_channel, self._commands.append)
         self.robot_simulator = self.robot.simulator()
         self._pristine = self.robot.CreateDefaultContext()
-        self.robot_time = 0  # steps since it was started
+        self.robot_time = 0  # steps since the robot was started
         self.start_robot()
         self.simulator = Simulator(self.station)
         self.start_controller()
@@ -162,12 +162,12 @@ class Bus:
     # Time.
 
     def go(self, seconds: float) -> None:
-        """Advance both by some time [s]."""
+        """Advance both programs by a time [s]."""
         for _ in range(round(seconds / PERIOD)):
             self.one()
 
     def one(self) -> None:
-        """Advance both by a period."""
+        """Advance both programs by a period."""
         self.step += 1
         if self.has_robot:
             self.robot_time += 1
@@ -267,7 +267,7 @@ class Bus:
             if observation.detected is None and self.is_detected:
                 observation.detected, observation.fastest = now, speed
                 observation.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
-            # A restarted program moves the arm again; one that was stopped has to be resumed.
+            # A restarted program moves the arm again without `resume`: that speed is not counted.
             is_moving_again = (
                 self.has_controller and self.arm_state in (ArmState.RAMPING, ArmState.RUNNING) and not self.is_detected
             )
@@ -289,7 +289,7 @@ class Bus:
 
 
 def with_fields(message: bytes, **fields: object) -> bytes:
-    """Return a status with other values."""
+    """Return a status message with other values of some fields."""
     status = lcmt_iiwa_status.decode(message)
     for name, value in fields.items():
         setattr(status, name, value)

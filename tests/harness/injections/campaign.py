@@ -34,7 +34,7 @@ from injections.kinds import KINDS, Kind, Q, V
 
 SLOW, SLOW_AFTER, GROWTH = 0.15, 0.1, 1.25  # [rad/s], [s], required of every fault
 DURATION = 0.3  # of a fault [s]
-MAX_STEPS = round(1.0 / PERIOD)  # in which a fault must have an effect, or it is none
+MAX_STEPS = round(1.0 / PERIOD)  # steps within which a fault must have an effect; otherwise it is not checked
 SENSITIVITY = {Q: 1e-3, V: 0.05}  # errors that must be detected [rad], [rad/s]
 
 
@@ -46,7 +46,7 @@ class Result:
         detected: Time from the fault to its detection [s]; NaN if it was not detected.
         cause: The station's fault.
         late_speed: Largest joint speed from `SLOW_AFTER` after the fault [rad/s].
-        growth: Largest joint speed after the fault over that at the fault or of the undisturbed motion.
+        growth: Largest joint speed after the fault, relative to that at the fault or of the undisturbed motion.
         wrong: Failed requirements.
     """
 
@@ -167,7 +167,7 @@ def in_child(bus: Bus, work: Callable[[], Result]) -> Result:
 
 
 def pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> Iterator[tuple[Kind, Kind]]:
-    """Yield random pairs of faults of messages in different places, or of a program and messages."""
+    """Yield random pairs of faults in different places: sensor, network, command or program."""
     while number and len({kind.where for kind in kinds}) > 1:
         first, second = (kinds[i] for i in rng.choice(len(kinds), 2, replace=False))
         if first.where != second.where:

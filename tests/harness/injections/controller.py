@@ -1,4 +1,4 @@
-"""Program that moves an arm on a circle and resumes after every stop as soon as possible: URL RATE."""
+"""Program that moves an arm on a circle and resumes after every stop as soon as possible; arguments: URL RATE."""
 
 import contextlib
 import sys

@@ -32,7 +32,7 @@ class Injection:
         begin: Function that begins the fault.
         end: Function that ends it.
         duration: Duration [s].
-        stops: Whether it must stop the arm; None if it may.
+        stops: True if the fault must stop the arm, False if it must not, None if both are allowed.
         fault: The station's fault, if it is always the same.
     """
 
@@ -83,7 +83,7 @@ def lost(where: str, seconds: float) -> Injection:
 
 
 def delayed(where: str, seconds: float) -> Injection:
-    """Delay all messages, for 0.3 s."""
+    """Delay all messages by `seconds`, during 0.3 s."""
     name = "status" if where == "on_status" else "commands"
     queue: deque[bytes] = deque()
     steps = round(seconds / PERIOD)
@@ -191,7 +191,7 @@ def external_load(joint: int, torque: float) -> Injection:
 
 
 def clock_jump(seconds: float) -> Injection:
-    """Set the robot's clock; the end of the fault sets it back, which is another jump."""
+    """Shift the robot's clock; the end of the fault shifts it back, which is another jump."""
 
     def relay(message: bytes) -> list[bytes]:
         if not message:

@@ -27,8 +27,8 @@ class Kind:
 
     Attributes:
         name: Name of the kind.
-        bound: Time within which it is detected while the arm moves [s], derived in docs/robot.md; NaN if the arm may
-            go on, because the fault has no effect.
+        bound: Time within which the fault must be detected while the arm moves [s], derived in docs/robot.md; NaN if
+            the arm may continue, because the fault has no effect.
         make: Function from a random generator to the fault of messages; None for a fault of a program.
         where: "sensor" (before station and safety monitor), "network" (before the station), "command" or "program".
         action: "kill" or "stop" and the program, for a fault of a program.
@@ -81,7 +81,7 @@ def _frozen(fields: tuple[str, ...], one: bool) -> Callable[[np.random.Generator
 def _changed(
     field: str, change: Callable[[float, float], float], one: bool = False
 ) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault that changes the values of a field; `change` has a value and the time since the fault began."""
+    """Return a fault that changes the values of a field; `change` maps a value and the time since then [s]."""
 
     def make(rng: np.random.Generator) -> Fault:
         joint, sign = int(rng.integers(7)), float(rng.choice([-1.0, 1.0]))
@@ -256,7 +256,7 @@ def _resized(message: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _second_program(change: Callable[[np.ndarray], np.ndarray], delay: float) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault by a second program that commands other torques after each command; its clock differs [s]."""
+    """Return a fault by a second program that commands other torques after each command, with a clock error [s]."""
 
     def make(rng: np.random.Generator) -> Fault:
         def relay(message: bytes, elapsed: float) -> list[bytes]:
@@ -277,8 +277,8 @@ def _spike(size: float) -> Callable[[float, float], float]:
 NEXT, TWO, FEW = 2 * PERIOD, 3 * PERIOD, 6 * PERIOD
 TIMEOUT, HEARTBEAT, SLOW = 8 * PERIOD, 14 * PERIOD, 24 * PERIOD
 UNDETECTED = float("nan")
-# Errors that are proportional to the velocity have the bound of an error of 0.05 rad/s: they count from there on, and
-# how fast they grow depends on the motion.
+# An error proportional to the velocity counts from 0.05 rad/s on, and its growth depends on the motion. Its bound is
+# therefore that of a constant error of 0.05 rad/s.
 KINDS = (
     Kind("all values frozen", FEW, _frozen(FIELDS, one=False)),
     Kind("one joint frozen", FEW, _frozen((Q, V, T), one=True)),

@@ -33,7 +33,7 @@ STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] o
 # Without a status a step takes one and a half periods.
 SILENT_AFTER = 0.95
 PAUSES = (0.1, 0.3, 1.0)  # by the robot's clock [s]
-MISSED_WITHIN, MISSED_FOR = 0.08, 0.9  # after which, and until when, a safety monitor is missed [s]
+MISSED_WITHIN, MISSED_FOR = 0.08, 0.9  # times between which a missing monitor must keep the arm stopped [s]
 MOVING = 0.15  # speed of the fastest joint of a moving arm [rad/s]
 
 
@@ -85,7 +85,7 @@ class Listener:
             self.lcm.HandleSubscriptions(max(1, int(1000 * left)))
 
     def wait_for_motion(self, seconds: float, rate: float) -> bool:
-        """Return True if the arm moves within some wall clock time [s], and has moved for a while."""
+        """Wait at most some wall clock time [s]; return True once the arm has moved for a while without a stop."""
         end = time.monotonic() + seconds
         since = None
         while time.monotonic() < end:

@@ -10,7 +10,7 @@ class Together:
     """Clock of a hardware station that steps the simulated robot before each step of the station.
 
     Attributes:
-        happens: Injected faults: function to call at each step, by the step's number.
+        happens: Injected faults: functions, by the number of the step at which they are called.
         is_silent: True while the robot is not stepped.
         clock: Time [s] passed to the station as its wall clock; None if it gets none.
     """

@@ -3,11 +3,12 @@
     python tests/harness/kills/kill.py --kills 40                       # about ten minutes on an idle machine
     python tests/harness/kills/kill.py --kills 12 --tasks GridClamp     # of one task
 
-A run is started, killed (SIGKILL) and resumed repeatedly, and finally completed. Half of the kills happen when at least
-half of its episodes are in a checkpoint, after a random part of an episode; the others at any instant after the first
-import. Its folder is compared with that of an undisturbed run: tables without wall-clock times, the policy's bytes,
-every array and value of the checkpoint. A study is killed with its workers running, and once only a worker: no process
-may remain. The results are printed as JSON, and the exit code is 1 if anything differs.
+A run is started, killed (SIGKILL) and resumed repeatedly, and finally completed. Half of the kills happen at a random
+instant of an episode, after at least half of the run's episodes are in a checkpoint. The others happen at a random
+instant soon after the start of the process. The run's folder is compared with that of an undisturbed run: tables
+without wall-clock times, the policy's bytes, every array and value of the checkpoint. A study is killed while its
+workers run, and once only one worker is killed; no process may remain. The results are printed as JSON, and the exit
+code is 1 if anything differs.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ HEAVY += (
 def graft(mutant: Mutant) -> None:
     """Replace the code, defaults and constants that a mutant changes in the modules of this process.
 
-    Tests have imported the module already, and its names, so that it cannot be imported again.
+    The module cannot be imported again, because the tests have already imported it and its names.
     """
     name = "guiderail." + mutant.file.removesuffix(".py").replace("/", ".")
     module, names = sys.modules[name], {"__name__": name, "__file__": str(ROOT / mutant.file)}
@@ -115,7 +115,7 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str) -> N
 
 
 def _grafted(before: tuple | None, after: tuple | None) -> tuple | None:
-    """Return defaults with the numbers of a mutant."""
+    """Return the defaults of a function with their numbers replaced by those of a mutant."""
     if before is None or after is None or len(before) != len(after):
         return after
     return tuple(b if _is_numeric(b) else a for a, b in zip(before, after, strict=True))
@@ -252,7 +252,7 @@ def killer(mutant: Mutant, items: dict[str, Any], covered: dict, kills: Counter[
     here, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
     lines = covered["lines"].get(mutant.file, {})
     chosen = {test for test in seconds if any(line in here for line in lines.get(test, ()))}
-    # Only the first test executes a shared fixture, and no test executes constants and defaults.
+    # Only the first test executes a shared fixture, and none executes constants and defaults: add the file's own tests.
     chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
     chosen = sorted(chosen or seconds, key=lambda test: (seconds[test] + 1e-3) / (1.0 + kills[test]))
     limit = 10 + 5 * sum(seconds[test] for test in chosen)

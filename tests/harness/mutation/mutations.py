@@ -43,7 +43,7 @@ COUNTERPART = {
 # Calls that are replaced by their argument. Conversions of a number's type are not among them: NumPy's numbers behave
 # like Python's.
 DROPPED = {"abs", "sqrt", "copy", "sorted", "round", "array", "asarray"}
-# Keyword arguments that only make Drake evaluate less often, check a length, or choose a type.
+# Keyword arguments that are not removed: they only make Drake evaluate less often, check a length, or choose a type.
 KEPT_KEYWORDS = {"prerequisites_of_calc", "strict", "dtype"}
 LIMITS = ast.Lt | ast.LtE | ast.Gt | ast.GtE
 
@@ -55,8 +55,8 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
             for other in ORDER[type(operator)]:
                 yield _with(node, ops=[*node.ops[:i], other(), *node.ops[i + 1 :]])
             left, right = ([node.left, *node.comparators][j] for j in (i, i + 1))
-            # A factor changes neither infinity nor the sign of a value that is compared with zero, and then with
-            # infinity or with nothing.
+            # Scaling `right` has no effect if it is infinite, or if `left` is zero and nothing but infinity follows:
+            # then only the sign of `right` matters.
             following = [ast.unparse(other) for other in node.comparators[i : i + 2]]
             is_zero = isinstance(left, ast.Constant) and left.value == 0
             is_same = following[0] == "np.inf" or (is_zero and following[1:] in ([], ["np.inf"]))
@@ -93,7 +93,7 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
 
 
 def _can_be_removed(node: ast.AST) -> bool:
-    """Return True for a statement that the following ones do not need."""
+    """Return True for a statement that defines no name for the following ones."""
     if isinstance(node, ast.Assign):
         return not any(isinstance(target, ast.Name | ast.Tuple) for target in node.targets)
     return isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
