@@ -14,8 +14,8 @@ from guiderail.models.parts.solids import measure_distance, to_arrays, to_manifo
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
 MAX_MOVED = 5e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
-_ENVELOPES = (2e-5, 1e-4)  # largest deviations that fTetWild is allowed, the second if the first takes too long [m]
-_CPU_SECONDS = 40  # CPU time of each
+_ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
+_CPU_SECONDS = 60
 _NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
 
 
@@ -120,19 +120,18 @@ def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
             f"{gaps}: close it in the CAD model, and export it again, or pip install 'guiderail[repair]', which closes "
             "small gaps"
         )
-    reason = "its result still has open edges"
-    for envelope in _ENVELOPES:
-        try:
-            points, tetrahedra = run_isolated(
-                tetrahedralize, vertices, triangles, envelope, 0.15, False, cpu_seconds=_CPU_SECONDS
-            )
-            solid = to_manifold(*boundary_of(points, tetrahedra))
-        except (IsolatedError, ValueError) as error:
-            reason = str(error)
-            continue
-        if _is_solid(solid):
-            return solid
-    raise InputError(f"{gaps}, and the repair failed ({reason}): close it in the CAD model, and export it again")
+    try:
+        points, tetrahedra = run_isolated(
+            tetrahedralize, vertices, triangles, _ENVELOPE, 0.15, False, cpu_seconds=_CPU_SECONDS
+        )
+        solid = to_manifold(*boundary_of(points, tetrahedra))
+    except (IsolatedError, ValueError) as error:
+        raise InputError(
+            f"{gaps}, and the repair failed ({error}): close it in the CAD model, and export it again"
+        ) from error
+    if not _is_solid(solid):
+        raise InputError(f"{gaps}, and its repair still has open edges: close it in the CAD model, and export it again")
+    return solid
 
 
 def _outward_bodies(solid: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, int]:
