@@ -28,7 +28,7 @@ from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.train import train_on_robot
 
 REFERENCE_PERIOD = 0.01  # [s]
-FORCE_LIMIT = 20.0  # [N]; at the default of 40 N a firm push exceeds the limits of the external joint torques
+FORCE_LIMIT = 20.0  # [N]; at the default of 35 N a firm push exceeds the limits of the external joint torques
 
 
 @dataclass(frozen=True)
