@@ -189,7 +189,8 @@ class PlacedTemplate:
         template: Shared control template.
         frames: Poses X_TF of the template's objects by name, in the frame of the station's poses.
         active_constraints: True if the active constraints are enforced; None: the guidance's default.
-        max_tracking_error: Distance between robot and command [m] beyond which the last command is repeated.
+        max_tracking_error: Distance between robot and command [m] beyond which the last command is repeated, unless the
+            new one is closer to the robot.
     """
 
     template: SharedControlTemplate

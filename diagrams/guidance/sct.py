@@ -119,7 +119,8 @@ class SctGuidance(Guidance):
             input_mapping: Second template, whose initial state maps the inputs instead of `template`. The active
                 constraints of `template` are then a safety filter, for example of an end-effector velocity.
             active_constraints: False commands the requested pose without constraints.
-            max_tracking_error: Distance between robot and command beyond which the last command is repeated [m].
+            max_tracking_error: Distance between robot and command beyond which the last command is repeated, unless the
+                new one is closer to the robot [m].
         """
         super().__init__()
         builder = DiagramBuilder()

@@ -3,12 +3,13 @@
     python tests/harness/injections/campaign.py --instants 25 --pairs 200
 
 Robot, safety monitor and station are stepped in turn in one process, so that the same seed gives the same result. At
-each instant that process is forked for every fault. `processes.py` kills and pauses real processes. Required of every
-detectable fault: detected within its bound, all joints below 0.15 rad/s within 100 ms of the fault, and never faster
-than 1.25 times the speed at the fault (or the speed that the undisturbed motion has within the bound, if it is higher).
-The exit code is 1 otherwise. A fault that only changes positions or velocities begins when they are wrong by
-`SENSITIVITY`: a velocity that is frozen in a joint at rest is right until the joint moves. Of two faults one can hide
-the other, so that the longer bound holds.
+each instant that process is forked for every fault. `processes.py` kills and pauses real processes.
+
+Every detectable fault must be detected within its bound. All joints must be below 0.15 rad/s within 100 ms of the
+fault, and never faster than 1.25 times the speed at the fault or, if it is higher, the speed of the undisturbed motion
+within the bound. The exit code is 1 if a requirement is not met. A fault that only changes positions or velocities
+begins when they are wrong by `SENSITIVITY`: a velocity that is frozen in a joint at rest is right until the joint
+moves. Of two injected faults one can hide the other; the longer bound applies.
 """
 
 from __future__ import annotations
