@@ -153,10 +153,11 @@ class SharedControlTemplate:
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. The displacement is also scaled down if one constraint undoes another. Constraints that keep the end
-        effector outside of a shape are linearized at the last command, so that the line to the new command is outside
-        too. After `BACKTRACKS` attempts the last command is repeated. If the last command is inside the constraints, so is the new one. If the last command is outside (at the
-        start of an episode, or after an object moved), the commands move inside at the largest speed.
+        object. The displacement is also scaled down if one constraint undoes another; after `BACKTRACKS` attempts the
+        last command is repeated. Constraints that keep the end effector outside of a shape are linearized at the last
+        command, so that the line to the new command is outside too. If the last command is inside the constraints, so
+        is the new one. If the last command is outside (at the start of an episode, or after an object moved), the
+        commands move inside at the largest speed.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
