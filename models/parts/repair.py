@@ -16,6 +16,9 @@ from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 MAX_MOVED = 5e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
 _CPU_SECONDS = 60
+# fTetWild is not deterministic, and may leave tetrahedra outside the part. The best of several attempts is used; an
+# attempt that moves the surface by less than `_NEAR` [m] is the last.
+_ATTEMPTS, _NEAR = 3, 1e-4
 _NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
 
 
@@ -120,18 +123,23 @@ def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
             f"{gaps}: close it in the CAD model, and export it again, or pip install 'guiderail[repair]', which closes "
             "small gaps"
         )
-    try:
-        points, tetrahedra = run_isolated(
-            tetrahedralize, vertices, triangles, _ENVELOPE, 0.15, False, cpu_seconds=_CPU_SECONDS
-        )
-        solid = to_manifold(*boundary_of(points, tetrahedra))
-    except (IsolatedError, ValueError) as error:
-        raise InputError(
-            f"{gaps}, and the repair failed ({error}): close it in the CAD model, and export it again"
-        ) from error
-    if not _is_solid(solid):
-        raise InputError(f"{gaps}, and its repair still has open edges: close it in the CAD model, and export it again")
-    return solid
+    best, nearest, reason = None, np.inf, "its result still has open edges"
+    for _ in range(_ATTEMPTS):
+        try:
+            points, tetrahedra = run_isolated(
+                tetrahedralize, vertices, triangles, _ENVELOPE, 0.15, False, cpu_seconds=_CPU_SECONDS
+            )
+            solid = to_manifold(*boundary_of(points, tetrahedra))
+        except (IsolatedError, ValueError) as error:
+            reason = str(error)
+            break  # the next attempt would probably take as long
+        if _is_solid(solid) and (moved := measure_distance(to_arrays(solid), (vertices, triangles))) < nearest:
+            best, nearest = solid, moved
+        if nearest < _NEAR:
+            break
+    if best is None:
+        raise InputError(f"{gaps}, and the repair failed ({reason}): close it in the CAD model, and export it again")
+    return best
 
 
 def _outward_bodies(solid: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, int]:

@@ -120,6 +120,25 @@ def test_load_part_closes_a_small_hole_and_states_the_distance(tmp_path, monkeyp
             load_part(tmp_path / "part.stl", "mm")
 
 
+def test_load_part_uses_the_best_of_several_repairs(tmp_path, monkeypatch):
+    results = [box().apply_scale(factor * 1e-3) for factor in (1.05, 1.03, 1.0001, 1.0)]
+    monkeypatch.setattr(repair, "find_spec", lambda name: True)
+    monkeypatch.setattr(repair, "boundary_of", lambda points, cells: (points, cells))
+    calls = []
+
+    def run_isolated(*arguments, **limits):
+        calls.append(arguments)
+        result = results[len(calls) - 1]
+        return np.asarray(result.vertices), np.asarray(result.faces)
+
+    monkeypatch.setattr(repair, "run_isolated", run_isolated)
+    mesh = box()
+    gaps = "part.stl is not watertight"
+    solid = repair._wrap(gaps, np.asarray(mesh.vertices) * 1e-3, np.asarray(mesh.faces))
+    assert len(calls) == 3  # the third moves the surface by a micrometer
+    assert solid.volume() == pytest.approx(1e9 * 2e-6, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("spoil", "unit", "message"),
     [
