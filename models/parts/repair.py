@@ -13,12 +13,10 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.solids import measure_distance, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
-MAX_MOVED = 5e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
+MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
 _CPU_SECONDS = 60
-# fTetWild is not deterministic, and may leave tetrahedra outside the part. The best of several attempts is used; an
-# attempt that moves the surface by less than `_NEAR` [m] is the last.
-_ATTEMPTS, _NEAR = 3, 1e-4
+_ATTEMPTS = 3  # fTetWild is not deterministic, and may leave tetrahedra outside the part: the best attempt is used
 _NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
 
 
@@ -135,7 +133,7 @@ def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
             break  # the next attempt would probably take as long
         if _is_solid(solid) and (moved := measure_distance(to_arrays(solid), (vertices, triangles))) < nearest:
             best, nearest = solid, moved
-        if nearest < _NEAR:
+        if nearest <= MAX_MOVED:
             break
     if best is None:
         raise InputError(f"{gaps}, and the repair failed ({reason}): close it in the CAD model, and export it again")
