@@ -27,7 +27,7 @@ class AutoInterventionConfig(OffPolicyConfig):
     """Settings of TQC with automatic interventions."""
 
     algorithm: str = "auto_intervention"
-    window: Positive = 25  # control steps ahead of the progress that are searched for the nearest one
+    window: Positive = 25  # number of steps ahead of the last progress among which the nearest step is searched
     stall_actions: Positive = 6  # actions without progress after which the demonstration takes over
     intervention_actions: Positive = 6  # actions that an intervention lasts
     until_successes: Positive = 3  # consecutive greedy successes after which there are no interventions
@@ -73,7 +73,7 @@ class AutoInterventionLearner(TqcLearner):
         super().__init__(config, env, **arguments)
         self._env: Any = env.unwrapped
         if config.pipelined or config.num_envs or "demonstrations" not in self._env.task.declaration.provides():
-            raise InputError("auto_intervention needs demonstrations, and neither pipelined nor num_envs")
+            raise InputError("auto_intervention needs a task with demonstrations: leave out pipelined and num_envs")
         self._reference = self._env.task.declaration.reference()
         self._start()
 

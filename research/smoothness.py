@@ -1,4 +1,4 @@
-"""Smoothness of exploration: every exploration method at the same RMS.
+"""Smoothness of exploration methods that displace the command by the same root mean square (RMS).
 
 Each method explores the connector with random actions, in free space (the jack is out of reach) and in contact: KGRL
 and sKGRL through their null space, the others as a residual on the demonstrations. The jerk of a command has two parts:
@@ -87,8 +87,8 @@ def spectral_arc_length(
 
 
 TASK = "BncConnector"
-ACTION_REPEAT = 10  # control steps of an action when the connector is learned
-SLOW = 25  # control steps of an action that is as slow as a low-pass filter of 1 Hz
+ACTION_REPEAT = 10  # control steps per action, as in the training of BncConnector
+SLOW = 25  # control steps per action; two actions per second resolve 1 Hz, the cutoff of one of the low-pass filters
 PLACES = ("free", "connector")
 OUT_OF_REACH = (MAX_GIVEN_OFFSET, MAX_GIVEN_OFFSET)  # jack offset for motions in free space [m]
 ALONE = "demonstration alone"
@@ -104,7 +104,7 @@ class Method:
     Attributes:
         name: Name in the table.
         guidance: Kind of guidance.
-        explore: Function of a random generator, the number of steps and the number of actions; returns a policy.
+        explore: Function of a random generator, the number of control steps and the action size; returns a policy.
         action_repeat: Control steps for which `explore` repeats an action. The environment's own action repeat is 1.
         environment: Further options of the environment.
     """
@@ -142,7 +142,7 @@ def smoothness(
 
     Args:
         out: Folder; methods that are already measured in it are not measured again.
-        episodes: Episodes of each method, in free space and in contact each.
+        episodes: Episodes of each method in free space, and as many in contact.
         action_scale: Common exploration RMS, in demonstration standard deviations.
         outputs: "all" for all six outputs, as in the thesis, or "xy" for the outputs that the learned policies move.
         seed: Seed of the random actions and of the jack offsets, which are new in every episode.
@@ -176,7 +176,7 @@ def smoothness(
 
 
 def quiet_commands() -> np.ndarray:
-    """Return the commands of the demonstrations without actions, (N, 6)."""
+    """Return the commands of the demonstrations' KMP without any action in free space, (N, 6)."""
     env: Any = make_environment(TASK, {"guidance": "kmp", "action_repeat": 1, "fixture_offset": "none"})
     rollout(env, constant_policy(env, np.zeros(env.action_space.shape)), seed=0, options={"offset": OUT_OF_REACH})
     commands = env.unwrapped.trace.commanded.copy()
@@ -192,7 +192,7 @@ def measure(
     Args:
         method: Exploration method.
         action_dims: Indices of the outputs that the method moves.
-        quiet: Commands of the demonstrations without actions, (N, 6): see `quiet_commands`.
+        quiet: Commands without any action, (N, 6): see `quiet_commands`.
         episodes: Episodes in each place.
         action_scale: Exploration RMS, in demonstration standard deviations.
         seed: Seed of the random actions and of the jack offsets.
@@ -228,18 +228,19 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
     """Return options that give random actions the RMS `action_scale` where no constraint is active."""
     if method.guidance == "kmp":
         return {}
-    # The primitive of the environment at an action scale of 1.
+    # The prior knowledge of the same environment, but with an action scale of 1.
     histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
     config = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
     assert config is not None
     indices = np.array(action_dims)
-    if method.guidance == "residual":  # one gain for all outputs of a unit, although their deviations differ
+    if method.guidance == "residual":  # positions share one gain, and so do angles, although their deviations differ
         reached = RMS * (config.residual_gains() / deviation(config.reference))[indices]
         return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
     primitive = config.primitive(history=method.guidance == "skgrl")
     if not method.environment.get("adaptive_history"):
         return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
-    # One action scale sets the gains for all lengths of an adaptive history. In free space the history is complete.
+    # One action scale sets the gains for every length of an adaptive history. It is computed for the full length,
+    # which the history has in free space.
     reached = exploration_rms(primitive, config.null_space_gains(primitive), method.action_repeat)[indices]
     return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
 
@@ -290,8 +291,8 @@ def _ratios(rows: list[dict[str, Any]]) -> dict[str, Any]:
         for part in ("linear", "angular"):
             key, measured, added = f"jerk_commanded_{part}", f"jerk_measured_{part}", f"jerk_added_{part}"
             ratios[f"{ours_name}, {part} jerk below that of KGRL repeat {ACTION_REPEAT}"] = (
-                f"{kgrl[key] / ours[key]:.0f} times commanded ({kgrl[added] / ours[added]:.0f} times what exploring "
-                f"adds), {kgrl[measured] / ours[measured]:.1f} times measured"
+                f"{kgrl[key] / ours[key]:.0f} times commanded ({kgrl[added] / ours[added]:.0f} times in the part "
+                f"that exploration adds), {kgrl[measured] / ours[measured]:.1f} times measured"
             )
             ratios[f"{ours_name}, commanded {part} jerk as a fraction of the demonstrations' own"] = (
                 f"{ours[key] / free[ALONE][key]:.3g}"

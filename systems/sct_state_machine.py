@@ -34,9 +34,10 @@ class SctStateMachine(LeafSystem):
 
     ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``initial_pose`` is the
     measured pose. It replaces ``pose`` at initialization, when a commanded ``pose`` may not be initialized yet.
-    ``state`` is (1,), the number of the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_t of
-    the current state in meters or radians. ``progress`` is (1,), the progress in the whole task: it accumulates over
-    the states, and its increase in a step is d_{t−1} − d_t of equation 3.2.
+    ``state`` is (1,), the number of the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_q of
+    the current state q in meters or radians. ``progress`` is (1,), the progress in the whole task: it accumulates over
+    the states, and increases in a step by the decrease of the transition distance (d_{t−1} − d_t of equation 3.2) times
+    the weight of the state.
 
     Args:
         template: Shared control template.
@@ -70,7 +71,7 @@ class SctStateMachine(LeafSystem):
     get_pose_input_port = input_getter("pose", "pose at which transition distances are evaluated, (6,)")
     get_initial_pose_input_port = input_getter("initial_pose", "pose that determines the first state, (6,)")
     get_state_output_port = output_getter("state", "number of the template's state, (1,)")
-    get_transition_distance_output_port = output_getter("transition_distance", "distance d_t, (1,) [m or rad]")
+    get_transition_distance_output_port = output_getter("transition_distance", "transition distance, (1,) [m or rad]")
     get_progress_output_port = output_getter("progress", "progress in the task, (1,)")
 
     def _state_pose_frames(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:

@@ -24,11 +24,12 @@ from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.systems.reference_governor import ReferenceGovernor
 
 TANK_CAPACITY = 5.0  # capacity of the energy tank [J], a multiple of the work of an insertion
-# Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. Their damping is a lower bound of the
-# dissipation that refills a tank.
+# Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. A joint's damping increases with its inertia, so
+# these give a lower bound of the dissipation that refills a tank.
 MIN_MASS, MIN_INERTIA = 1.5, 2e-3
 WRENCH_RATE = np.array([100.0] * 3 + [10.0] * 3 + [100.0, 10.0])
-"""Largest rate at which the limits of force and torque change from state to state of a template, (8,) [N/s, Nm/s]."""
+"""Largest rates at which a wrench limit changes from state to state of a template: of three forces, three torques, the
+norm of the force and the norm of the torque, (8,) [N/s, Nm/s]."""
 
 
 def add_controller(
@@ -39,7 +40,7 @@ def add_controller(
     *,
     compensate_gravity: bool,
 ) -> tuple[CartesianImpedanceController, ImpedanceMonitor, EnergyTank | None]:
-    """Add a robot's controller, sampled with `period` [s], and connect the monitor of its wrench and its energy tank.
+    """Add a robot's controller, sampled with `period` [s], the monitor of its impedance wrench, and its energy tank.
 
     There is a tank only if the impedance is bounded. The tank, not the controller, then receives the desired pose.
     """

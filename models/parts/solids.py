@@ -41,7 +41,7 @@ class SurfaceLocator:
     """Nearest points on a triangle surface."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
-        """Construct the hierarchy of at least one triangle (T, 3), of indices of vertices (V, 3)."""
+        """Construct the bounding volume hierarchy of triangles (T, 3), at least one, which index vertices (V, 3)."""
         self._vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         self._triangles = np.ascontiguousarray(triangles, dtype=np.int64)
         self._tree: Any = import_extra("igl").AABB()
@@ -58,9 +58,10 @@ class SurfaceLocator:
 
 
 def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (P, 3) of a surface and their triangles (P,): `count` uniform samples and corners.
+    """Return points (P, 3) of a surface and their triangles (P,): uniform samples, and corners of triangles.
 
-    The samples are the same in every call.
+    There are `count` samples and fewer than `2 * count` corners, every n-th one of the mesh. The samples are the
+    same in every call.
     """
     corners = vertices[triangles]
     cumulative = np.cumsum(0.5 * np.linalg.norm(area_vectors(vertices, triangles), axis=1))
@@ -77,7 +78,7 @@ def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> t
 def measure_distance(
     points_of: tuple[np.ndarray, np.ndarray], surface: tuple[np.ndarray, np.ndarray], count: int = NUM_SAMPLES
 ) -> float:
-    """Return the largest sampled distance of the points of one surface (V, 3), (T, 3) from another."""
+    """Return the largest distance of sampled points of one surface from another, each as in `measure_deviation`."""
     points, _ = sample_surface(*points_of, count)
     return float(SurfaceLocator(*surface).find_nearest(points)[1].max())
 

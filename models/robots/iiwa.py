@@ -15,7 +15,8 @@ IIWA14 = register_robot(
         joints=tuple(f"iiwa_joint_{number}" for number in range(1, 8)),
         home=(0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0),
         tool_turn=math.pi,
-        # Reduced by joint torque feedback, without which a Cartesian impedance would lag far behind its command.
+        # Joint torque feedback reduces the apparent inertia of the rotors. With the full inertia, a Cartesian impedance
+        # would lag far behind its command.
         apparent_rotor_inertia=0.1,
         # Most of the inertia is that of the rotor, which turns 100 or 160 times as fast as its joint.
         drives=JointDrives(

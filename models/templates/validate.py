@@ -1,7 +1,8 @@
 """Checks of a template beyond those that are made when its file is read.
 
-The checks place the template's objects and the end effector at random near each other and evaluate the template's laws.
-A fault that occurs in less than one of a few hundred poses may not be found.
+The checks place the template's objects and the end effector at random near each other, and evaluate the template's
+input mappings, active constraints and transitions there. A fault that occurs in less than one of a few hundred poses
+may not be found.
 """
 
 from collections.abc import Iterator, Sequence
@@ -56,7 +57,7 @@ def _sample_scene(
         yaw = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
         frames[name] = RigidTransform(yaw, rng.uniform(-0.3, 0.3, 3))
     X_WF = frames[template.frames[rng.integers(len(frames))]] if frames else RigidTransform()
-    # Sampled uniformly in the distance, because constraints are closest to each other near an object.
+    # The distance is uniform, not the position, because more samples are needed near an object, where constraints meet.
     p_FE = rng.normal(size=3)
     p_FE *= REACH * rng.uniform() / np.linalg.norm(p_FE)
     R_FE = RotationMatrix(Rotation.random(rng=rng).as_matrix())
@@ -132,7 +133,9 @@ def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Itera
             if best > threshold:
                 inside = template.distance(number, *starts[0])
                 why = (
-                    "no input leads there" if inside <= threshold else "the active constraints keep it away from there"
+                    "no input leads there"
+                    if inside <= threshold
+                    else "no sampled pose within the active constraints is there, and no input leads there"
                 )
                 yield Finding(
                     True, f"{state.name}: {goal} never fires: {why} (nearest {best:.3g}, threshold {threshold:.3g})"
@@ -149,7 +152,7 @@ def _greedy(
     threshold: float,
     period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
-    """Return the least distance, and the last pose, of a greedy search that applies one full input at every step."""
+    """Return the least distance, and the last pose, of a greedy search that sets one input to ±1 at every step."""
     candidates = [sign * row for row in np.eye(template.inputs) for sign in (1.0, -1.0)]
     best = template.distance(number, X_WE, frames)
     for _ in range(GREEDY_STEPS):
@@ -187,6 +190,6 @@ def _check_arrivals(template: SharedControlTemplate, scenes: Scenes) -> Iterator
                 yield Finding(
                     False,
                     f"{state.name}: the transition to {transition.to} waits in {waiting} of {arrived} arrivals, as the "
-                    f"command is up to {worst:.2g} m or rad outside of the next state's constraints; let them meet at "
-                    "the threshold",
+                    f"command is up to {worst:.2g} m or rad outside of the next state's constraints; change the "
+                    "constraints of either state so that they agree at the threshold",
                 )

@@ -84,8 +84,8 @@ def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -
         takes.bind(**dict.fromkeys(names))
     except TypeError:
         raise InputError(
-            f"{what} is called with its signals by name, {', '.join(names) or 'none'}, and takes "
-            f"{', '.join(takes.parameters) or 'none'}: give its function and its inputs the same names"
+            f"{what} is called with the keyword arguments ({', '.join(names)}), but its function has the parameters "
+            f"({', '.join(takes.parameters)}): give its inputs the names of the parameters"
         ) from None
 
 
@@ -249,9 +249,9 @@ def plant_context(
 
 
 def input_getter(name: str, description: str) -> Callable[[System], InputPort]:
-    """Return a method that returns the input port `name`, which a system or diagram stores as `_<name>_port`.
+    """Return a method that returns the input port `name`, stored as `_<name>_port` or found by name.
 
-    The description has signal, shape and unit, for the method's docstring.
+    The method's docstring is "Return the port of the" with the description, which names signal, shape and unit.
     """
 
     def getter(self: System) -> InputPort:

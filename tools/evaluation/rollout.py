@@ -101,9 +101,9 @@ def rollout(
     held_out: bool = False,
     options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Run one episode and return its row; the environment's trace holds that episode afterwards.
+    """Run one episode and return its statistics as a table row; the environment's trace holds that episode afterwards.
 
-    The row of an environment of another origin, which has no trace, has fewer columns; see `outside_row`.
+    An environment from outside this package has no trace, and its row has fewer columns; see `outside_row`.
 
     Args:
         env: Environment.
@@ -165,7 +165,7 @@ class Paths(EnvCallback):
 def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
     """Start an episode with held-out conditions; `options` are further options of the reset.
 
-    An environment of another origin has no such option: its conditions depend on the seed.
+    An environment from outside this package has no option `held_out`: its conditions depend on the seed.
     """
     if not hasattr(env.unwrapped, "trace"):
         return env.reset(seed=seed, options=options or None)[0]
@@ -175,7 +175,7 @@ def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
     """Return True if a policy's actions for several observations have the shape of the environment's actions.
 
-    Several observations are tried because a scripted policy may index the observation only for some of its values.
+    Several observations are tried because a scripted policy may read a component only if others have certain values.
     """
     act, shape = make_policy(env), env.observation_space.shape or ()
     try:

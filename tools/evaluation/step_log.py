@@ -20,7 +20,7 @@ from guiderail.tools.evaluation.rollout import EnvCallback
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import check_parquet
 
-SLACK = "distance outside of the constraint; negative is slack"
+SLACK = "unit of the constraint; negative is slack"
 # Unit and meaning of each column; "_i" stands for one column per component of a pose or a wrench.
 MEANINGS = {
     "episode": ("", "number of the episode, from 0"),
@@ -42,7 +42,7 @@ _FLAGS = {"collision", "command_timed_out", "fallback"}
 
 
 class StepLog(EnvCallback):
-    """Callback that writes an episode's control steps when the episode ends, before a checkpoint counts it.
+    """Callback that writes an episode's control steps when the episode ends, before a checkpoint includes the episode.
 
     Attributes:
         seconds: Time spent on writing so far [s].

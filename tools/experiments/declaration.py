@@ -120,7 +120,7 @@ class Study(_Strict):
     """Methods × seeds × numbers of training episodes × evaluation sets."""
 
     name: FolderName  # name of the tables
-    task: str  # task of every method: its name, or in a file also the path of a task folder
+    task: str  # name of the task of every method; in a YAML file, the path of a task folder is allowed too
     env: dict[str, Any] = {}  # options of the environment of every method
     learner: LearnerChoice = LearnerChoice()  # learner of every method that learns
     methods: dict[FolderName, Method] = Field(min_length=1)  # by name, used in folders and legends
@@ -155,7 +155,7 @@ class Study(_Strict):
         for ratio in self.ratios:
             for method in (ratio.method, ratio.against):
                 if method not in self.methods:
-                    raise ValueError(f"a ratio names no method {method!r}: {did_you_mean(method, self.methods)}")
+                    raise ValueError(f"a ratio has the unknown method {method!r}: {did_you_mean(method, self.methods)}")
         return self
 
     @model_validator(mode="after")

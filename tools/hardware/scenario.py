@@ -17,7 +17,8 @@ from guiderail.models.common.yaml import MAX_SIZE, check_yaml
 
 HARDWARE, SIMULATION = "hardware", "simulation"
 _TAGS = ("!IiwaDriver", "!PandaDriver", "!Rpy")  # accepted tags, which name classes
-# Supported fields of Drake's classes. Others are refused: with a channel suffix, for example, another robot would move.
+# Supported fields of Drake's classes. Others are refused, not ignored: without its channel suffix, for example, a
+# command would move another robot.
 SUPPORTED = ("control_mode", "lcm_bus", "lcm_url")
 
 

@@ -1,4 +1,4 @@
-"""BncConnector: insert, align and lock a bayonet connector at a position that is not exactly known (4.4.2, 5.4.2)."""
+"""BncConnector: insert, align and lock a bayonet connector at an uncertain position (thesis, sections 4.4.2, 5.4.2)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def reference_trajectory(demonstrations: str, count: int | None = None, **fit: A
     return _fit_reference(demonstrations, count, tuple(sorted(fit.items())))
 
 
-@cache  # called with positional arguments only: an omitted argument and its default have the same key
+@cache  # called with all arguments by position: an omitted `count` and None have the same key
 def _fit_reference(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **dict(fit))
@@ -119,7 +119,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
 class BncConnector(DemonstratedInsertion):
     """Insert, align and lock the connector.
 
-    Rewards: "sparse" is the thesis's reward (4.27, 4.28); "shaped" and "aligned" add terms to it.
+    Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28); "shaped" and "aligned" add terms to it.
     """
 
     Options = BncOptions
@@ -168,7 +168,7 @@ class BncConnector(DemonstratedInsertion):
         return LinearConstraints.box(-bound, bound)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the estimate of height and turn; lateral offset cannot be measured, and is checked by pulling."""
+        """Return D and y0 that estimate height and turn; the lateral offset is not estimated but checked by a pull."""
         size = self._workcell.dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = D[5, 3] = 1.0

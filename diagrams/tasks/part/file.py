@@ -77,7 +77,7 @@ class PartModel(Options):
     gyration: Number = Field(gt=0, description="radius of gyration [m]")
     pieces: tuple[Piece, ...] = Field(min_length=1, description="collision meshes")
     convex: tuple[str, ...] = Field(
-        (), description="OBJ files of convex pieces for station=mujoco, which both parts need; default: not offered"
+        (), description="OBJ files of convex pieces: station=mujoco needs some of both parts; default: none"
     )
 
 
@@ -150,7 +150,7 @@ class Bounds(Options):
             return phases  # the errors of `lower` and `upper` are reported instead
         lower, upper = _filled(info.data["lower"], -np.inf), _filled(info.data["upper"], np.inf)
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
-            raise ValueError("bounds that change need phases, and a list of lower and of upper ones for each")
+            raise ValueError("bounds that change need phases, and for each phase a list in lower and a list in upper")
         if phases is not None and (phases[0] != 0.0 or any(np.diff([*phases, 1.0]) <= 0.0)):
             raise ValueError("phases begin at 0, increase, and are below 1")
         for bound in (np.isfinite(lower), np.isfinite(upper)):
@@ -230,7 +230,7 @@ class SearchNumbers(Options):
         -1,
         ge=-1,
         le=1,
-        description="1 if the center of pressure lies towards the socket's axis, -1 if away from it, as measured",
+        description="1 if a misaligned plug's center of pressure lies towards the socket's axis, -1 if away from it",
     )
     speed: Number = Field(2.0, gt=0, le=10, description="change of the action [1/s]")
     turn_speed: Number = Field(0.5, gt=0, le=10, description="change of the action that turns the plug [1/s]")
@@ -309,7 +309,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
         raise InputError(f"{folder} is no task: it has no {FILE_NAME}; guiderail create-task makes one")
     data = load_yaml(path, "task")
     if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
-        raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
+        raise InputError(f"{path} is no task: it must contain the line 'format: {FILE_FORMAT}'")
     file = validate_options(PartTaskFile, data, str(path))
     for name in file.files:
         if not _FILE_NAME.fullmatch(name) or ".." in name.split("/"):

@@ -90,7 +90,7 @@ def with_row(changed):
         (BY_PHASE | {"phases": [0.0, 0.0]}, "increase"),
         (BY_PHASE | {"phases": [0.0, 1.0]}, "below 1"),
         (BY_PHASE | {"phases": None}, "need phases"),
-        (BY_PHASE | {"phases": [0.0]}, "a list of lower and of upper ones for each"),
+        (BY_PHASE | {"phases": [0.0]}, "for each phase a list in lower and a list in upper"),
         (with_row([None, -0.001, *[None] * 4]), "in every phase or in none"),
         (with_row([float("nan"), -0.001, *[None] * 4]), "six finite numbers"),
         (with_row([float("inf"), -0.001, *[None] * 4]), "six finite numbers"),
