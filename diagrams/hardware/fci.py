@@ -24,7 +24,7 @@ from guiderail.models.control.motion_constraints import MotionLimits
 logger = logging.getLogger(__name__)
 
 # Limits of the commands: a fifth of the robot's linear and four fifths of its angular velocity, and half of its
-# accelerations and jerks. A single axis has 1/√3 of a limit. A policy turns a bayonet at 1 rad/s about one axis.
+# accelerations and jerks. A single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
 MOTION_LIMITS = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
 NO_ERRORS = "[]"  # the client's text of a robot without errors
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
@@ -33,7 +33,7 @@ STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
 # Collision thresholds of the robot, relative to the impedance's largest wrench along an axis. The force threshold is at
 # least that of libfranka's examples [N], because the robot's estimate is off by some newtons. In simulation a plug that
-# drops from a rim into its hole ends with an impact of 1.9 times that wrench (28 N of 15 N, eight random episodes).
+# drops from a rim into its hole ends with an impact of 1.9 times that wrench (28 N, where it is 15 N; eight episodes).
 FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 2.5, 20.0
 MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
@@ -215,7 +215,7 @@ class FciDriver(PoseDriver):
         self._motion = None
         if self._robot is not None:
             with suppress(self._franky.Exception, RuntimeError):
-                self._robot.join_motion(STOP_TIME)  # raises a motion's error, which the next motion would raise
+                self._robot.join_motion(STOP_TIME)  # raises the error of the last motion here, not in the next motion
         is_recovered = False
         if not self._is_lost:
             try:

@@ -253,7 +253,7 @@ def serve_in_real_time(
     """Simulate an arm in real time; like a real robot, it does not wait for commands.
 
     Contact makes the simulation slower. If the simulation falls so far behind that its statuses count as old, this is
-    reported once, because the commanding program is not the cause.
+    reported once, so that the cause is not sought in the commanding program.
 
     Args:
         simulator: Simulator of the arm, initialized.
@@ -275,7 +275,7 @@ def serve_in_real_time(
         delay = (time.monotonic() - start) * rate - step * period
         if delay > max_delay and not is_reported:
             log(
-                f"this machine is too slow, or too busy, for a simulated robot with a clock at {rate:g} of the "
-                f"wall's: it is {delay:.2f} s behind; give a smaller --rate, or --synchronous"
+                f"this machine is too slow, or too busy, for a simulated robot at {rate:g} times real time: it "
+                f"is {delay:.2f} s behind; give a smaller --rate, or --synchronous"
             )
             is_reported = True

@@ -87,7 +87,7 @@ CalibrationError = Annotated[
 
 
 def _sensor_error(description: str) -> Any:
-    return Field(None, description=f"{description}; default: that of sensing")
+    return Field(None, description=f"{description}; default: set by sensing")
 
 
 class Disturbances(Options):
@@ -119,7 +119,7 @@ class Disturbances(Options):
     )
     wrench_noise: Magnitudes | None = _sensor_error("standard deviation of the measured wrench: force [N], torque [Nm]")
     wrench_delay: Integer | None = Field(
-        None, ge=0, le=50, description="delay of the measured wrench in control steps; default: that of sensing"
+        None, ge=0, le=50, description="delay of the measured wrench in control steps; default: set by sensing"
     )
     calibration_error: CalibrationError | None = _sensor_error(
         "largest error of the robot's kinematics, sampled every episode: position [m], orientation [rad]"

@@ -209,7 +209,8 @@ REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 TERMINAL = {"success": 60.0, "collision": -50.0}
 # Reward per depth gained [1/mm]. The connector locks when the demonstrations end, however early the plug drops. With a
 # terminal reward alone, a success by random motion would therefore earn as much as a success by use of the contact,
-# although it is less reliable. The path from start to lock is 15.6 mm long, with the last 5.5 mm in the jack.
+# although random motion succeeds less reliably. The path from start to lock is 15.6 mm long, with the last 5.5 mm in
+# the jack.
 DEPTH_REWARD = 5.0
 # Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
 ALIGNMENT_REWARD = 5.0
@@ -265,10 +266,10 @@ class DemonstratedInsertion(InsertionTask):
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
     and y. "image" is the wrist camera's image alone; "image_and_state" adds it to the state.
 
-    Rewards: "sparse" is the thesis's reward (4.27, 4.28), with costs of actions and forces and a terminal reward.
-    "shaped" adds the depth gained, and "aligned" also the distance gained towards the fixture's axis. This distance is
-    privileged: the policy does not observe this simulation state. Depth gained and distance gained are differences of
-    potentials. The name of the workpiece must be "plug".
+    Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28), with costs of actions and forces, and a terminal
+    reward. "shaped" adds the depth gained, and "aligned" also the distance gained towards the fixture's axis. This
+    distance is privileged: the policy does not observe this simulation state. Depth gained and distance gained are
+    differences of potentials. The name of the workpiece must be "plug".
 
     Attributes:
         insertion_length: Length of the insertion, which scales the distance of the wrist camera [m].

@@ -1,9 +1,12 @@
 """Bounds on commands whose corrections satisfy a budget, tightened by Lagrange multipliers of the constraints.
 
+A correction is the change of a command by active constraints; see `bounds.py` for the budget.
+
 The largest value of a direction over a zonotope is the sum of the absolute values of the generators along this
-direction. Commands at other steps satisfy constraints, too: subtracting α times such a command from the direction and
-adding |α| times the margin of its constraint gives another valid bound, where α is the multiplier. Any multipliers
-prove a bound; they are feasible points of the dual of a linear program. A greedy search finds good multipliers.
+direction. Commands at other steps satisfy constraints, too. For any multiplier α, another valid bound is computed by
+subtracting α times the generators of such a command from those of the direction, and adding |α| times the margin of
+the command's constraint. Any multipliers prove a bound; they are feasible points of the dual of a linear program. A
+greedy search finds good multipliers.
 """
 
 from dataclasses import dataclass
@@ -20,18 +23,18 @@ FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative t
 
 @dataclass(frozen=True)
 class Budget:
-    """Budget of corrections: largest value at one step, and largest sum over a sequence."""
+    """Budget of corrections: the rows are the largest value at one step and the largest sum over a sequence."""
 
     excess: np.ndarray  # (2, A), excess over ±1 of the actions that are equivalent to corrected commands
-    residue: np.ndarray  # (2, O), displacement of outputs that no action moves, by corrections
+    residue: np.ndarray  # (2, O), displacement by corrections of the outputs that no action moves
 
 
 @dataclass(frozen=True)
 class BudgetedBounds:
     """Bounds under the assumption that corrections satisfy a budget.
 
-    The last three attributes prove the bounds. They have one entry for each order of the difference, sign, step, output
-    and round, (3, 2, N, O, R).
+    The last three attributes prove the bounds. Their shape is (3, 2, N, O, R): order of the difference (0 for
+    commands, 1 for speeds, 2 for accelerations), sign, step, output and round of the search.
     """
 
     budget: Budget  # assumed budget

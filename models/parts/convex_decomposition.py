@@ -29,7 +29,7 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES) -> list[Any
     Each cut is along the plane of a face at a concave edge; the plane that leaves the smallest concave volume is used.
 
     Returns:
-        The pieces; None if more than `max_pieces` are necessary, or if they would fill a concavity that no cut removes.
+        The pieces; None if more than `max_pieces` are necessary, or if hulls fill a concavity that no cut removes.
     """
     total, filled, uncut, pieces = solid.volume(), 0.0, [solid], []
     while uncut:
@@ -50,7 +50,7 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES) -> list[Any
 
 
 def _with_large_faces(convex: Any) -> Any:
-    """Return a convex solid without vertices whose faces are too small for Drake (near an edge or another vertex)."""
+    """Return a convex solid without vertices so near to an edge or vertex that a face is too small for Drake."""
     from pydrake.geometry import Convex  # imported here because it takes half a second
 
     manifold3d = import_extra("manifold3d")

@@ -30,9 +30,10 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.ndarray | None = None) -> np.ndarray:
     """Compute gains (O,) with which a constant action of ±1 moves outputs by √3 κ demonstration standard deviations.
 
-    The factor √3 is KGRL's own relation: uniform actions in ±1 then cause an RMS of κ standard deviations. Displacement
-    and deviation are RMS over the whole motion, so that wide regions, which leave room to explore, dominate. The result
-    does not depend on the action repeat, because a constant action is the same for every action repeat.
+    The RMS of uniform actions in ±1 is 1/√3. With the factor √3 they cause an RMS of κ standard deviations in KGRL,
+    in which a command depends on one action only, if outputs are not coupled. Displacement and deviation are RMS over
+    the whole motion, so that regions dominate in which the demonstrations vary widely and leave room to explore. The
+    result does not depend on the action repeat, because a constant action is the same for every action repeat.
 
     Args:
         primitive: Primitive to calibrate.
@@ -121,7 +122,7 @@ def _explored_mask(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray
 
 
 def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
-    """Compute displacements (N, O, B) from the motion without actions by raw actions (N, O, B), commands as history."""
+    """Compute the displacements (N, O, B) that raw actions (N, O, B) cause; the history consists of past commands."""
     steps, outputs, batch = actions.shape
     history = primitive.history
     past = np.zeros((history + steps, outputs, batch))
@@ -134,7 +135,7 @@ def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
 
 
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
-    """Compute the mean square (O, O) of output i over the motion per squared gain of white actions in output j."""
+    """Compute the mean square displacement (O, O) of output i by uniform white actions in output j, with gain 1."""
     if int(action_repeat) != action_repeat or action_repeat < 1:
         raise InputError(f"action_repeat is a number of control steps, at least 1, not {action_repeat}")
     steps, outputs = primitive.num_steps, primitive.num_outputs

@@ -21,16 +21,16 @@ def main(arguments: list[str]) -> None:
     """Run the program."""
     parser = Parser(
         "parts",
-        "Create a task of every pair of meshes below a folder, insert it aligned, and with --learn train and evaluate "
-        "a policy. Each finished step is stored, and the same command resumes.",
+        "Create a task from every pair of meshes below a folder, test the insertion without an offset, and with "
+        "--learn train and evaluate a policy. Each finished step is stored, and the same command resumes.",
         "--meshes assets --out parts --processes 2 --learn hard",
     )
     parser.add_argument("--meshes", type=Path, required=True, help="folder with the meshes; nothing is written to it")
     parser.add_out("parts_benchmark")
     parser.add_argument("--unit", default="m", help="unit of the meshes (default: m)")
     parser.add_argument("--pairs", help="names of pairs, separated by commas (default: all)")
-    parser.add_argument("--every", type=int, default=1, help="learn only one of this many prepared pairs")
-    parser.add_argument("--learn", help=f"difficulties that are learned, of {', '.join(DIFFICULTIES)}; with commas")
+    parser.add_argument("--every", type=int, default=1, help="learn only every n-th prepared pair (default: 1)")
+    parser.add_argument("--learn", help=f"difficulties to learn, separated by commas: {', '.join(DIFFICULTIES)}")
     parser.add_argument("--episodes", type=int, default=150, help="training episodes (default: 150)")
     parser.add_argument("--held-out", type=int, default=100, help="evaluated episodes (default: 100)")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of the training (default: 1)")

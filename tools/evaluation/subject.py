@@ -121,12 +121,12 @@ def find_subject(
         policy = Path(policy)
     if env is None:
         if not isinstance(policy, Path | str) or is_policy_file(policy):
-            raise InputError("a policy without a run acts in a task: name it (--task)")
+            raise InputError("a policy without a run acts in a task: name the task (--task)")
         if str(policy) in known_tasks() and not Path(policy).is_dir():
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
         run_config = folder.config()
-        # The environment is not necessarily the run's own.
+        # The policy is checked against the environment, which is not necessarily that of the run.
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder))
@@ -158,7 +158,7 @@ def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> 
 
 
 def _digest(source: Path) -> str:
-    """Return the digest of a policy's folder or file; a unique value for a function, which may use other files."""
+    """Return the digest of a policy's folder or file; a unique value for module:function, which may use other files."""
     file = source / "policy.safetensors" if source.is_dir() else source
     if not file.is_file():
         return str(time.time_ns())

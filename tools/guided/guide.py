@@ -64,7 +64,7 @@ class Guide(ABC):
 
     @abstractmethod
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
-        """Begin a control step; return the prediction that `finish` needs, or None.
+        """Begin a control step; return the request of the prediction that `finish` needs, or None.
 
         Args:
             env: Environment, for the callables of segments and templates.
@@ -153,7 +153,8 @@ class _FittedSegment:
             return np.zeros(self.num_outputs)
         dims = list(range(self.num_outputs)) if self.settings.action_dims is None else list(self.settings.action_dims)
         if "residual" in self.guidance:
-            # One gain for each group of outputs and all times: RMS displacement by a constant null-space action of ±1.
+            # One gain for each group of outputs, constant over time: an action of ±1 displaces them by as much as a
+            # constant null-space action of ±1 does on average (RMS).
             gains = np.zeros(self.num_outputs)
             sigma = deviation(self.reference)
             groups = (range(3), range(3, 6)) if self.num_outputs == 6 else (range(self.num_outputs),)

@@ -84,7 +84,7 @@ class OffPolicyConfig(LearnerConfig):
     greedy_episode_fraction: Fraction = 0.0  # fraction of the episodes, evenly spread, that do not explore
     privileged_critic: bool = False  # critics also observe hidden values and the exact wrench; the policy never does
     layer_norm: bool = False  # normalize hidden layers before their activation
-    selection_window: NonNegative = 0  # greedy successes counted before and after an actor to select it; 0: last actor
+    selection_window: NonNegative = 0  # greedy successes that count at most before and after an actor; 0: last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
@@ -246,7 +246,7 @@ PRESETS = {
         actor_ema=0.003,
     ),
     # The force cost is learned long before a success, so policies avoid contact. A large entropy coefficient and
-    # temporally extended actions restore it. These actions end once greedy episodes succeed: they push hardest.
+    # temporally extended actions restore contact. Extended actions push hardest and end once greedy episodes succeed.
     "sac_gridclamp": OffPolicyConfig(
         algorithm="sac",
         learning_rate=7e-4,

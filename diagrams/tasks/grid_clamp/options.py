@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 
 
-# Force of a collision [N]. Commands in the cuboid are at most 6 mm below the seat and 8 mm sideways. The force of an
-# impedance of 1500 N/m is then smaller.
+# Force of a collision [N]. It is larger than the force of an impedance of 1500 N/m, because the template's cuboid keeps
+# commands at most 6 mm below the seat and 8 mm sideways.
 COLLISION_FORCE = 35.0
 START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
 HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid

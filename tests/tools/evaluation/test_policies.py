@@ -178,7 +178,7 @@ def test_python_model_is_evaluated_in_a_task(env):
     assert as_model["mean_return"] == as_function["mean_return"]
     with pytest.raises(InputError, match="is no policy: give the folder of a run"):
         evaluate(3, "Bead", 2)
-    with pytest.raises(InputError, match=r"acts in a task: name it \(--task\)"):
+    with pytest.raises(InputError, match=r"acts in a task: name the task \(--task\)"):
         evaluate(model)
 
 

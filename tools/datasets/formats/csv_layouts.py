@@ -59,7 +59,7 @@ class _Column:
 
     @property
     def plain(self) -> str:
-        """Name in lower case, without brackets and their contents."""
+        """Name in lower case, without the first bracket and all that follows it."""
         return re.sub(r"[\[(].*", "", self.name).strip().lower()
 
 
@@ -126,8 +126,8 @@ def _read(
     position = _columns(file, columns, "xyz")
     if not position:
         raise InputError(
-            f"{file} has no columns x, y and z: name them so; outputs other than a pose need no import: "
-            "guiderail reads them as they are, with time in seconds"
+            f"{file} has no columns x, y and z: name them so; a table of outputs other than a pose needs "
+            "no import: guiderail reads it as it is, if its time is in seconds"
         )
     positions = np.column_stack([one.values for one in position])
     units = _units(file, position, UNITS, unit, "--unit")
@@ -190,7 +190,8 @@ def _units(
         unit = _unit_of_name(file, column.name, known) or given
         if given not in (None, unit):
             raise InputError(
-                f"{file} has {column.name}, and {option} says {given}: leave it out, and name each column's unit"
+                f"{file} has {column.name}, which contradicts {option} {given}: leave {option} out, and name each "
+                "column's unit"
             )
         units.append(unit)
     return units
@@ -250,9 +251,9 @@ def _time(
     steps = np.diff(ticks)
     if (steps < 0.0).any():
         at = int(np.argmax(steps < 0.0)) + 1
-        raise InputError(f"{file}: time, which is {clock.name}, goes back at sample {at}: sort or drop samples")
+        raise InputError(f"{file}: the time column {clock.name} decreases at sample {at}: sort or drop samples")
     if not (steps > 0.0).any():
-        raise InputError(f"{file}: time, which is {clock.name}, does not increase: a motion needs increasing time")
+        raise InputError(f"{file}: the time column {clock.name} does not increase: a motion needs increasing time")
     if unit is None:
         step = float(np.median(steps[steps > 0.0]))  # a recorder faster than the robot repeats time stamps
         fitting = [name for name, scale in _TIME_UNITS.items() if _PERIODS[0] <= step * scale < _PERIODS[1]]
