@@ -131,14 +131,10 @@ def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Itera
                 break
         for goal, threshold in goals:
             if best > threshold:
-                inside = template.distance(number, *starts[0])
-                why = (
-                    "no input leads there"
-                    if inside <= threshold
-                    else "no sampled pose within the active constraints is there, and no input leads there"
-                )
                 yield Finding(
-                    True, f"{state.name}: {goal} never fires: {why} (nearest {best:.3g}, threshold {threshold:.3g})"
+                    True,
+                    f"{state.name}: {goal} never fires: no sampled pose within the active constraints is there, and no "
+                    f"input leads there (nearest {best:.3g}, threshold {threshold:.3g})",
                 )
         if all(template.distance(number, X, frames) < lowest for X, frames in starts):
             yield Finding(False, f"{state.name}: every pose is below the threshold; the state is left immediately")

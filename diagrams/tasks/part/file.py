@@ -6,7 +6,7 @@ import hashlib
 import re
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -226,10 +226,8 @@ class Recommended(Options):
 class SearchNumbers(Options):
     """Parameters of the scripted search for a plug on the rim."""
 
-    lever_sign: int = Field(
+    lever_sign: Literal[-1, 1] = Field(
         -1,
-        ge=-1,
-        le=1,
         description="1 if a misaligned plug's center of pressure lies towards the socket's axis, -1 if away from it",
     )
     speed: Number = Field(2.0, gt=0, le=10, description="change of the action [1/s]")
