@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -56,6 +57,22 @@ class InsertionReset(ResetOptions):
 
     new_run: bool = Field(False, description="sample the hidden values of a run again")
     offset: GivenOffset | None = Field(None, description="(x, y) of the fixture or the workpiece [m]; default: sampled")
+
+
+@dataclass(frozen=True)
+class HoldTest:
+    """Push on an inserted workpiece that confirms a success on hardware, where the workpiece's pose is not measured.
+
+    Attributes:
+        displacement: Displacement of the command, (3,) [m].
+        max_motion: Largest measured motion in its direction [m].
+    """
+
+    displacement: tuple[float, float, float]
+    max_motion: float
+
+
+HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM
 
 
 class InsertionTask(Task):
@@ -131,6 +148,10 @@ class InsertionTask(Task):
         If it returns None, the default, the task cannot be learned on hardware.
         """
         return None
+
+    def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:
+        """Return the pushes that an inserted workpiece resists, for the pose X_TP (6,) of a success: a pull upwards."""
+        return [HoldTest((0.0, 0.0, HOLD_DISTANCE), MAX_HOLD_MOTION)]
 
     def impedance(self) -> Impedance | None:
         """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -17,6 +17,7 @@ from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.tasks.insertion import HoldTest
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.joint_status import Fault
@@ -25,9 +26,8 @@ from guiderail.tools.hardware.connection import Log
 from guiderail.tools.hardware.operator import OperatorKeys
 from guiderail.tools.hardware.preflight import PreflightChecks, is_near, pose_distance, retrace, slow_approach
 
-# Pull that confirms a success: commanded distance, largest measured distance [m], smallest measured force [N].
-PULL_DISTANCE, MAX_PULL_MOTION, MIN_PULL_FORCE = 3.0 * MM, 1.0 * MM, 1.5
-PULL_STEPS = 25  # control steps of the pull
+MIN_HOLD_FORCE = 1.5  # smallest measured force with which an inserted workpiece resists a push [N]
+HOLD_STEPS = 25  # control steps of a push
 ANGLE_WEIGHT = 0.1  # weight of an angle in the distance to the return path [m/rad]
 RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
 
@@ -51,8 +51,8 @@ class RobotEnv(DiagramEnv):
     reset, it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that
     was stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
 
-    A success by pose is confirmed by a pull on the workpiece; if it gives way, `termination` is "did_not_hold".
-    Episodes that end as "stopped" or "did_not_hold" must not be learned from.
+    A success by pose is confirmed by the task's `hold_tests`; if the workpiece gives way, `termination` is
+    "did_not_hold". Episodes that end as "stopped" or "did_not_hold" must not be learned from.
 
     If the way back does not release the workpiece, or the arm is too weak to release it, the arm comes to rest, and
     `free_workpiece` has the operator release it by hand.
@@ -75,6 +75,7 @@ class RobotEnv(DiagramEnv):
         confirm_resume: Callable[[str], None],
         free_workpiece: Callable[[str], None],
         log: Log,
+        hold_tests: Callable[[np.ndarray], Sequence[HoldTest]],
         snaps_in: bool = False,
         randomize_parts: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
     ):
@@ -92,6 +93,7 @@ class RobotEnv(DiagramEnv):
             free_workpiece: Function called with the reason why a workpiece has to be released by hand; returns when it
                 is released and the arm may move again, or raises.
             log: Function that shows a message.
+            hold_tests: Function that returns the pushes that confirm a success, for its measured pose (6,).
             snaps_in: True if the arm cannot pull out a workpiece after a success.
             randomize_parts: Function called at the start pose with a random number generator and the reset's options;
                 moves the parts as a reset in simulation does, and returns what was sampled.
@@ -103,7 +105,7 @@ class RobotEnv(DiagramEnv):
         self._randomize_parts = randomize_parts
         self._task_station, self._transfer_station, self._start, self._clock = station, transfer_station, start, clock
         self._keys, self._confirm_resume, self._free_workpiece, self._log = keys, confirm_resume, free_workpiece, log
-        self._snaps_in = snaps_in
+        self._hold_tests, self._snaps_in = hold_tests, snaps_in
         self._steps = round(task.control_period / station.period)
         self._station, self._is_stepping = transfer_station, False
         self.preflight = PreflightChecks(transfer_station, clock, start, self._steps)
@@ -199,7 +201,7 @@ class RobotEnv(DiagramEnv):
             return self._observation, 0.0, False, True, info
         if terminated or truncated:
             self._extend_return_path()
-            if info["is_success"] and not self._resists_pull():
+            if info["is_success"] and not self._holds():
                 info |= {"is_success": False, "termination": "did_not_hold"}
             if info["is_success"] and self._snaps_in:
                 self._must_be_freed = "the workpiece has snapped in"
@@ -262,20 +264,28 @@ class RobotEnv(DiagramEnv):
         )
         self._advance()
 
-    def _resists_pull(self) -> bool:
-        """Return True if the workpiece stays where it is when it is pulled up."""
+    def _holds(self) -> bool:
+        """Return True if the workpiece resists every push of the hold tests; the arm returns after each."""
         self._switch_to_transfer()
         before = self.pose
-        force = 0.0
         try:
-            for step in range(1, PULL_STEPS + 1):
-                self._command(before + [0.0, 0.0, PULL_DISTANCE * step / PULL_STEPS, 0.0, 0.0, 0.0])
-            force = float(-self._station.get_wrench_output_port().Eval(self._context)[2])
+            return all(self._resists(test, before) for test in self._hold_tests(before))
         except RobotStoppedError as stop:
             self.fault = stop.fault
             self._come_to_rest()
             return False
-        return bool(self.pose[2] - before[2] < MAX_PULL_MOTION and force > MIN_PULL_FORCE)
+
+    def _resists(self, test: HoldTest, before: np.ndarray) -> bool:
+        push = np.array([*test.displacement, 0.0, 0.0, 0.0])
+        direction = push[:3] / np.linalg.norm(push)
+        shares = np.arange(1, HOLD_STEPS + 1) / HOLD_STEPS
+        for share in shares:
+            self._command(before + share * push)
+        motion = float(direction @ (self.pose - before)[:3])
+        force = float(-direction @ self._station.get_wrench_output_port().Eval(self._context)[:3])
+        for share in shares[::-1]:
+            self._command(before + share * push)
+        return motion < test.max_motion and force > MIN_HOLD_FORCE
 
     def _return_to_start(self) -> None:
         """Move back along the return path, and slowly to the start.

@@ -95,6 +95,7 @@ def robot_session(
             confirm_resume=lambda reason: ask(reason, "Resume from where it is?"),
             free_workpiece=free_workpiece,
             log=log,
+            hold_tests=task.hold_tests,
             snaps_in=task.snaps_in,
             randomize_parts=randomize_parts,
         )

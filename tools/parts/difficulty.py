@@ -178,12 +178,12 @@ def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
     return float(min(file.force_limit, max(MIN_FORCE, math.ceil(FORCE_RATIO * peak_force))))
 
 
-def turn_of(clearance: float | None, radius: float) -> float:
+def turn_of(clearance: float, radius: float) -> float:
     """Return the largest turn of the socket that the clearance [m] allows, at most `MAX_TURN` [degrees].
 
-    The clearance is None without walls, and the radius is the largest distance of the plug from the axis [m].
+    The clearance is 0 without walls, and the radius is the largest distance of the plug from the axis [m].
     """
-    if not clearance or clearance < 0.0:
+    if clearance <= 0.0:
         return 0.0
     return round(min(MAX_TURN, math.degrees(clearance / max(radius, clearance))), 2)
 
@@ -196,9 +196,8 @@ def calibrate(
     The task folder already contains `file`. The radius is the largest distance of the plug from the axis [m]. Each
     policy runs at most `episodes` episodes with each setting. A sentence on the result is logged.
     """
-    clearance = file.measured.get("clearance_mm")
     force_limit = force_limit_of(file, float(file.measured["force"]))
-    turn = file.motion.search_turn or turn_of(None if clearance is None else clearance * MM, radius)
+    turn = file.motion.search_turn or turn_of(file.clearance, radius)
     try:
         read_task_file(folder).demonstrations.reference(folder)  # fits the written file; the child inherits the cache
         setting, score, is_hard = run_isolated(

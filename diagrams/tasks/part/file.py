@@ -260,7 +260,9 @@ class PartTaskFile(Options):
     recommended: Recommended = Recommended.model_validate({})
     search: SearchNumbers = SearchNumbers.model_validate({})
     hard: dict[str, Any] = Field(HARD, description="options of the environment with difficulty=hard")
-    measured: dict[str, Any] = Field({}, description="measurements of create-task, for information only")
+    measured: dict[str, Any] = Field(
+        {}, description="measurements of create-task, for information; only the clearance is used, in hold tests"
+    )
 
     @field_validator("time_step")
     @classmethod
@@ -287,6 +289,12 @@ class PartTaskFile(Options):
     def is_convex(self) -> bool:
         """True if both parts have convex pieces, and `scenario` adds no other objects."""
         return bool(self.plug.convex and self.socket.convex) and not self.scenario
+
+    @property
+    def clearance(self) -> float:
+        """Measured clearance between the parts [m]; 0 if it was not measured."""
+        value = self.measured.get("clearance_mm")
+        return MM * float(value) if isinstance(value, int | float) and 0.0 < value < np.inf else 0.0
 
     @cached_property
     def turn(self) -> float:

@@ -22,7 +22,13 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
-from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
+from guiderail.diagrams.tasks.insertion import (
+    HOLD_DISTANCE,
+    MAX_HOLD_MOTION,
+    DemonstratedInsertion,
+    HoldTest,
+    sides_of_the_rim,
+)
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     HISTORY_VARIANCE,
@@ -121,6 +127,7 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
 IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
+MIN_PUSH = 1.5 * MM  # smallest distance beyond the play by which a push displaces the command of a seated plug [m]
 FOLLOWING = 3.0  # action rate per 2 mm of distance from the command to a plug in the socket [1/s]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
@@ -223,6 +230,7 @@ class PartInsertion(DemonstratedInsertion):
     Options = PartOptions
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
+    simulated_rewards = ("aligned",)
     rewards = REWARDS
     observations = OBSERVATIONS
     folder: ClassVar[Path]
@@ -256,6 +264,29 @@ class PartInsertion(DemonstratedInsertion):
             both = (-limit, -limit, *bounds.lower[2:]), (limit, limit, *bounds.upper[2:])
             bounds = Bounds(lower=both[0], upper=both[1], phases=None)
         return bounds.constraints(self.reference().num_steps)
+
+    def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return D and y0 that estimate height and turn; the lateral offset is not estimated but checked by pushes."""
+        D = np.zeros((POSE_SIZE, POSE_SIZE))
+        D[2, 2] = D[5, 3] = 1.0
+        return D, np.zeros(POSE_SIZE)
+
+    def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:
+        """Return pushes along ±x and ±y, as far as the bounds allow, which the walls of the socket stop.
+
+        A plug that was turned is locked and is pulled upwards instead. A direction is omitted if the bounds allow less
+        than the play, twice the clearance, and `MIN_PUSH`.
+        """
+        if self.file.turn:
+            return super().hold_tests(pose)
+        play, constraints = min(2.0 * self.file.clearance, HOLD_DISTANCE), self.constraints()
+        tests = []
+        for direction in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+            target = pose + (play + HOLD_DISTANCE) * np.array([*direction, 0.0, 0.0, 0.0, 0.0])
+            x, y = (constraints.nearest(target, self.num_steps) - pose)[:2].tolist()
+            if direction[0] * x + direction[1] * y >= play + MIN_PUSH:
+                tests.append(HoldTest((x, y, 0.0), play + MAX_HOLD_MOTION))
+        return tests
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:

@@ -12,6 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
+from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE
 from guiderail.diagrams.tasks.part.file import Bounds, read_task_file
 from guiderail.diagrams.tasks.part.task import load_task_folder
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
@@ -225,3 +226,45 @@ def test_scene_has_the_box_of_each_phase(tmp_path):
         str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}
     ).make_task()
     assert task.scene().constraint == ()
+
+
+def test_success_on_hardware_is_estimated_from_height_and_turn(tmp_path):
+    task = EnvConfig.resolve(str(write(tmp_path / "held")), {"reward": "shaped"}).make_task()
+    D, y0 = task.observable_success()
+    np.testing.assert_array_equal(D @ [1.0, 2.0, 3.0, 4.0, 5.0, 6.0] + y0, [0.0, 0.0, 3.0, 0.0, 0.0, 4.0])
+    assert "aligned" in task.simulated_rewards
+
+
+@pytest.mark.parametrize(
+    ("x", "clearance", "pushes"),
+    [
+        (0.0, 0.1, [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)]),
+        (1.0, 0.1, [(-3.0, 0.0), (0.0, 2.0), (0.0, -2.0)]),  # +x is 1 mm from the bound
+        (1.0, 0.3, [(-3.0, 0.0)]),
+        (0.0, 50.0, []),
+        (0.0, "unknown", [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)]),
+    ],
+)
+def test_pushes_that_confirm_a_success_stay_within_the_bounds(x, clearance, pushes, tmp_path):
+    folder = write(
+        tmp_path / "pushed",
+        bounds={"lower": [-0.002, -0.002, *4 * [None]], "upper": [0.002, 0.002, *4 * [None]]},
+        measured={"clearance_mm": clearance},
+    )
+    task = EnvConfig.resolve(str(folder), {}).make_task()
+    pose = np.array([1e-3 * x, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tests = task.hold_tests(pose)
+    assert [tuple(1e3 * along for along in test.displacement[:2]) for test in tests] == [
+        pytest.approx(push, abs=1e-6) for push in pushes
+    ]
+    for test in tests:
+        assert test.displacement[2] == 0.0
+        assert np.linalg.norm(test.displacement) > test.max_motion  # a plug beside the socket moves farther
+        assert task.constraints().violation(pose + [*test.displacement, 0.0, 0.0, 0.0], task.num_steps) <= 1e-9
+
+
+def test_turned_plug_is_pulled(tmp_path):
+    task = EnvConfig.resolve(
+        str(write(tmp_path / "turned", motion={"travel": 0.02, "rim": 0.01, "turn": 30.0})), {}
+    ).make_task()
+    assert [test.displacement for test in task.hold_tests(np.zeros(6))] == [(0.0, 0.0, HOLD_DISTANCE)]

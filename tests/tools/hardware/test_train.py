@@ -14,6 +14,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE, MAX_HOLD_MOTION, HoldTest
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
@@ -56,6 +57,7 @@ def make(patch, start, **options):
         confirm_resume=requests.append,
         free_workpiece=requests.append,
         log=lambda text: None,
+        hold_tests=declared.hold_tests,
     )
     env.clock, env.keys, env.asked, env.begin = clock, keys, requests, begin
     return env
@@ -405,7 +407,7 @@ def test_reset_raises_if_the_start_is_not_reached_after_the_release(env, monkeyp
 @pytest.mark.parametrize("snaps_in", [False, True])
 def test_workpiece_that_snapped_in_is_released_by_hand(env, monkeypatch, snaps_in):
     monkeypatch.setattr(env, "_snaps_in", snaps_in)
-    monkeypatch.setattr(env, "_resists_pull", lambda: True)
+    monkeypatch.setattr(env, "_holds", lambda: True)
     env.reset()
     with monkeypatch.context() as patch:
         step = DiagramEnv.step
@@ -429,10 +431,22 @@ def test_reset_completes_after_a_stop(env):
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
-def test_pull_tells_a_locked_workpiece_from_a_loose_one(env, monkeypatch):
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+def test_push_tells_an_inserted_workpiece_from_a_loose_one(env, monkeypatch, direction):
+    test = HoldTest(tuple(HOLD_DISTANCE * np.array(direction)), MAX_HOLD_MOTION)
     for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
+        monkeypatch.setattr(one, "_hold_tests", lambda pose: [test])
         one._retry_until_ok(one._take_control)
-        assert one._resists_pull() == holds
+        before = one.pose
+        assert one._holds() == holds
+        np.testing.assert_allclose(one.pose[:3], before[:3], atol=1.5e-3)  # it returns
+
+
+def test_success_needs_every_push_to_be_resisted(env, monkeypatch):
+    results = iter([True, False])
+    monkeypatch.setattr(env, "_hold_tests", lambda pose: [HoldTest((0.0, 0.0, 1e-3), 1e-3)] * 2)
+    monkeypatch.setattr(env, "_resists", lambda test, before: next(results))
+    assert not env._holds()
 
 
 @pytest.mark.parametrize(

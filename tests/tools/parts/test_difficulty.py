@@ -91,7 +91,7 @@ def test_settings_become_harder_and_keep_the_socket_in_reach():
 def test_force_limit_and_turn_follow_from_the_part():
     file = SimpleNamespace(force_limit=35.0)
     assert [force_limit_of(file, peak) for peak in (1.0, 6.1, 30.0)] == [10.0, 16.0, 35.0]
-    assert turn_of(None, 5e-3) == 0.0
+    assert turn_of(0.0, 5e-3) == 0.0
     assert turn_of(0.1e-3, 10e-3) == pytest.approx(0.57)
     assert turn_of(1e-3, 5e-3) == MAX_TURN
 
@@ -121,7 +121,7 @@ def test_episode_ends_when_the_plug_stays_on_the_rim():
 def test_failed_calibration_keeps_the_default(monkeypatch, tmp_path):
     sentences = []
     motion = MotionNumbers(travel=0.010, rim=0.007)
-    file = SimpleNamespace(measured={"force": 5.0, "clearance_mm": None}, force_limit=35.0, motion=motion)
+    file = SimpleNamespace(measured={"force": 5.0}, clearance=0.0, force_limit=35.0, motion=motion)
     assert calibrate(tmp_path / "missing", file, 1e-2, 2, sentences.append) is file
     assert sentences[0].startswith("difficulty=hard is not calibrated: there is no task folder")
 
