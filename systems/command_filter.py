@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.control.command_filters import CommandLaw
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import after_start, input_getter, output_getter
@@ -14,7 +15,8 @@ class CommandFilter(LeafSystem):
         safe_pose = law(last safe_pose, desired_pose)
 
     See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`. The last of these laws uses the last two
-    commands. At initialization, the last command is the measured pose.
+    commands. At initialization, the last command is the measured pose. If the law returns a command that is not finite,
+    for example because the desired pose is not finite, the last command is repeated.
 
     .. pydrake_system::
 
@@ -27,7 +29,7 @@ class CommandFilter(LeafSystem):
         - intervention
 
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1
-    if the law had to change the command.
+    if the law had to change the command, or the last command is repeated.
 
     Args:
         law: Law of the filter.
@@ -67,4 +69,6 @@ class CommandFilter(LeafSystem):
         """Return the next state, which begins with the safe command, and the intervention flag."""
         last = context.get_discrete_state(self._last).value()
         state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
+        if not is_finite(state):  # NaN would remain in the state
+            state, is_changed = last, True
         return np.append(state, float(is_changed))

@@ -14,6 +14,8 @@ BOX = LinearConstraints.box([-1.0, -np.inf], [1.0, np.inf])
 WALL = ([[0.5, 2.0]], [[9.0, 3.0]])  # above y = 2 where x > 0.5
 KEEP_OUT = KeepOut(*WALL, BOX, margin=0.1)
 LAWS = {"barrier": BarrierFilter(KEEP_OUT, 0.3), "tangent": TangentSpaceFilter(KEEP_OUT, 0.2)}
+UNBOUNDED = LinearConstraints.box([-np.inf, -np.inf], [np.inf, np.inf])
+FREE = TangentSpaceFilter(KeepOut(np.empty((0, 2)), np.empty((0, 2)), UNBOUNDED, margin=0.0), 0.2)
 
 
 def margin(point):
@@ -103,6 +105,26 @@ def test_system_starts_at_the_measured_pose_and_keeps_the_last_command():
     assert system.get_intervention_output_port().Eval(context)[0] == 0.0
     simulator.Initialize()
     assert system.get_safe_pose_output_port().Eval(context)[0] == pytest.approx(0.3 * 0.9)
+
+
+@pytest.mark.parametrize("law", [*LAWS.values(), FREE], ids=[*LAWS, "free"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_last_command_repeats_when_desired_one_is_not_finite(law, bad):
+    system = CommandFilter(law, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    desired = system.get_desired_pose_input_port().FixValue(context, [0.0, 0.1])
+    system.get_pose_input_port().FixValue(context, [0.0, 0.0])
+    simulator.Initialize()
+    simulator.AdvanceTo(1.5 * PERIOD)
+    last = context.get_discrete_state_vector().value().copy()
+    desired.GetMutableData().set_value([0.0, bad])
+    simulator.AdvanceTo(2.5 * PERIOD)
+    np.testing.assert_array_equal(system.get_safe_pose_output_port().Eval(context), last)
+    assert system.get_intervention_output_port().Eval(context)[0] == 1.0
+    desired.GetMutableData().set_value([0.0, 0.2])
+    simulator.AdvanceTo(5.5 * PERIOD)
+    np.testing.assert_allclose(system.get_safe_pose_output_port().Eval(context), [0.0, 0.2], atol=1e-3)
 
 
 def test_system_raises_when_the_period_is_not_positive():
