@@ -52,13 +52,14 @@ class EnergyTank(LeafSystem):
         - energy
 
     ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
-    desired pose that is not finite is passed on and takes no energy. ``max_wrench`` and ``admitted_wrench`` are (8,),
+    desired pose that is not finite is passed on and takes no energy. While the measured pose is not finite,
+    reference and content are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,),
     [fx fy fz tx ty tz], norm of the force and norm of the torque [N, Nm]. ``energy`` is (1,), the content [J].
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
         damping: Smallest damping (6,) of each coordinate [N s/m, Nm s/rad], not negative.
-        bound: Bound of the wrench.
+        bound: Bound of the wrench, with finite limits per axis.
         capacity: Initial and largest content [J], positive.
         period: Sampling period [s], positive.
 
@@ -73,6 +74,8 @@ class EnergyTank(LeafSystem):
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
         if not 0.0 < capacity < np.inf:
             raise InputError(f"an energy tank's capacity must be positive, not {capacity} J")
+        if not is_finite(np.asarray(bound.axes)):
+            raise InputError(f"an energy tank needs finite limits of the wrench per axis, not {bound.axes}")
         self._bound, self._capacity, self._period = bound, capacity, period
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
@@ -115,7 +118,9 @@ class EnergyTank(LeafSystem):
             desired = reference
         requested = self._requested_bound(context).in_pose_order.axes
         limits, K = np.minimum(last_limits, requested), self._stiffness
-        moved = pose_difference(pose, last_pose)
+        if not is_finite(pose):  # NaN would fill the tank and remain in its state
+            return _Admitted(reference, limits, float(content[0]))
+        moved = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
         dissipated = float(self._damping @ moved**2) / self._period
         energy = min(self._capacity, float(content[0]) + dissipated)
         error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)

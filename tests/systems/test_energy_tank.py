@@ -99,11 +99,25 @@ def test_pose_that_is_not_finite_costs_nothing():
     assert content == before
 
 
+def test_content_is_kept_when_the_measured_pose_is_not_finite():
+    tank, desired = Tank(), np.r_[0.05, np.zeros(5)]
+    reference, limit, before = tank.step(desired, np.zeros(6), BOUND.numbers)
+    assert before < 0.1
+    held, lowered, content = tank.step(-desired, np.full(6, np.nan), 0.5 * BOUND.numbers)
+    np.testing.assert_array_equal(held, reference)
+    np.testing.assert_array_equal(lowered[:6], 0.5 * limit[:6])
+    assert content == before
+    reference, limit, content = tank.step(held, np.r_[0.01, np.zeros(5)], 0.5 * BOUND.numbers)
+    assert np.isfinite([*reference, *limit]).all()
+    assert content == pytest.approx(before)  # the motion without a measurement is not counted as dissipation
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
         ({"capacity": 0.0}, "capacity must be positive"),
+        ({"bound": WrenchBound(np.r_[np.inf, np.ones(5)], 20.0, 5.2)}, "finite limits"),
         ({"period": 0.0}, "period must be positive"),
     ],
 )
