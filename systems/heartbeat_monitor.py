@@ -33,7 +33,8 @@ class HeartbeatMonitor(LeafSystem):
 
     Args:
         period: Sampling period [s], positive.
-        timeout: Largest accepted age of a heartbeat [s], positive.
+        timeout: Largest accepted age of a heartbeat [s], positive and less than `FORGET_TIME`. With a larger one,
+            the exit of one monitor would never be detected while another one is alive.
 
     Raises:
         InputError: If an argument is out of range.
@@ -41,8 +42,8 @@ class HeartbeatMonitor(LeafSystem):
 
     def __init__(self, *, period: float, timeout: float):
         super().__init__()
-        if not 0.0 < timeout < np.inf:
-            raise InputError(f"the heartbeat timeout must be positive, not {timeout} s")
+        if not 0.0 < timeout < FORGET_TIME:
+            raise InputError(f"the heartbeat timeout must be positive and less than {FORGET_TIME} s, not {timeout} s")
         self._period, self._timeout = period, timeout
         self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)

@@ -81,7 +81,7 @@ def built():
         systems.CenterOfPressure(0.5),
         systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
-        systems.HeartbeatMonitor(period=PERIOD, timeout=1.0),
+        systems.HeartbeatMonitor(period=PERIOD, timeout=0.5),
         systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),
         systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
         systems.PoseRateLimiter(period=PERIOD),

@@ -152,7 +152,9 @@ def test_status_fault_takes_precedence():
     assert rig.step(Heartbeat(1, True)) == Fault.STALE
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"timeout": 0.0}, {"timeout": np.nan}, {"timeout": np.inf}])
+@pytest.mark.parametrize(
+    "wrong", [{"period": 0.0}, {"timeout": 0.0}, {"timeout": np.nan}, {"timeout": np.inf}, {"timeout": FORGET_TIME}]
+)
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         HeartbeatMonitor(**{"period": PERIOD, "timeout": TIMEOUT} | wrong)
