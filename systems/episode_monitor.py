@@ -38,7 +38,10 @@ class TerminationTerm:
         progress: Optional function of the same signals. Without this function, the steps must be consecutive. With it,
             they need not be consecutive, but their count is reset when the value of the function exceeds its value at
             the previous reset by more than `min_progress`.
-        min_progress: Increase of the value of `progress` up to which the count is not reset.
+        min_progress: Increase of the value of `progress` up to which the count is not reset, not negative, finite.
+
+    Raises:
+        InputError: If the termination is unknown, or `steps` or `min_progress` is out of range.
     """
 
     termination: str
@@ -51,8 +54,10 @@ class TerminationTerm:
     def __post_init__(self) -> None:
         if self.termination not in TERMINATIONS[1:]:
             raise InputError(f"an episode can't end as '{self.termination}', only as one of {TERMINATIONS[1:]}")
-        if self.steps < 1:
+        if not 1 <= self.steps < np.inf:
             raise InputError(f"a condition must hold for at least one control step, not {self.steps}")
+        if not 0.0 <= self.min_progress < np.inf:
+            raise InputError(f"the smallest progress must be finite and not negative, not {self.min_progress}")
 
 
 class EpisodeMonitor(LeafSystem):

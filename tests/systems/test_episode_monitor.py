@@ -87,6 +87,10 @@ def test_first_term_takes_precedence():
         lambda: TerminationTerm("lost", {"u": 1}, lambda u: True),
         lambda: TerminationTerm("", {"u": 1}, lambda u: True),
         lambda: above(1, steps=0),
+        lambda: above(1, steps=float("nan")),
+        lambda: above(1, steps=float("inf")),
+        lambda: above(1, min_progress=-0.1),
+        lambda: above(1, min_progress=float("nan")),
     ],
 )
 def test_constructor_refuses_invalid_arguments(make):
