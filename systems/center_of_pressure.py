@@ -1,5 +1,6 @@
 """Center of pressure of a contact, computed from its wrench."""
 
+import numpy as np
 from pydrake.systems.framework import LeafSystem
 
 from guiderail.models.common.errors import InputError
@@ -27,16 +28,16 @@ class CenterOfPressure(LeafSystem):
     ``wrench`` is (6,), force and torque about the tool center [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
 
     Args:
-        min_force: Force along z below which there is no contact [N], positive.
+        min_force: Force along z below which there is no contact [N], positive and finite.
 
     Raises:
-        InputError: If `min_force` is not positive.
+        InputError: If `min_force` is out of range.
     """
 
     def __init__(self, min_force: float):
         super().__init__()
-        if not min_force > 0.0:
-            raise InputError(f"a center of pressure needs a positive minimum force, not {min_force} N")
+        if not 0.0 < min_force < np.inf:
+            raise InputError(f"a center of pressure needs a positive, finite minimum force, not {min_force} N")
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         self._center_of_pressure_port = declare.output(
             self,

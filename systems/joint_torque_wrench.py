@@ -40,7 +40,7 @@ class JointTorqueWrench(LeafSystem):
         tool_center: Frame P.
         period: Sampling period [s], positive.
         time_constant: Time constant t_f of the filter [s]; 0 disables it.
-        damping: Damping of the pseudoinverse, not negative.
+        damping: Damping of the pseudoinverse, not negative, finite.
 
     Raises:
         InputError: If an argument is out of range.
@@ -57,8 +57,8 @@ class JointTorqueWrench(LeafSystem):
         damping: float = 1e-4,
     ):
         super().__init__()
-        if not 0.0 <= time_constant < np.inf or not damping >= 0.0:
-            raise InputError("a wrench estimate's time constant and damping must not be negative")
+        if not 0.0 <= time_constant < np.inf or not 0.0 <= damping < np.inf:
+            raise InputError("a wrench estimate's time constant and damping must be finite and not negative")
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_center = plant, target, tool_center
         self._damping = damping * np.eye(6)

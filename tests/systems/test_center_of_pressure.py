@@ -24,7 +24,7 @@ def test_center_of_pressure_is_zero_when_the_force_is_small(force):
     np.testing.assert_array_equal(compute([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
 
 
-@pytest.mark.parametrize("min_force", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("min_force", [0.0, -1.0, np.nan, np.inf])
 def test_constructor_refuses_a_minimum_force_out_of_range(min_force):
     with pytest.raises(InputError):
         CenterOfPressure(min_force)

@@ -59,7 +59,7 @@ def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
     np.testing.assert_allclose(output.Eval(context), first * (2.0 - np.exp(-0.5)), atol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}])
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}, {"damping": np.inf}])
 def test_constructor_refuses_arguments_out_of_range(arm, wrong):
     with pytest.raises(InputError):
         estimate(arm, np.zeros(6), **wrong)
