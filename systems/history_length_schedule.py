@@ -33,7 +33,7 @@ class HistoryLengthSchedule(LeafSystem):
         lengths: History lengths in any order, each at least 1, because without a history a command would not start
             where the previous one ended.
         period: Control period [s], positive.
-        contact_threshold: Force above which contact begins [N].
+        contact_threshold: Force above which contact begins [N], finite.
         release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.
         dwell_steps: Control steps in free space before the next longer length, at least 1.
         wrench_size: Size W of the wrench, at least 1.
@@ -53,12 +53,12 @@ class HistoryLengthSchedule(LeafSystem):
         wrench_size: int = 6,
     ):
         super().__init__()
-        if not len(lengths) or min(lengths) < 1:
+        if not len(lengths) or not all(length >= 1 and float(length).is_integer() for length in lengths):
             raise InputError(f"history lengths are whole numbers from 1, at least one of them, not {list(lengths)}")
-        if not 0.0 <= release_threshold <= contact_threshold:
+        if not 0.0 <= release_threshold <= contact_threshold < np.inf:
             raise InputError(
-                f"contact begins at {contact_threshold} N and must end at a force from 0 to this one, "
-                f"not at {release_threshold} N"
+                f"contact must begin at a finite force and end at a force from 0 to that, not at {contact_threshold} N "
+                f"and {release_threshold} N"
             )
         if dwell_steps < 1 or wrench_size < 1:
             raise InputError(f"dwell steps and wrench size must be at least 1, not {dwell_steps} and {wrench_size}")

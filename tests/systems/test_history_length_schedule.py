@@ -76,6 +76,9 @@ def test_initialization_restores_the_longest_length():
         {"wrench_size": 0},
         {"lengths": []},
         {"lengths": [0, 3]},
+        {"lengths": [1, 2.5]},
+        {"lengths": [1, np.nan]},
+        {"contact_threshold": np.inf},
     ],
 )
 def test_constructor_refuses_arguments_out_of_range(arguments):
