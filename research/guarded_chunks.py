@@ -53,9 +53,10 @@ def check_commands(
         "bound_excess": float(beyond.max()),
         "speed_ratio": float(fast.max()),
         "jerk_ratio": float(jerky.max()),
-        "bound_violations": int((beyond > 0.0).sum()),
-        "speed_violations": int((fast > 1.0 + ROUNDING).sum()),
-        "jerk_violations": int((jerky > 1.0 + ROUNDING).sum()),
+        # Negated, so that NaN counts as a violation.
+        "bound_violations": int((~(beyond <= 0.0)).sum()),
+        "speed_violations": int((~(fast <= 1.0 + ROUNDING)).sum()),
+        "jerk_violations": int((~(jerky <= 1.0 + ROUNDING)).sum()),
     }
 
 

@@ -29,6 +29,11 @@ def test_check_counts_commands_beyond_each_limit_only():
     assert check(cubic)["bound_excess"] == pytest.approx(0.25)
 
 
+def test_check_counts_nan_as_a_violation_of_each_limit():
+    result = check(np.full((6, 2), np.nan))
+    assert [result[f"{name}_violations"] for name in ("bound", "speed", "jerk")] == [6, 5, 3]
+
+
 def test_comparison_counts_paired_outcomes_and_stores_blocks(tmp_path, monkeypatch):
     evaluated = []
 
