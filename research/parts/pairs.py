@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,7 +53,7 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
         unit: Unit of all files.
 
     Raises:
-        InputError: If there is none.
+        InputError: If there are no pairs, or two pairs have the same name, by which their results are stored.
     """
     files = {path.name: path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS}
     names = {
@@ -79,4 +80,8 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
             pairs.append(Pair(plug.parent.name, plug, socket, unit))
     if not pairs:
         raise InputError(f"{folder} has no pairs: name a folder with plug.stl and socket.stl in a subfolder of each")
-    return sorted(pairs, key=lambda pair: pair.name)
+    pairs = sorted(pairs, key=lambda pair: pair.name)
+    for first, second in itertools.pairwise(pairs):
+        if first.name == second.name:
+            raise InputError(f"two pairs are named {first.name!r} ({first.plug}, {second.plug}): rename a subfolder")
+    return pairs

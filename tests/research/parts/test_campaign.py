@@ -26,6 +26,10 @@ def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_p
     assert [pair.name for pair in find_pairs(tmp_path)] == ["a", "b", "industreal_gear_small"]
     with pytest.raises(InputError, match="has no pairs"):
         find_pairs(tmp_path / "c")
+    for name in ("b/second_plug.stl", "b/second_socket.stl"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match="two pairs are named 'b'"):
+        find_pairs(tmp_path)
 
 
 def test_finished_steps_are_not_repeated(tmp_path):
