@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.tools.files import write_atomically
 from guiderail.tools.guided.guide import Guide
 from research.outside_envs.table import print_table
 from research.outside_envs.task import OutsideTask
@@ -245,7 +246,7 @@ def main() -> None:
             result["held_out"] = {"learned": evaluate(env, policy, args.held_out)}
             print(label, seed, result["held_out"]["learned"], flush=True)
         result["cpu_s"] = time.process_time() - begin
-        path.write_text(json.dumps(result, indent=1))
+        write_atomically(path, json.dumps(result, indent=1).encode())  # a file that exists counts as finished
 
 
 if __name__ == "__main__":

@@ -2,11 +2,15 @@
 
 import csv
 import json
+import os
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 
+from guiderail.models.common.errors import InputError
+from research.outside_envs import learn
 from research.outside_envs.table import print_table, read_rows
 from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
@@ -109,3 +113,17 @@ def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
     print_table(tmp_path)
     assert "| peg | kgrl | 1 | 2 | 90% of 10 (60% to 98%) | 100%, 80% | 3, 2.0 | 30 |" in capsys.readouterr().out
     assert len(list(csv.DictReader((tmp_path / "outside_envs.csv").open()))) == 2
+
+
+def test_interrupted_write_leaves_no_result(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sys.argv", ["learn", "peg", "--method", "baselines", "--out", str(tmp_path)])
+    monkeypatch.setattr(learn, "import_module", lambda name: SimpleNamespace(TASK=TASK))
+    monkeypatch.setattr(learn, "evaluate_baselines", lambda *_: {"zero": {}})
+    monkeypatch.setattr("torch.set_num_threads", lambda number: None)
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(InputError, match="cannot be written"):
+        learn.main()
+    assert not list(tmp_path.iterdir())
