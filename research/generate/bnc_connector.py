@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from guiderail.models.objects.bnc_connector import demonstrations as bnc_connect
 from guiderail.models.objects.bnc_connector import search_demonstrations as bnc_search
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES, NUM_STEPS
 from guiderail.systems.recorder import Recording
+from guiderail.tools.files import write_atomically
 
 TIMES = CONTROL_PERIOD * np.arange(NUM_STEPS + 1)
 TIME_STEP = CONTROL_PERIOD / 4  # time step of the shipped demonstrations [s]
@@ -93,4 +95,6 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
 def main(folder: Path | None = None, session: Session = INSERT_SESSION) -> None:
     """Write the file of a session into a folder; that of the package by default."""
     arrays: dict[str, Any] = record(session, range(100))
-    np.savez_compressed((folder or session.path.parent) / session.path.name, **arrays)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomically((folder or session.path.parent) / session.path.name, buffer.getvalue())

@@ -1,8 +1,14 @@
-import numpy as np
+import os
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import demonstrations
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
+from research.generate import bnc_connector as generator
 from research.generate.bnc_connector import TIMES as TIMES_RECORDED
 from research.generate.bnc_connector import record_one
 
@@ -69,3 +75,17 @@ def test_recording_again_reproduces_the_file():
     np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
     np.testing.assert_allclose(recording["pose"][:60], everything["measured"][0, :60], atol=1e-6)
     np.testing.assert_allclose(recording["pose"][-1, :3], everything["measured"][0, -1, :3], atol=0.1 * MM)
+
+
+def test_shipped_file_is_kept_when_writing_is_interrupted(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    session = replace(generator.INSERT_SESSION, path=tmp_path / "session.npz")
+    monkeypatch.setattr(generator, "record", lambda *_: {"times": np.arange(3.0)})
+    generator.main(session=session)
+    monkeypatch.setattr(generator, "record", lambda *_: {"times": np.arange(9.0)})
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(InputError, match="cannot be written"):
+        generator.main(session=session)
+    np.testing.assert_array_equal(np.load(session.path)["times"], np.arange(3.0))
