@@ -122,6 +122,9 @@ def _transport() -> list[Row]:
     """Measure the interval between received messages and the round trip over LCM.
 
     A second process sends at the rate of a robot; this process answers immediately.
+
+    Raises:
+        EOFError: If the second process ends without a result.
     """
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     os.environ.setdefault("DRAKE_ALLOW_NETWORK", "lcm")
@@ -137,6 +140,7 @@ def _transport() -> list[Row]:
 
     lcm.Subscribe("STATUS", answer)
     sender.start()
+    there.close()  # the second process has a copy; while this one is open, the pipe would not end with that process
     with _realtime_priority():
         while not here.poll():
             lcm.HandleSubscriptions(10)

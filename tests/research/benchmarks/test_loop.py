@@ -1,6 +1,9 @@
 """The benchmark of the control loop."""
 
+import operator
+
 import numpy as np
+import pytest
 
 from research.benchmarks import loop
 
@@ -38,3 +41,9 @@ def test_late_answer_belongs_to_its_own_message():
     assert answers.is_answered()
     answers.send(3.0)
     assert answers.seconds() == [1.5, 0.75, float("inf")]
+
+
+def test_transport_raises_when_the_sender_ends_without_a_result(monkeypatch):
+    monkeypatch.setattr(loop, "_send_statuses", operator.sub)  # raises a TypeError for a pipe and a URL
+    with pytest.raises(EOFError):
+        loop._transport()
