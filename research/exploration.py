@@ -102,7 +102,7 @@ def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: i
             weights = rng.normal(size=(size, FEATURES))
         count += 1
         # Normalize by the noise's standard deviation in this state, because gSDE's own scale depends on the network.
-        return np.clip(RMS * weights @ features / np.linalg.norm(features), -1.0, 1.0)
+        return np.clip(RMS * weights @ features / max(float(np.linalg.norm(features)), 1e-12), -1.0, 1.0)
 
     return act
 

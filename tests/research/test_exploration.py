@@ -63,6 +63,11 @@ def test_state_dependent_noise_is_resampled_after_the_interval():
     assert not np.allclose(first, resampled)
 
 
+def test_state_dependent_noise_is_zero_when_the_observation_is():
+    act = state_dependent(np.random.default_rng(0), STEPS, SIZE, interval=3)
+    np.testing.assert_array_equal(act(np.zeros(5)), np.zeros(SIZE))
+
+
 def test_open_loop_refuses_zero_steps():
     with pytest.raises(InputError):
         open_loop(uniform, np.random.default_rng(0), 0, 2)
