@@ -1,8 +1,8 @@
 """Certificates of shipped skills, with the worst command that an adversary found.
 
 Each skill is certified, the certificate is checked by a checker that shares no code with the primitive, and the skill
-is attacked. The ratio of a bound to the worst command found shows how tight it is. The table has the largest ratio over
-all steps, separately for steps at which a constraint can be active.
+is attacked. The ratio of a bound to the worst command found shows how tight the bound is. The table
+has the largest ratio over all steps, separately for steps at which a constraint can be active.
 
 Run it with `python -m research.certificates --out studies`.
 """

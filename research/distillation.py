@@ -134,7 +134,7 @@ def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> 
         episodes: Number of episodes of each variant.
 
     Raises:
-        InputError: If there is no episode, or a folder has no such policy.
+        InputError: If `episodes` is below 1, or a folder does not contain a suitable policy.
     """
     if episodes < 1:
         raise InputError(f"give at least one episode, not {episodes}")

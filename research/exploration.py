@@ -35,7 +35,7 @@ def ornstein_uhlenbeck(rng: np.random.Generator, steps: int, size: int, correlat
     Args:
         rng: Random generator.
         steps: Number of control steps.
-        size: Number of actions.
+        size: Number of entries of an action.
         correlation: Correlation time in control steps, 1/(θ dt).
     """
     decay = np.exp(-1.0 / correlation)
@@ -48,7 +48,7 @@ def low_pass(rng: np.random.Generator, steps: int, size: int, cutoff: float = 1.
     Args:
         rng: Random generator.
         steps: Number of control steps.
-        size: Number of actions.
+        size: Number of entries of an action.
         cutoff: Cutoff frequency [Hz].
         period: Control period [s].
     """
@@ -68,7 +68,7 @@ def open_loop(
         sample: Sampler of this module, of (steps, size) numbers.
         rng: Random generator.
         steps: Number of control steps, at least 1.
-        size: Number of actions, at least 1.
+        size: Number of entries of an action, at least 1.
         arguments: Further arguments of the sampler.
 
     Raises:
@@ -86,7 +86,7 @@ def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: i
     Args:
         rng: Random generator.
         steps: Ignored; the noise has no fixed length.
-        size: Number of actions.
+        size: Number of entries of an action.
         interval: Control steps after which the linear map is sampled again.
     """
     projection: np.ndarray | None = None
@@ -108,7 +108,7 @@ def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: i
 
 
 def _with_rms(sequence: np.ndarray) -> np.ndarray:
-    """Scale a sequence so that every action has the common RMS after clipping to [−1, 1]."""
+    """Scale a sequence (steps, size) so that every column has the common RMS after clipping to [−1, 1]."""
     scale = np.full(sequence.shape[1], RMS) / np.maximum(np.sqrt(np.mean(sequence**2, axis=0)), 1e-12)
     for _ in range(20):
         clipped = np.clip(sequence * scale, -1.0, 1.0)

@@ -43,7 +43,7 @@ def check_commands(
 
     Returns:
         The largest distance beyond a bound [unit], negative inside; the largest speed and the largest jerk relative to
-        their limits; and the number of commands that violate each.
+        their limits; and for each kind of limit the number of violations.
     """
     beyond = np.maximum(lower - commands, commands - upper).max(axis=1)
     fast = (np.abs(commands[1:] - commands[:-1]) / (speed * period)).max(axis=1)
@@ -93,11 +93,11 @@ def compare_guards(out: Path, *, base_policy: str = BASE_POLICY, episodes: int =
 
     Args:
         out: Folder; blocks of episodes that are already evaluated in it are not evaluated again.
-        base_policy: Registered base policy, or folder of a run of the learner chunk.
+        base_policy: Registered base policy, or folder of a run with the learner `chunk`.
         episodes: Number of episodes of each guard.
 
     Raises:
-        InputError: If there is no episode or no such base policy.
+        InputError: If `episodes` is below 1, or there is no such base policy.
     """
     if episodes < 1:
         raise InputError(f"give at least one episode, not {episodes}")

@@ -2,9 +2,9 @@
 
     python -m research.pretrained [NAME...] [--out runs/pretrained] [--episodes 40]
 
-The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Each is
-evaluated on 40 held-out episodes with all baseline policies. Its configuration, its weights and its evaluation are
-written to `tools/pretrained/NAME`. An interrupted training is resumed.
+The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Every policy
+and the baseline policies of its task are evaluated on 40 held-out episodes. The policy's configuration, weights and
+evaluation are written to `tools/pretrained/NAME`. An interrupted training is resumed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Differences between a run and the thesis.
 
-`THESIS` holds the settings that the thesis gives, with their places. Where the thesis gives none, the remarks name what
-this project uses. Options that deviate from this project's own defaults are listed too.
+`THESIS` holds the settings that the thesis gives, and their sections. Where the thesis gives none, the remarks name
+what this project uses. Options that deviate from this project's own defaults are listed too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Setting:
     """Settings of the thesis for a task.
 
     Attributes:
-        section: Sections that give them.
+        section: Sections of the thesis that give the settings.
         options: Values of the environment's options; several where the thesis has several.
         preset: Name of the preset that holds the table of the learner's settings.
         algorithms: Names of the learners.

@@ -26,7 +26,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite. The same
     happens if the tracking error exceeds its bound and the request would not reduce it, for example when the robot is
-    blocked. If a transition or a moved object puts the repeated command outside the constraints, it moves inside.
+    blocked. If a transition or a moved object puts the repeated command outside the constraints,
+    the command moves inside.
 
     .. pydrake_system::
 

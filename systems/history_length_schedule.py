@@ -66,7 +66,7 @@ class HistoryLengthSchedule(LeafSystem):
         self._contact_threshold, self._release_threshold = contact_threshold, release_threshold
         self._dwell_steps = dwell_steps
         self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
-        # [index into `_lengths`, longest first; 1 in contact, else 0; steps in free space since the last longer length]
+        # [index into `_lengths`, longest first; 1 in contact, else 0; free steps since contact or the last increase]
         self._state = self.DeclareDiscreteState(3)
         self._history_length_port = declare.scalar_output(
             self,

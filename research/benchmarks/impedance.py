@@ -2,8 +2,8 @@
 
 `joint` consists of springs and dampers in the gantry's joints, solved together with the contact. `cartesian` is the
 Cartesian impedance controller of the arm, whose forces are constant during a plant step. Both have the same stiffness,
-damping ratio and limits. A scripted insertion at several time steps is compared with the insertion at the
-finest one. The demonstration alone and the scripted policy act in the same held-out episodes with each impedance.
+damping ratio and limits. A scripted insertion is simulated with several time steps, each compared with the finest.
+The demonstration alone and the scripted policy act in the same held-out episodes with each impedance.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarra
 
 
 def step_response(control: str, time_step: float | None = None) -> dict[str, Any]:
-    """Return the response of the tool center to a step of all six coordinates, relative to the step, (n, 6)."""
+    """Return a row whose `response` (n, 6) is that of the tool center to a step of all coordinates, relative to it."""
     station = GantryStation(BncWorkcell(), time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
     start = np.array([0.0, 0.0, 50.0 * MM, 0.0, 0.0, 0.0])
     simulator = Simulator(station)

@@ -1,13 +1,13 @@
 """Duration of gradient steps compared with Stable-Baselines3: `python -m research.benchmarks learner`.
 
-CPU time of one core. The two learners alternate, and the ratio is the median over the turns. Batches have 13
-observations and 2 actions, as those of the connector.
+CPU time of one core. The two learners alternate, and the ratio is the median over the turns. An observation has 13
+entries and an action 2, as in the connector task.
 
-Variants of TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64) take this
-share of Stable-Baselines3's time: 0.39 with critics batched in PyTorch's autograd, flat parameters and a fused
-optimizer; 0.20 to 0.25 with hand-written gradients. Variants of the latter take this multiple of its time: 1.02 to 1.08
-with quantiles sorted by PyTorch instead of NumPy; 0.96 to 1.05 with preallocated memory for quantile errors; 1.05 to
-1.08 with their sums as a matrix product; 40 with two threads on busy cores, because waiting threads spin.
+TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64) takes this share of
+Stable-Baselines3's time: 0.39 with critics batched in PyTorch's autograd, flat parameters and a fused optimizer; 0.20
+to 0.25 with hand-written gradients. These changes multiply the time with hand-written gradients: 1.02 to 1.08 for
+quantiles sorted by PyTorch instead of NumPy; 0.96 to 1.05 for preallocated memory of the quantile errors; 1.05 to 1.08
+for sums of the quantile errors as a matrix product; 40 for two threads on busy cores, because waiting threads spin.
 
 With large batches and layers the matrix products dominate: SAC with 256 by 256 units and batches of 256
 (`table_4_1_simulation`) takes 0.68 of Stable-Baselines3's time.
@@ -45,14 +45,14 @@ class PlainTqc(OffPolicyLearner):
 
 
 PRESETS = ("tqc_contact", "sac_gridclamp", "tqc_fast", "table_4_1_simulation")
-REQUIRED_RATIO = 2.5  # smallest ratio of `REQUIRED_OF`
+REQUIRED_RATIO = 2.5  # smallest accepted `times_faster` of the result `REQUIRED_OF`
 REQUIRED_OF = "tqc tqc_contact"
 TURNS = 8
 _TRANSITIONS = 2000
 
 
 class _Spaces(gymnasium.Env):
-    """Spaces of the connector."""
+    """Environment of which only the spaces are used, those of the connector."""
 
     observation_space = spaces.Box(-10.0, 10.0, (13,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -1,6 +1,6 @@
 """Timing of the control loop of a robot: `python -m research.benchmarks loop`.
 
-Measures the duration of each part of the loop, to compare with its period, and the jitter of LCM messages on localhost.
+Measures the duration of each part of the loop, next to the part's period, and the jitter of LCM messages on localhost.
 Both are measured without added load and with a busy process on every core. Durations are wall-clock times, including
 the worst case.
 """
@@ -48,7 +48,7 @@ def measure() -> dict[str, list[Row]]:
 
 
 def _row(part: str, period: float, seconds: np.ndarray) -> Row:
-    # The latency of a missing answer is infinite; method="higher" does not interpolate between it and finite ones.
+    # The latency of a missing answer is infinite; method="higher" does not interpolate between infinity and a number.
     median, p99, worst = 1000.0 * np.quantile(seconds, (0.5, 0.99, 1.0), method="higher")
     return {
         "part": part,
@@ -67,7 +67,7 @@ def _timed(call: Callable[[int], object], number: int) -> np.ndarray:
         started = time.perf_counter()
         call(index)
         seconds[index] = time.perf_counter() - started
-    return seconds[number // 20 :]  # without the first calls: on hardware, a warm-up makes them before motion
+    return seconds[number // 20 :]  # without the first calls, which a warm-up makes on hardware before motion
 
 
 def _policy(observations: int, actions: int) -> Policy:

@@ -1,8 +1,8 @@
 """Parallel environments, one process each: `python -m research.benchmarks many_envs`.
 
 Gymnasium's vector environment (`gymnasium.make_vec`) waits for the slowest process at every step. It sends actions and
-reads results one environment after the other; this time per environment is the serial part. The rate for more cores
-than the machine has is extrapolated: n environments on n cores take the time of one plus n − 1 serial parts.
+reads results one environment after the other; the time of this per environment is the serial part. The rate for more
+cores than the machine has is extrapolated: n environments on n cores take the time of one plus n − 1 serial parts.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def measure(*, steps: int = STEPS, counts: tuple[int, ...] | None = None) -> dic
 
 
 def _measured(count: int, steps: int) -> dict[str, float]:
-    """Return the wall-clock time of a step of the vector environment and the CPU time of its own process [s]."""
+    """Return the wall-clock time of a step of the vector environment and the CPU time of this process in it [s]."""
     envs = gymnasium.make_vec(
         ENVIRONMENT,
         num_envs=count,

@@ -20,7 +20,7 @@ from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.qp import SOLVERS
 from research.benchmarks import with_progress
 
-# O, F, H, P: planar task, connector, and a larger problem.
+# Outputs O, constraint rows F, horizon H and history P of a planar task, the connector, and a larger problem.
 SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
 REGIMES = {"slack": 1.3, "grazing": 1.0, "active": 0.5}
 DENSE_SECONDS = 5.0
@@ -69,7 +69,7 @@ def _reference(outputs: int) -> ReferenceTrajectory:
 
 
 def _primitive(size: tuple[int, int, int, int], share: float, solver: str = "daqp") -> LcNsKmp:
-    """Return a primitive with bounds at a share of the mean's range: F/2 outputs in a box, or one upper bound."""
+    """Return a primitive with F/2 outputs in a box, a share of the mean's range; F = 1 is one upper bound."""
     outputs, rows, horizon, history = size
     reference = _reference(outputs)
     reach = share * (np.abs(reference.means) + reference.standard_deviations * (share > 1) * 3).max(axis=0)
@@ -240,7 +240,10 @@ def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
 
 
 def _batch(size: tuple[int, int, int, int], repetitions: int = 20) -> dict[str, float]:
-    """Return the duration of a prediction in a batch at one step with slack constraints, and the largest difference."""
+    """Return the duration of a prediction in a batch at one step, and the largest difference from single predictions.
+
+    The constraints are slack.
+    """
     p, rng = _primitive(size, REGIMES["slack"]), np.random.default_rng(0)
     step = _MOTION // 2
     gains = authority_gains(p)

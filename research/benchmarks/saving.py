@@ -1,7 +1,7 @@
 """Cost of saving a run: `python -m research.benchmarks saving`.
 
 A short run is trained. The wall-clock time of its step log and its checkpoints, most of which is spent waiting for the
-disk, is given as a fraction of the whole.
+disk, is given as a fraction of the run's.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from guiderail.systems.support.last_valid_pose import LastValidPose
 from guiderail.systems.wrench_sensor import WrenchSensor
 from research.benchmarks import with_progress
 
-# Outermost callbacks only: nested ones would count twice.
+# Timed callbacks. A callback that another one of these causes counts once, as a part of the outer one.
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (PoseWrench, "_wrench"),

@@ -136,7 +136,7 @@ def measure(
 
     Args:
         task: Name of the task.
-        environment: Its options.
+        environment: Options of its environment.
         episodes: Number of training episodes.
     """
     task = task or TASK

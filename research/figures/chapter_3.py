@@ -73,7 +73,7 @@ def figure_3_4(out: Path) -> dict[str, Any]:
 
 
 def figure_3_7(out: Path, seeds: int = 5, episodes: int | None = None) -> dict[str, Any]:
-    """Draw success, spills and return of RL-SCT-Shaped with SAC, as on the thesis's robot."""
+    """Draw success, spills and return of RL-SCT-Shaped with SAC, in simulation; the thesis used a real robot."""
     rows = _pouring(out, "sac", seeds, episodes, ("rl_sct_shaped",))
     figure, (axes,) = new_figure(1, 3, (13, 4.2))
     runs, (name, shade) = episodes_of(rows, "rl_sct_shaped"), METHODS["rl_sct_shaped"]

@@ -151,7 +151,7 @@ def random_episodes(env: Any, seed: int, episodes: int) -> list[dict[str, Any]]:
 
 
 def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
-    """Draw the positions that random exploration reaches, for two action repeats.
+    """Draw the positions that random exploration reaches. The table also has action repeat 1, which is not drawn.
 
     Args:
         out: Folder.

@@ -25,7 +25,7 @@ def _session(name: str) -> Callable[..., None]:
     return record
 
 
-# Each takes a folder, or nothing for the folder of the package.
+# Functions that write the files into a folder; without an argument, into the folder of the package.
 GENERATORS: dict[str, Callable[..., None]] = {
     "connector-demonstrations": _main("research.generate.bnc_connector"),
     "connector-search-demonstrations": _session("SEARCH_SESSION"),

@@ -51,7 +51,7 @@ class HiddenPeg(HiddenGoal):
 
 
 def _signal(env: HiddenPeg) -> tuple[bool, bool, bool]:
-    """Return whether the hand is above the handle, above it and closing, and the ring is lifted."""
+    """Return three flags: the hand is above the handle; it is there and closing; the ring is lifted."""
     raw = env.raw
     near = bool(np.linalg.norm(raw[:2] - (raw[4:7] + [-0.02, 0.0, 0.0])[:2]) <= 0.02)
     return near, near and raw[3] < 0.5, bool(raw[6] > 0.15)

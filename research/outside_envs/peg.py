@@ -45,7 +45,7 @@ LENGTH = num_steps(PARTS)
 
 
 class _Env(SawyerPegInsertionSideEnvV3):
-    """The environment without the peg's orientation, which is unused here and takes a fifth of a step."""
+    """The environment without the peg's orientation, which is unused here and takes a fifth of a step's time."""
 
     def _get_quat_objects(self) -> np.ndarray:
         return np.zeros(4)
@@ -80,7 +80,7 @@ class HiddenHole(HiddenGoal):
 
 
 def _signal(env: HiddenHole) -> tuple[bool, bool, bool]:
-    """Return whether the hand is near the peg, near, low and closing, and the peg is aligned with the hole."""
+    """Return three flags: the hand is near the peg; it is near, low and closing; the peg is aligned with the hole."""
     raw = env.raw
     near = bool(np.linalg.norm(raw[:2] - raw[4:6]) <= 0.04)
     aligned = bool(np.linalg.norm((raw[4:7] - [0, env.unwrapped._target_pos[1], 0.16])[1:]) <= 0.03)

@@ -79,7 +79,9 @@ def finish(stored: Path, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def prepare(pair: Pair, out: Path, timeout: float) -> dict[str, Any]:
-    """Prepare a pair and insert it aligned. If the parts overlap, shrink the plug by the distance of `OverlapError`.
+    """Prepare a pair and insert the plug from its aligned pose.
+
+    While the parts overlap, the plug is shrunk by the distance in the `OverlapError`.
 
     Raises:
         StepError: If the pair is refused, or needs more than `timeout` [s] of CPU time.

@@ -15,8 +15,8 @@ def main(arguments: list[str]) -> None:
     """Run the program."""
     parser = Parser(
         "results",
-        "Store the tables of finished studies and figures, and write the pages of results. Without --out these are "
-        "research/results, docs/results and the table in README.md.",
+        "Store the tables of finished studies and figures, and write the pages of results. Without --out, the tables "
+        "are in research/results and the pages in docs/results, and the table in README.md is updated.",
         "studies reproductions",
     )
     parser.add_argument(

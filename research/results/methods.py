@@ -41,7 +41,7 @@ class Row:
     Attributes:
         name: Name in the table.
         study: Study that has its results.
-        method: Its name in the study.
+        method: Name of the method in the study.
         eval_set: Evaluation set, if the study has several.
     """
 
@@ -76,7 +76,7 @@ _ALL = ("demonstration", "uniform_random", "best_constant", "scripted")
 _ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
 _NOT_CONSTANT = ("demonstration", "uniform_random", "scripted")
 _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
-# Evaluation sets of the study connector_hard_gantry, by their names in its table.
+# Evaluation set of the study connector_hard_gantry, by the label of its rows in the table of methods.
 _STATIONS = {"at 2.5 ms": "fresh", "MuJoCo": "MuJoCo", "iiwa": "iiwa", "Panda": "Panda", "UR5e": "UR5e"}
 
 SECTIONS: dict[str, list[Section]] = {
@@ -304,7 +304,7 @@ def task_table(task: str, tables: Path) -> str:
 
 
 def readme_table(tables: Path) -> str:
-    """Return the Markdown table of the README: a row a section, hard ones first."""
+    """Return the Markdown table of the README: a row for each section, hard tasks first."""
     rows = []
     for section in sorted((s for sections in SECTIONS.values() for s in sections), key=lambda s: "hard" not in s.title):
         named = {row.name: last_rows(tables, row) for row in section.rows}

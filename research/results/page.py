@@ -63,7 +63,7 @@ def store(folders: Sequence[Path], tables: Path) -> None:
         tables: Folder with a CSV file for each study and a JSON file for each figure.
 
     Raises:
-        InputError: If a folder holds neither.
+        InputError: If a folder holds no table and no figure.
     """
     names = [*study_names(), *PROGRAMS]
     for folder in folders:
