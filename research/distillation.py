@@ -18,7 +18,7 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, chunk_samples, find_base_policy
 from guiderail.tools.environments import beyond_defaults, make_environment
-from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.cache import load_or_compute, policy_digest
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.learning.run_folder import RunFolder
@@ -130,7 +130,8 @@ def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> 
     Args:
         teacher: Folder of the teacher's run.
         student: Folder of the student's run.
-        out: Folder; blocks of episodes that are already evaluated in it are not evaluated again.
+        out: Folder; blocks of episodes that are already evaluated in it are not evaluated again, unless a policy has
+            changed.
         episodes: Number of episodes of each variant.
 
     Raises:
@@ -139,12 +140,15 @@ def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> 
     if episodes < 1:
         raise InputError(f"give at least one episode, not {episodes}")
     find_base_policy(str(student))
+    Policy.load(teacher)
     folder, rows = RunFolder(teacher), []
+    runs = [RunFolder(one) for one in (teacher, student) if (one / "policy.safetensors").is_file()]
+    policies = "-".join([teacher.name, student.name, *map(policy_digest, runs)])
     for number, variant in enumerate(VARIANTS):
         tables = []
         for first in range(0, episodes, BLOCK):
             count = min(BLOCK, episodes - first)
-            file = out / "episodes" / f"{number}-{teacher.name}-{student.name}-{first}-{count}.csv"
+            file = out / "episodes" / f"{number}-{policies}-{first}-{count}.csv"
             arguments = (folder, student, variant, count, HELD_OUT_SEED + first)
             tables.append(load_or_compute(file, lambda arguments=arguments: evaluate_variant(*arguments)))
         table = pd.concat(tables)

@@ -14,9 +14,10 @@ import pandas as pd
 import research.base_policies  # noqa: F401 (registers the base policy)
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.cache import load_or_compute, policy_digest
 from guiderail.tools.evaluation.evaluate import evaluate_policies
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
 from research.command import Parser, print_result, run_program
 
@@ -92,7 +93,8 @@ def compare_guards(out: Path, *, base_policy: str = BASE_POLICY, episodes: int =
     """Evaluate the base policy with and without the guard; write `guarded_chunks.csv` and `.md`; return the rows.
 
     Args:
-        out: Folder; blocks of episodes that are already evaluated in it are not evaluated again.
+        out: Folder; blocks of episodes that are already evaluated in it are not evaluated again, unless the policy of a
+            run has changed.
         base_policy: Registered base policy, or folder of a run with the learner `chunk`.
         episodes: Number of episodes of each guard.
 
@@ -101,12 +103,14 @@ def compare_guards(out: Path, *, base_policy: str = BASE_POLICY, episodes: int =
     """
     if episodes < 1:
         raise InputError(f"give at least one episode, not {episodes}")
-    rows = []
+    rows, name = [], Path(base_policy).name
+    if (Path(base_policy) / "policy.safetensors").is_file():
+        name += f"-{policy_digest(RunFolder(Path(base_policy)))}"
     tables: dict[str, list[pd.DataFrame]] = {guard: [] for guard in GUARDS}
     for first in range(0, episodes, BLOCK):
         number = min(BLOCK, episodes - first)
         for guard in GUARDS:
-            file = out / "episodes" / f"{Path(base_policy).name}-{guard}-{first}-{number}.csv"
+            file = out / "episodes" / f"{name}-{guard}-{first}-{number}.csv"
             arguments = (guard, base_policy, number, HELD_OUT_SEED + first)
             tables[guard].append(load_or_compute(file, lambda arguments=arguments: evaluate_guard(*arguments)))
     unguarded = pd.concat(tables["none"])["success"].to_numpy()

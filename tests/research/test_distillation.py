@@ -34,6 +34,10 @@ def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, monke
     monkeypatch.setattr(distillation, "evaluate_variant", evaluate)
     monkeypatch.setattr(distillation, "time_per_action", lambda *folders: {"teacher": 1.0, "student": 0.1})
     monkeypatch.setattr(distillation, "find_base_policy", lambda source: SimpleNamespace())
+    monkeypatch.setattr(distillation, "Policy", SimpleNamespace(load=lambda path: None))
+    for name in ("teacher", "student"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "policy.safetensors").write_bytes(b"weights")
     rows = distillation.compare(tmp_path / "teacher", tmp_path / "student", tmp_path / "out", episodes=11)
     assert [row["variant"] for row in rows] == list(distillation.VARIANTS)
     assert [row["episodes"] for row in rows] == [11] * 4
@@ -41,5 +45,8 @@ def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, monke
     assert len(evaluated) == 8
     distillation.compare(tmp_path / "teacher", tmp_path / "student", tmp_path / "out", episodes=11)
     assert len(evaluated) == 8
+    (tmp_path / "teacher" / "policy.safetensors").write_bytes(b"other weights")
+    distillation.compare(tmp_path / "teacher", tmp_path / "student", tmp_path / "out", episodes=11)
+    assert len(evaluated) == 16
     with pytest.raises(InputError, match="at least one"):
         distillation.compare(tmp_path / "teacher", tmp_path / "student", tmp_path / "out", episodes=0)

@@ -49,5 +49,9 @@ def test_comparison_counts_paired_outcomes_and_stores_blocks(tmp_path, monkeypat
     assert [row["only_with_guard"] for row in rows] == [0, 1, 1]
     assert rows == guarded.compare_guards(tmp_path, episodes=2)
     assert len(evaluated) == 3
+    for number, weights in enumerate((b"first", b"second")):
+        (tmp_path / "policy.safetensors").write_bytes(weights)
+        guarded.compare_guards(tmp_path, base_policy=str(tmp_path), episodes=2)
+        assert len(evaluated) == 6 + 3 * number
     with pytest.raises(InputError, match="at least one"):
         guarded.compare_guards(tmp_path, episodes=0)
