@@ -2,8 +2,8 @@
 
 A base policy predicts chunks of commanded poses, which guidance takes as its reference. It is a function from an
 observation (n,) to the next K commanded outputs, one per control step. It returns samples (E, K, O) of an ensemble or
-of a generative model, one chunk (K, O), or a flat vector of either. A `Policy` whose description has the entry
-`chunk`, [E, K, O], is a base policy (`guiderail train --algorithm chunk`).
+of a generative model, one chunk (K, O), or one chunk as a flat vector. A `Policy` whose description has the entry
+`chunk`, [E, K, O], is a base policy (`guiderail train --algorithm chunk`); it returns samples as a flat vector.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from research.distillation import median_time, teacher_actions
 
 TASK, SETTINGS = "BncConnector", {"symmetry": "near"}
 TEACHER = {"guidance": "kgrl", "difficulty": "hard", "reward": "aligned"}
-STUDENT = {**TEACHER, "guidance": "safe_residual", "action_scale": 1.85}  # the teacher's reach
+STUDENT = {**TEACHER, "guidance": "safe_residual", "action_scale": 1.85}  # the student reaches as far as the teacher
 # Policy and environment of each row.
 VARIANTS: dict[str, tuple[str, Mapping[str, Any]]] = {
     "teacher": ("teacher", TEACHER),
@@ -40,7 +40,7 @@ VARIANTS: dict[str, tuple[str, Mapping[str, Any]]] = {
     "student, without constraints": ("student", {**STUDENT, "guidance": "residual"}),
     "student, refined": ("refined", STUDENT),
 }
-BLOCK = 10  # episodes of a stored file
+BLOCK = 10  # number of episodes in a stored file
 
 
 class TaskSpaceTransitions(Callback):

@@ -23,7 +23,7 @@ _ANGLES = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS  # an
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
 _NARROW = np.array([0.12 * MM, 0.12 * MM, 0.4 * MM, 0.5 * DEGREE, 0.15 * DEGREE, 0.15 * DEGREE])
 _CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # correlation times of the deviations [s]
-_CENTERING = 0.9  # part of the mean of the random curves that is removed
+_CENTERING = 0.9  # fraction of the mean of the random curves that is subtracted from each of them
 
 
 def plan_straight_insertion(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:

@@ -82,7 +82,7 @@ def find_unit(path: Path, unit: str | None) -> str | None:
 
 
 def load_part(path: Path, unit: str) -> Part:
-    """Read a mesh file, STL, OBJ, PLY, GLB or STEP, with numbers in one of `UNITS`.
+    """Read a mesh file (STL, OBJ, PLY, GLB or STEP) whose coordinates are in `unit`, one of `UNITS`.
 
     Raises:
         InputError: If the file can't be read, the part can't be made a solid, or its size is out of bounds.
@@ -124,7 +124,7 @@ def load_part(path: Path, unit: str) -> Part:
 
 
 def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return vertices (V, 3), triangles (T, 3) and the number of triangles; the arrays are empty if it is too large.
+    """Return vertices (V, 3), triangles (T, 3) and the number of triangles; too many triangles are not returned.
 
     Without a path and materials, a parser opens no other file and decodes no image.
     """

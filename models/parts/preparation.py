@@ -19,7 +19,7 @@ from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, measure
 from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
-NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at without walls that face each other [m]
+NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at if no walls face each other [m]
 MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [m]
 _THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
 MIN_YAW = 0.1  # default rotation of the plug about its axis in a search, by which the margin is widened [rad]

@@ -17,16 +17,16 @@ MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger one would 
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
 _CPU_SECONDS = 60
 _ATTEMPTS = 3  # fTetWild is not deterministic, and may leave tetrahedra outside the part: the best attempt is used
-_NEGLIGIBLE = 1e-9  # part of the whole volume below which a body is a rounding error
+_NEGLIGIBLE = 1e-9  # fraction of the largest body's volume below which a body is a rounding error
 
 
 @dataclass(frozen=True)
 class Repair:
     """Changes of a mesh that made it a solid."""
 
-    # Number of edges that did not join exactly two triangles, at least 1 if the surface was changed.
+    # Number of open edges of the mesh (`find_open_edges`), at least 1 if the surface was changed.
     closed_edges: int = 0
-    moved: float = 0.0  # largest distance of the new surface from the old one [m]
+    moved: float = 0.0  # largest distance of a point of the new surface from the old surface [m]
     cavities: int = 0  # number of filled closed cavities
     inverted: int = 0  # number of bodies whose faces pointed inwards
 
@@ -83,7 +83,7 @@ def close_surface(
 
 
 def find_open_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of edges not balanced by opposite edges of other triangles, and their center (3,) [m]."""
+    """Return the number of edges that are not used equally often in both directions, and their center (3,) [m]."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     edges = edges[edges[:, 0] != edges[:, 1]]
     low, high = edges.min(axis=1), edges.max(axis=1)

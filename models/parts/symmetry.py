@@ -24,7 +24,7 @@ SYMMETRIES = {
     "mirrored across the other diagonal": np.array([[0, -1], [-1, 0]]),
 }
 SAME, NEARLY = 0.99, 0.8  # smallest intersection over union of two outlines that count as (nearly) the same
-BELOW = 0.8e-3  # distance of the rim's sections from tip and mouth, past their lead-ins [m]
+BELOW = 0.8e-3  # distance of the sections at the rim from the plug's tip or the socket's mouth, past the lead-ins [m]
 _SECTIONS = 12  # heights at which outlines are compared
 _AROUND = 1.15  # radius around the axis in which a socket is compared, in radii of the plug
 

@@ -1,4 +1,4 @@
-"""Tetrahedral meshes of parts that neither close exactly nor decompose into few convex pieces (fTetWild)."""
+"""Tetrahedral meshes of parts that do not close exactly, or do not decompose into few convex pieces (fTetWild)."""
 
 from __future__ import annotations
 

@@ -10,7 +10,8 @@ from guiderail.models.primitives.kernels import Kernel
 # Conditioning on a history with a standard deviation √ρ far below the kernel's, which is 1, loses digits in double
 # precision. Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
-# A point can have an action of its own if its variance given the others, relative to the kernel's, is at least this.
+# A point can have an action of its own if its variance given the points before it in the list, relative to the
+# kernel's, is at least this.
 _MIN_INDEPENDENCE = 1e-9
 
 
@@ -50,8 +51,8 @@ def window_interpolation(
 ) -> np.ndarray:
     """Compute the map (H+1, J) that interpolates actions at J different future points to all, given the history.
 
-    The map is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history. See `window_features` for the
-    arguments.
+    The map is K̂ K̲⁻¹ of equation 4.17. K̂ is conditioned on the history, and K̲, between the J points, is not. See
+    `window_features` for the arguments.
 
     Raises:
         InputError: If points are so close that K̲ is singular.

@@ -23,9 +23,9 @@ MIN_SHARE = 0.95
 """Share of the steps that must be within one standard deviation for a motion to follow the demonstrations."""
 # Length scales to try, relative to the motion's duration: from one bend to a few steps.
 _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
-# Values of ħ to try, for outputs of unit size.
+# Values of ħ = λ + β to try, for outputs of unit size.
 _REGULARIZATIONS = (1.0, 0.1, 0.01)
-_COMPONENTS = (3, 5, 8, 12, 18, 26, 36, 50)
+_COMPONENTS = (3, 5, 8, 12, 18, 26, 36, 50)  # numbers of mixture components to try
 _EVALUATED = 40  # number of steps at which candidates are compared
 
 
@@ -249,7 +249,7 @@ def _explain(
 ) -> str:
     length = selected.length_scale
     best = min(candidate.error for candidate in candidates)
-    tried = "have the least information criterion of {} numbers" if len(criteria) > 1 else "are fixed"
+    tried = "have the least information criterion of the {} numbers tried" if len(criteria) > 1 else "are fixed"
     text = (
         f"{components} components {tried.format(len(criteria))}. "
         f"A kernel of length scale {length:.3g}, {length / (times[-1] - times[0]):.1%} of the motion, with "

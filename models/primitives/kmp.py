@@ -20,7 +20,7 @@ class _Point:
 class Kmp:
     """Kernelized movement primitive with E(ζ) = k*(K + λΣ)⁻¹μ and cov(ζ) = N/λ_c (k** − k*(K + λ_cΣ)⁻¹k*ᵀ).
 
-    `LcNsKmp` solves for a window of a clock; this class uses the whole reference at once, for primitives driven by a
+    `LcNsKmp` solves for a window of steps; this class uses the whole reference at once, for primitives driven by a
     state instead of time, and for via-points. The solution is stored as weights of the kernel's features, whose number
     is the rank of the kernel and not the number of points. The weights are solved for with the triangular factor of a
     QR decomposition. The factor of the reference is stored: a change of a via-point only appends the O rows of each

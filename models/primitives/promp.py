@@ -23,7 +23,7 @@ class ProMp:
     Attributes:
         mean: μ_w, the weights of the first output, then those of the next, (O·K,) [unit of the output].
         covariance: Σ_w (O·K, O·K), positive semidefinite: its rank is less than the number of demonstrations.
-        noise: Σ_y (O, O), covariance of what the basis functions do not resolve.
+        noise: Σ_y (O, O), covariance of the residuals of the least-squares fit.
     """
 
     mean: np.ndarray

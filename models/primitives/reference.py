@@ -85,8 +85,8 @@ class ReferenceTrajectory:
     ) -> ReferenceTrajectory:
         """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR), or fit a ProMP.
 
-        The covariance of a single demonstration holds only what the mixture does not resolve, such as a circling
-        search; `prior_std` adds the variance that other demonstrations would have shown.
+        The covariance of a single demonstration is only that of motions which the mixture averages out, such as a
+        circling search; `prior_std` adds the variance that other demonstrations would have shown.
 
         Args:
             demonstrations: Demonstrations, resampled to one clock if their clocks differ.

@@ -108,7 +108,7 @@ class EndEffector:
         tool_center: Name of the frame P that a station commands: the center of compliance, z towards the flange, fixed
             to the mount.
         bodies: Names of all bodies, the mount first.
-        X_FlangeMount: Pose of the mount in the flange frame after its rotation by the robot's `tool_turn`.
+        X_FlangeMount: Pose of the mount in the flange frame, after a rotation of that frame by the robot's `tool_turn`.
         joints: Names of the actuated joints of a gripper, without mimic joints; empty for a rigid tool.
         opening: Positions of all joints by name, including mimic joints, at the start of an episode [rad] or [m].
         drives: Drives of the actuated joints.

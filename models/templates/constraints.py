@@ -1,8 +1,8 @@
 """Active constraints: projections of the end effector's pose into an allowed set (thesis, equation 2.21).
 
-Each projection is idempotent: an allowed pose is returned unchanged. The constraints of a state are applied in the
-order of the file. A constraint on the orientation that depends on the position therefore comes after the constraints
-on the position.
+Each projection is idempotent up to rounding: an allowed pose is not changed. The constraints of a state are applied in
+the order of the file. A constraint on the orientation that depends on the position therefore comes after the
+constraints on the position.
 """
 
 import math
@@ -37,7 +37,7 @@ class ActiveConstraint(StatePart, ABC):
 
     @abstractmethod
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        """Return the projection of X_WE; X_WE itself if it is allowed."""
+        """Return the projection of X_WE, equal to X_WE up to rounding if X_WE is allowed."""
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
         """Return the distance of X_WE from its projection, the larger of position [m] and angle [rad]; 0 if allowed."""
@@ -54,7 +54,7 @@ class FrameConstraint(ActiveConstraint):
 
     @abstractmethod
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; the same objects if allowed."""
+        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; the argument itself means no change."""
 
     @override
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
@@ -72,12 +72,12 @@ class ConstraintGroup:
     constraints: tuple[FrameConstraint, ...]
 
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        """Return the projection of X_WE; X_WE itself if it is allowed."""
+        """Return the projection of X_WE, equal to X_WE up to rounding if X_WE is allowed."""
         frame = self.constraints[0].frame
         R_FE, p_FE = R, p = pose_in(frame, X_WE, frames)
         for constraint in self.constraints:
             R, p = constraint.project_in_frame(R, p)
-        # An allowed pose is returned unchanged: conversion to the frame and back would change the last digits.
+        # An unchanged part is not converted: conversion to the frame and back would change the last digits.
         if p is not p_FE:
             X_WE = with_position_in(frame, p, X_WE, frames)
         if R is not R_FE:
@@ -126,9 +126,9 @@ class PositionConstraint(FrameConstraint):
 @register(ACTIVE_CONSTRAINTS, "half_space")
 @dataclass(frozen=True)
 class HalfSpace(PositionConstraint):
-    """Half-space normal · p_FE ≥ offset_m."""
+    """Half-space n · p_FE ≥ offset_m for the unit vector n along `normal`."""
 
-    normal: tuple[float, ...]  # vector in F
+    normal: tuple[float, ...]  # vector in F, of any length except zero
     offset_m: float  # offset of the plane along the normal
     frame: str = WORLD  # F: frame of an object, or `world`
 

@@ -18,8 +18,8 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, requi
 class Outside(PositionConstraint):
     """Base class of constraints to stay outside of a convex shape in F.
 
-    A request is projected into a half-space outside of the shape, which is linearized at the last command. Hence the
-    straight line from every command to the next one is outside too.
+    The constraint is linearized at the last command: a request is projected into a half-space outside of the shape.
+    Hence the straight line from a command outside to the next one is outside too.
     """
 
     @property

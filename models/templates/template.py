@@ -157,7 +157,7 @@ class SharedControlTemplate:
         last command is repeated. Constraints that keep the end effector outside of a shape are linearized at the last
         command, so that the line to the new command is outside too. If the last command is inside the constraints, so
         is the new one. If the last command is outside (at the start of an episode, or after an object moved), the
-        commands move inside at the largest speed.
+        commands move inside at the largest speed. The pose is not finite if that of an object is not; callers check it.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))

@@ -82,7 +82,7 @@ def _distance(corners: np.ndarray, point: np.ndarray) -> float:
 
 
 ACTION_DIMS = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
-STANDING_STEPS = 5  # control steps after which a penetration is no longer an impact
+STANDING_STEPS = 5  # number of actions after which a penetration is no longer an impact
 _D = BncWorkcell().dimensions
 # Compliant surfaces deform in an impact. Beyond these depths a body could pass through a wall: a lug with
 # its center inside the wall, or a barrel as deep in the ring as the ring is thick.
@@ -94,7 +94,7 @@ LIMITS = {
 
 
 class Penetration(EnvCallback):
-    """Callback that records the penetration depths of jack and plug [mm] at the end of each control step."""
+    """Callback that records the penetration depths of jack and plug [m] at the end of each action."""
 
     def on_episode_start(self) -> None:
         """Start with no depths."""
@@ -109,7 +109,7 @@ class Penetration(EnvCallback):
         self._depths.append(interference(_D, X_JP.rotation().matrix(), X_JP.translation()))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the largest depths of lug and barrel, and the largest depth that lasted for `STANDING_STEPS`."""
+        """Return the largest depths of lug and barrel and the largest that lasted for `STANDING_STEPS` actions [mm]."""
         depths = np.array(self._depths) / MM
         windows = np.lib.stride_tricks.sliding_window_view(depths.max(axis=1), min(STANDING_STEPS, len(depths)))
         return {

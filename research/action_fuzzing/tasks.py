@@ -63,7 +63,8 @@ def campaign_of(task: str) -> Campaign:
     """Return a campaign of every guidance of a task, with the default options.
 
     The violation of a task's constraints is recomputed. The violation of a template is the one that the guidance
-    reports, because the poses of its objects are unknown. Waiting, or stopping before a wall, is not a failure.
+    reports, because the poses of its objects are unknown. Waiting, or stopping before a wall, is a failure of KGRL and
+    sKGRL only.
 
     Args:
         task: Name of the task.

@@ -26,7 +26,7 @@ from research.benchmarks import with_progress
 
 TASK = "BncConnector"
 ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "fixture_offset": "per_run"}
-EPISODES = 20  # seeds 30 to 34 have converged after at most 10
+EPISODES = 20  # with seeds 30 to 34, training has converged after at most 10 episodes
 SEEDS = range(400, 405)
 HELD_OUT = 100
 KINDS = {"alternating": "false", "pipelined": "true"}  # the setting `pipelined`

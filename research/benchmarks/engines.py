@@ -38,7 +38,7 @@ AROUND, SPEEDS = (
     3.0 * MM,
     (0.003, 0.02, 0.04),
 )  # radius of a circle on the rim [m], speeds [m/s]
-CAPTURES = {  # station, and whether Drake's polygons have the area of their circles
+CAPTURES = {  # station, and True if Drake's polygons have the areas of the circles that they approximate
     "Drake": ("gantry", False),
     "Drake, equal areas": ("gantry", True),
     "MuJoCo": ("mujoco", False),
@@ -162,7 +162,10 @@ def show(results: dict[str, Any]) -> None:
     )
     for name, levers in results["levers_mm"].items():
         print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
-    print("a plug drops in from", ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()))
+    print(
+        "largest offset at which a plug drops in:",
+        ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()),
+    )
     speeds = ", ".join(f"{1e3 * speed:g}" for speed in SPEEDS)
     print(f"drag over normal force on a sharp rim at {speeds} mm/s; the friction is {FRICTION:g}")
     for name, drags in results["drags"].items():
