@@ -128,10 +128,10 @@ class LinearConstraints:
             UnsolvableError: If `output` is not finite.
         """
         output = np.asarray(output, dtype=float)
-        if self.violation(output, step) <= 0:
-            return output.copy()
         if not np.isfinite(output).all():
             raise UnsolvableError(f"an output must be finite to have a nearest one within constraints, not {output}")
+        if self.violation(output, step) <= 0:
+            return output.copy()
         G, c = (a[0] for a in self.window(np.array([step])))
         with suppress(UnsolvableError):
             move, _ = solve_least_norm(G.copy(), c - G @ output, np.full(len(c), np.inf))

@@ -163,9 +163,12 @@ def test_nearest_is_allowed_if_the_solver_fails(seed):
         np.testing.assert_allclose(on_line, [2.0, 0.25])
 
 
-def test_nearest_refuses_an_output_that_is_not_finite():
-    with pytest.raises(UnsolvableError, match="finite"):
-        LinearConstraints.box([0.0], [1.0]).nearest([np.nan])
+@pytest.mark.parametrize("upper", [1.0, np.inf])
+@pytest.mark.parametrize("output", [np.nan, np.inf])
+def test_nearest_refuses_an_output_that_is_not_finite(upper, output):
+    for constraints in (LinearConstraints.box([0.0], [upper]), LinearConstraints.none(1)):
+        with pytest.raises(UnsolvableError, match="finite"):
+            constraints.nearest([output])
 
 
 def test_scaled_constraints_hold_against_an_adversary():
