@@ -105,6 +105,8 @@ def load_part(path: Path, unit: str) -> Part:
         )
     if not len(triangles):
         raise InputError(f"{path} holds no triangles: export the part as a mesh")
+    if not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise InputError(f"{path} holds triangles of vertices that it lacks: export it again")
     corners = vertices[triangles.ravel()]
     if not np.isfinite(corners).all():
         raise InputError(f"{path} holds vertices that are NaN or infinite: export it again")

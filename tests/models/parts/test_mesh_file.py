@@ -95,6 +95,17 @@ def test_load_part_keeps_slivers_that_close_a_seam(tmp_path):
     assert trimesh.Trimesh(*part.bodies[0], process=False).volume == pytest.approx(2e-6)
 
 
+@pytest.mark.parametrize("index", [-3, 3, 2**31 - 1])
+def test_load_part_refuses_triangles_of_missing_vertices(index, tmp_path):
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    (tmp_path / "part.ply").write_text(header + f"0 0 0\n10 0 0\n0 10 0\n3 0 1 {index}\n")
+    with pytest.raises(InputError, match="vertices that it lacks"):
+        load_part(tmp_path / "part.ply", "mm")
+
+
 def test_load_part_refuses_a_hole(tmp_path):
     hole(box()).export(tmp_path / "part.stl")
     with pytest.raises(InputError, match=r"\(3 open edges.*close it"):
