@@ -84,6 +84,8 @@ class Policy:
             raise ValueError("an image has height, width and channels, and is part of the observation")
         if image is not None and "pool" not in self.description:
             raise ValueError("a policy of images needs `pool`, the side of the squares of pixels that are averaged")
+        if any(bias.ndim != 1 for _, bias in (*self._encoder, *self._layers)):
+            raise ValueError("a bias has one number for each output of its layer")
         sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
         expected = [(out, into) for into, out in pairwise(sizes)]
         if not self._layers or [weight.shape for weight, _ in self._layers] != expected or sizes[-1] != len(self._low):

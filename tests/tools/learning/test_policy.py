@@ -130,6 +130,13 @@ def test_image_policy_refuses_an_incomplete_description(missing):
         Policy(layers, {name: value for name, value in description.items() if name != missing})
 
 
+@pytest.mark.parametrize("shape", [(), (1, 1), (1, 2)])
+def test_policy_refuses_a_bias_that_is_no_vector(shape):
+    description = {"observation_shape": [3], "action_low": [-1.0], "action_high": [1.0]}
+    with pytest.raises(ValueError, match="bias"):
+        Policy([(np.ones((1, 3), np.float32), np.zeros(shape, np.float32))], description)
+
+
 def test_load_names_a_missing_policy(tmp_path):
     with pytest.raises(InputError, match="holds no policy"):
         Policy.load(tmp_path)
