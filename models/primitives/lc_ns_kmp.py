@@ -208,8 +208,8 @@ class LcNsKmp:
             history_inputs: Inputs of the history, (P,) or (P, I).
 
         Raises:
-            InputError: As `predict`, if shapes do not match, or if the constraints differ from step to step, which
-                requires a clock.
+            InputError: As `predict`, if shapes do not match, a covariance is not positive definite, or the constraints
+                differ from step to step, which requires a clock.
             UnsolvableError: As `predict`.
         """
         if self.constraints.num_steps is not None:
@@ -236,7 +236,11 @@ class LcNsKmp:
         """Compute the output at a step from a given window, such as that of a base policy; nothing is cached.
 
         Arguments are those of `predict`, and the window's `means` (H+1, O) and positive definite `covariances`
-        (H+1, O, O), the executed point first. Errors are those of `predict`.
+        (H+1, O, O), the executed point first.
+
+        Raises:
+            InputError: As `predict`, if shapes do not match, or a covariance is not positive definite.
+            UnsolvableError: As `predict`.
         """
         window = Window.checked(means, covariances, *self.constraints.window(self._window_steps(step, self.horizon)))
         factor = StepFactor(window, self._features(step), self.lambda_, self.beta)

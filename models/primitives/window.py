@@ -85,6 +85,9 @@ class StepFactor:
         lambda_: Regularization λ of problem 4.5.
         beta: Weight β of a null-space action.
 
+    Raises:
+        InputError: If a covariance of the window is not positive definite.
+
     Attributes:
         output_map, output_offset: Map (O, PO+O) and offset (O,) from x to the executed point.
         constraint_map: Map (m, PO+O) from x to the constrained directions, each divided by its largest
@@ -106,7 +109,10 @@ class StepFactor:
         # Columns of F̄ = F ⊗ I are ordered (feature, output); rows (step, output).
         F, W = self._features.features, self._features.history_map
         rank, past = F.shape[1], W.shape[1]
-        whiten = np.linalg.inv(np.linalg.cholesky(self._window.covariances))
+        try:
+            whiten = np.linalg.inv(np.linalg.cholesky(self._window.covariances))
+        except np.linalg.LinAlgError as error:
+            raise InputError("the covariances of a window must be positive definite: add a small variance") from error
         whitened = np.einsum("jk,joi->joki", F, whiten).reshape(steps * outputs, rank * outputs)
         R = np.linalg.qr(np.vstack([whitened, np.sqrt(self._hbar) * np.eye(rank * outputs)]), mode="r")
         eye = np.eye(outputs)

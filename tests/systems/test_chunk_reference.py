@@ -115,6 +115,12 @@ def test_window_is_refused_when_it_does_not_fit_the_primitive():
         primitive.predict_window(0, np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)))
     with pytest.raises(InputError, match="finite"):
         primitive.predict_window(0, np.full((5, 2), np.nan), np.tile(np.eye(2), (5, 1, 1)))
+    for covariance in (np.zeros((2, 2)), -np.eye(2), np.diag([1.0, 0.0])):
+        window = np.zeros((5, 2)), np.tile(covariance, (5, 1, 1))
+        with pytest.raises(InputError, match="positive definite"):
+            primitive.predict_window(0, *window)
+        with pytest.raises(InputError, match="positive definite"):
+            primitive.predict_at(0.1 * np.arange(5), *window)
 
 
 @pytest.mark.parametrize("past", [0, 3])
