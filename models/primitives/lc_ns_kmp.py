@@ -279,8 +279,8 @@ class LcNsKmp:
                 are so close that their kernel matrix is singular.
             UnsolvableError: If no window within the constraints was found.
         """
-        step = min(step, self.num_steps - 1)
-        return self._modified(self._factor(step), step, self.horizon, at, null_space_actions, history)
+        factor, step = self._factor(step), min(int(step), self.num_steps - 1)
+        return self._modified(factor, step, self.horizon, at, null_space_actions, history)
 
     def modified_trajectory(
         self, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None

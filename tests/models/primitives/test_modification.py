@@ -103,6 +103,17 @@ def plain(steps=40, deviation=0.1, **changes):
     return LcNsKmp(reference, **{"horizon": 15, **changes})
 
 
+def test_modified_window_accepts_a_whole_number_of_any_type():
+    p = plain()
+    expected = p.modified_window(3, [4], [[1.0, 2.0]])
+    for step in (3.0, np.int64(3)):
+        result = p.modified_window(step, [4], [[1.0, 2.0]])
+        np.testing.assert_array_equal(result.trajectory, expected.trajectory)
+    for step in (-1, 2.5, np.nan):
+        with pytest.raises(InputError):
+            p.modified_window(step, [4], [[1.0, 2.0]])
+
+
 def test_actions_add_up_without_active_constraints():
     p = plain(history=3, history_variance=1e-4)
     past = p.reference.means[7:10]
