@@ -31,6 +31,7 @@ An entry is called with `length_scale=` and its own further parameters, all of t
 register_kernel = KERNELS.register
 DEFAULT_KERNEL = "squared_exponential"
 DEFAULT_LENGTH_SCALE = 0.5
+_SMALLEST, _LARGEST = 1e-100, 1e100  # bounds of a length scale: far beyond them, kernels overflow or are NaN
 
 
 def make_kernel(
@@ -82,8 +83,10 @@ class _StationaryKernel:
     stationary = True
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.length_scale) and self.length_scale > 0):
-            raise InputError(f"the kernel's length_scale must be positive and finite, not {self.length_scale}")
+        if not _SMALLEST <= self.length_scale <= _LARGEST:
+            raise InputError(
+                f"the kernel's length_scale must be positive, {_SMALLEST:g} to {_LARGEST:g}, not {self.length_scale}"
+            )
 
 
 @register_kernel("squared_exponential")
@@ -97,7 +100,7 @@ class SquaredExponential(_StationaryKernel):
         length_scale: Length scale ℓ, in the unit of the input, positive.
 
     Raises:
-        InputError: If the length scale is not positive and finite.
+        InputError: If the length scale is not in [1e-100, 1e100].
     """
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -117,7 +120,7 @@ class Matern52(_StationaryKernel):
         length_scale: Length scale ℓ, in the unit of the input, positive.
 
     Raises:
-        InputError: If the length scale is not positive and finite.
+        InputError: If the length scale is not in [1e-100, 1e100].
     """
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:

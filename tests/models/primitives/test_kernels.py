@@ -20,7 +20,7 @@ def test_matern52_matches_its_closed_form():
 
 
 @pytest.mark.parametrize("kernel", [SquaredExponential, Matern52])
-@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf, 1e-160, 1e-320, 1e200])
 def test_kernel_refuses_an_invalid_length_scale(kernel, scale):
     with pytest.raises(InputError, match="positive"):
         kernel(scale)
