@@ -124,7 +124,7 @@ class PrimitiveStepper:
             self._state, is_braking = self._motion.apply(self._state, self._last)
             self._last = self._state[: len(self._last)]
             violation, is_fallback = self._motion.constraints.violation(self._last), is_fallback or is_braking
-        command = Command(self._last, violation, is_fallback)
+        command = Command(self._last.copy(), violation, is_fallback)
         if not self._is_measured:
             self._append(self._last)
         self.num_steps += 1

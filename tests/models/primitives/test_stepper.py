@@ -7,6 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
@@ -71,6 +72,19 @@ def test_fallback_is_nearest_to_the_last_command_and_inside(monkeypatch):
     assert command.is_fallback
     np.testing.assert_array_equal(command.output, last)
     assert stepper.num_steps == 2
+
+
+def test_a_change_of_a_command_does_not_change_the_next_one():
+    p = primitive(history=0)
+    motion = MotionConstraintFilter(MotionConstraints(p.constraints, max_speed=[1.0, 1.0]), PERIOD)
+    for filtered in (None, motion):
+        first, second = p.start(motion=filtered), p.start(motion=filtered)
+        for _ in range(2):
+            expected = first.step([0.0, 0.0]).output
+            changed = second.step([0.0, 0.0]).output
+            np.testing.assert_array_equal(changed, expected)
+            changed += 0.01
+        np.testing.assert_array_equal(second.finish(None).output, first.finish(None).output)
 
 
 def test_measured_history_follows_the_measured_pose():
