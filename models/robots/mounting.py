@@ -19,7 +19,7 @@ from pydrake.multibody.tree import (
 )
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.parsing import add_model, add_models
+from guiderail.models.common.parsing import add_models
 from guiderail.models.robots.robot import EndEffector, JointDrives, Robot
 
 
@@ -116,8 +116,8 @@ def _read(plant: MultibodyPlant, file: Path, label: str, *, only_one: bool = Fal
         raise InputError(f"{label}: there is no model file {file}")
     try:
         models = add_models(plant, file)
-    except RuntimeError as error:
-        raise InputError(f"{label}: {file} can't be read as a model: {error}") from error
+    except InputError as error:
+        raise InputError(f"{label}: {error}") from error
     if only_one and len(models) != 1:
         raise InputError(f"{label}: {file} must hold one model, not {len(models)}")
     return models
@@ -172,7 +172,7 @@ def _add_rigid_copy(
     """Add one body with the inertia of the open gripper."""
     gripper_plant = MultibodyPlant(time_step=1e-3)  # only discrete plants support mimic joints
     gripper_plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
-    model = add_model(gripper_plant, end_effector.model)
+    (model,) = _read(gripper_plant, end_effector.model, f"end effector {end_effector.name!r}", only_one=True)
     _check_names(gripper_plant, model, end_effector)
     mount = gripper_plant.GetFrameByName(end_effector.mount_frame, model)
     gripper_plant.WeldFrames(gripper_plant.world_frame(), mount)

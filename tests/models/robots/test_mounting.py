@@ -119,7 +119,7 @@ def test_add_robot_refuses_data_that_the_model_lacks(wrong, sentence):
 def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
     for text, sentence in (
         (None, "no model file"),
-        ("<robot", "can't be read"),
+        ("<robot", "robot 'ur5e': .* can't be read"),
         (UR5E.model.read_text().split("<transmission")[0] + "</robot>", "give its model file a transmission"),
     ):
         file = tmp_path / "robot.urdf"
@@ -142,3 +142,15 @@ def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
 def test_add_end_effector_refuses_data_that_the_model_lacks(wrong, sentence, as_rigid):
     with pytest.raises(InputError, match=sentence):
         mounted(dataclasses.replace(GRIPPER, **wrong), as_rigid=as_rigid)
+
+
+@pytest.mark.parametrize("as_rigid", [False, True])
+def test_add_end_effector_refuses_a_missing_or_double_model(as_rigid, tmp_path):
+    file = tmp_path / "two.dmd.yaml"
+    label = "end effector 'parallel_gripper'"
+    with pytest.raises(InputError, match=f"{label}: there is no model file"):
+        mounted(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)
+    models = (f"- add_model: {{name: {name}, file: 'file://{GRIPPER.model}'}}\n" for name in ("one", "two"))
+    file.write_text("directives:\n" + "".join(models))
+    with pytest.raises(InputError, match=f"{label}: .* must hold one model, not 2"):
+        mounted(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)
