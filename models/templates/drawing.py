@@ -1,5 +1,6 @@
 """Drawings of a template's state machine, as Graphviz text or as a picture."""
 
+import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +9,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import write_atomically
 from guiderail.models.templates.template import SharedControlTemplate, TemplateState
 
 
@@ -60,15 +62,17 @@ def draw(template: SharedControlTemplate, path: str | Path) -> None:
     """Write the state machine to a .dot or .gv file as text, or to a .png, .svg or .pdf file as a picture.
 
     Raises:
-        InputError: If the file has another extension.
+        InputError: If the file has another extension, or it cannot be written.
     """
     path = Path(path)
     if path.suffix in (".dot", ".gv"):
-        path.write_text(to_dot(template), encoding="utf-8")
+        write_atomically(path, to_dot(template).encode())
         return
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
-    draw_figure(template).savefig(path, dpi=120)
+    content = io.BytesIO()
+    draw_figure(template).savefig(content, format=path.suffix[1:], dpi=120)
+    write_atomically(path, content.getvalue())
 
 
 def draw_figure(template: SharedControlTemplate) -> "Figure":

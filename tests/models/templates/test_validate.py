@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.drawing import draw, to_dot
 from guiderail.models.templates.validate import validate
@@ -111,6 +112,24 @@ def test_draw_shows_every_state_and_transition(tmp_path):
     for suffix in (".dot", ".png"):
         draw(template, tmp_path / f"pouring{suffix}")
         assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
+
+
+@pytest.mark.parametrize("ending", ["dot", "png", "svg"])
+def test_draw_replaces_a_file_or_leaves_it_unchanged(ending, tmp_path, monkeypatch):
+    template = load_template("pouring")
+    draw(template, tmp_path / "new" / f"a.{ending}")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        draw(template, tmp_path / "file" / f"a.{ending}")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    before = (tmp_path / "new" / f"a.{ending}").read_bytes()
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(InputError, match="No space left"):
+        draw(load_template("grid_clamp"), tmp_path / "new" / f"a.{ending}")
+    assert (tmp_path / "new" / f"a.{ending}").read_bytes() == before
 
 
 def test_validate_warns_of_a_transition_that_waits():
