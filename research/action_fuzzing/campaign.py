@@ -7,6 +7,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -137,30 +138,31 @@ def run_campaign(
             raise InputError(f"{out} holds another campaign: name another file")
     environments: dict[str, tuple[gymnasium.Env, list[Callback]]] = {}
     reported, began = len(rows), time.process_time()
-    while not is_done(rows):
-        case, name = rounds[len(rows) % len(rounds)]
-        if case.name not in environments:
-            env = make_environment(campaign.task, options[case.name])
-            callbacks: list[Callback] = [NonFiniteCounter(env), RecomputedViolation(env, campaign.frames)]
-            callbacks += [campaign.make_callback(env)] if campaign.make_callback else []
-            callbacks += [StepLog(env, step_log)] if step_log is not None else []
-            environments[case.name] = env, callbacks
-        env, callbacks = environments[case.name]
-        episode_seed = seed + len(rows)
-        size = int(np.prod(env.action_space.shape or ()))
-        act = campaign.actions[name](np.random.default_rng([episode_seed, 1]), size)
-        episode = rollout(env, act, *callbacks, index=len(rows), seed=episode_seed, options=case.options)
-        row = {"case": case.name, "actions": name, "seed": episode_seed, "environment": digests[case.name]}
-        row |= {"constrained": int(case.constrained), "may_wait": int(case.may_wait)}
-        columns = [*COLUMNS, *list(episode)[list(episode).index("not_finite") :]]
-        rows.append(row | {column: episode[column] for column in columns})
-        if len(rows) % len(campaign.cases) == 0 or is_done(rows):
-            if out is not None:
-                write_atomically(out, table_text(rows).encode())
-            if report is not None:
-                progress = f"{len(rows)} episodes, {time.process_time() - began:.0f} s of CPU"
-                report(f"{progress}: {json.dumps(outcome(rows[reported:]))}")
-            reported = len(rows)
+    with ExitStack() as stack:
+        while not is_done(rows):
+            case, name = rounds[len(rows) % len(rounds)]
+            if case.name not in environments:
+                env = stack.enter_context(closing(make_environment(campaign.task, options[case.name])))
+                callbacks: list[Callback] = [NonFiniteCounter(env), RecomputedViolation(env, campaign.frames)]
+                callbacks += [campaign.make_callback(env)] if campaign.make_callback else []
+                callbacks += [StepLog(env, step_log)] if step_log is not None else []
+                environments[case.name] = env, callbacks
+            env, callbacks = environments[case.name]
+            episode_seed = seed + len(rows)
+            size = int(np.prod(env.action_space.shape or ()))
+            act = campaign.actions[name](np.random.default_rng([episode_seed, 1]), size)
+            episode = rollout(env, act, *callbacks, index=len(rows), seed=episode_seed, options=case.options)
+            row = {"case": case.name, "actions": name, "seed": episode_seed, "environment": digests[case.name]}
+            row |= {"constrained": int(case.constrained), "may_wait": int(case.may_wait)}
+            columns = [*COLUMNS, *list(episode)[list(episode).index("not_finite") :]]
+            rows.append(row | {column: episode[column] for column in columns})
+            if len(rows) % len(campaign.cases) == 0 or is_done(rows):
+                if out is not None:
+                    write_atomically(out, table_text(rows).encode())
+                if report is not None:
+                    progress = f"{len(rows)} episodes, {time.process_time() - began:.0f} s of CPU"
+                    report(f"{progress}: {json.dumps(outcome(rows[reported:]))}")
+                reported = len(rows)
     return rows
 
 

@@ -84,6 +84,28 @@ def test_campaign_is_resumed_from_its_table(tmp_path):
     run_campaign(BEAD, at_least(7), seed=3, out=table, environment={"wall": 1.0})  # 1.0 is the default
 
 
+def test_campaign_closes_its_environments(monkeypatch):
+    made, closed = [], []
+
+    def make(*arguments):
+        env = make_environment(*arguments)
+        made.append(env)
+        monkeypatch.setattr(env, "close", lambda: closed.append(env))
+        return env
+
+    def interrupt(rows):
+        if rows:
+            raise KeyboardInterrupt
+        return False
+
+    monkeypatch.setattr("research.action_fuzzing.campaign.make_environment", make)
+    run_campaign(BEAD, at_least(1))
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(BEAD, interrupt)
+    assert len(made) == 2
+    assert closed == made
+
+
 def test_callback_receives_every_transition():
     for action_repeat in (1, 2):
         row = run_campaign(BEAD, at_least(1), environment={"action_repeat": action_repeat})[0]
