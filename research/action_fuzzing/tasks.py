@@ -112,7 +112,7 @@ def fuzz(
         The entries `cases`, `all` and `failures`; with "all", the entries `tasks`, `control_steps` and `failures`.
 
     Raises:
-        InputError: For an unknown task, or a number out of range.
+        InputError: For an unknown task, a number out of range, or both `episodes` and `steps`.
     """
     if (episodes is not None and episodes < 1) or (steps is not None and steps < 1) or seed < 0:
         raise InputError("a campaign has at least one episode or control step, and a seed from 0")
@@ -122,6 +122,8 @@ def fuzz(
         if out is not None and out.suffix == ".csv":
             raise InputError(f"all tasks need a folder, not the table {out}: name a folder with --out")
         return _fuzz_all(-(-steps // len(CAMPAIGNS)), seed=seed, out=out, report=report)
+    if episodes is not None and steps is not None:
+        raise InputError("a campaign ends after a number of episodes or of control steps: give one of the two")
     if task not in CAMPAIGNS and task not in TASKS.names():
         remedy = did_you_mean(task, {*CAMPAIGNS, *TASKS.names(), ALL})
         raise InputError(

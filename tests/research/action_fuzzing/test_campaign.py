@@ -233,7 +233,7 @@ def test_pouring_passes_with_shaking_inputs():
     assert 0.0 <= result["all"]["early_tilt"] <= 1e-9
 
 
-@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"steps": 0}, {"seed": -1}])
+@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"steps": 0}, {"seed": -1}, {"episodes": 2, "steps": 9}])
 def test_fuzz_refuses_numbers_out_of_range(wrong):
     with pytest.raises(InputError):
         fuzz("NarrowPassage", **wrong)
