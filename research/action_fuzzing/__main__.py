@@ -4,7 +4,7 @@ import json
 import sys
 from pathlib import Path
 
-from guiderail.tools.cli.app import parse_environment
+from guiderail.tools.cli.app import parse_environment, to_json
 from research.action_fuzzing.tasks import ALL, CAMPAIGNS, fuzz
 from research.command import Parser, find_task, run_program
 
@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
         environment=parse_environment(args.env),
         report=lambda line: print(line, file=sys.stderr, flush=True),
     )
-    print(json.dumps(result, indent=None if args.json else 2))
+    print(to_json(result) if args.json else json.dumps(result, indent=2))
     return 1 if result["failures"] else 0
 
 

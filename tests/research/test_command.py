@@ -86,6 +86,17 @@ def test_non_finite_numbers_are_null_in_json(capsys):
     assert json.loads(capsys.readouterr().out) == {"slack": None, "rows": [None, 1.0]}
 
 
+def test_fuzzing_prints_one_json_object_without_non_finite_numbers(capsys, monkeypatch):
+    result = {"all": {"peak_force": float("nan"), "max_commanded_violation": float("-inf")}, "failures": ["one"]}
+    monkeypatch.setattr("research.action_fuzzing.__main__.fuzz", lambda *_, **__: result)
+    code, out, _ = run(capsys, action_fuzzing, "Pouring", "--json")
+    assert code == 1
+    assert json.loads(out, parse_constant=pytest.fail) == {
+        "all": {"peak_force": None, "max_commanded_violation": None},
+        "failures": ["one"],
+    }
+
+
 def test_interrupted_program_exits_with_130(capsys):
     def interrupted(arguments):
         raise KeyboardInterrupt
