@@ -81,7 +81,8 @@ def _train(
     process = subprocess.run(command, capture_output=True, text=True)
     seconds = time.perf_counter() - start
     if process.returncode:
-        raise InputError(f"a run failed: {process.stderr.strip().splitlines()[-1]}")
+        lines = process.stderr.strip().splitlines() or [f"it ended with exit status {process.returncode}"]
+        raise InputError(f"a run failed: {lines[-1]}")
     return seconds
 
 

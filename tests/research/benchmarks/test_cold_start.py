@@ -30,8 +30,12 @@ def test_both_kinds_of_each_seed_are_timed(monkeypatch, bead_config, capsys):
     assert "seed 3" in capsys.readouterr().out
 
 
-def test_failing_run_is_reported(monkeypatch):
-    said = subprocess.CompletedProcess([], 2, stderr="at work\nguiderail: hold must be at least 1\n")
+@pytest.mark.parametrize(
+    ("code", "stderr", "reason"),
+    [(2, "at work\nguiderail: hold must be at least 1\n", "hold must be at least 1"), (-9, "", "exit status -9")],
+)
+def test_failing_run_is_reported(code, stderr, reason, monkeypatch):
+    said = subprocess.CompletedProcess([], code, stderr=stderr)
     monkeypatch.setattr(cold_start.subprocess, "run", lambda *_, **__: said)
-    with pytest.raises(InputError, match="hold must be at least 1"):
+    with pytest.raises(InputError, match=reason):
         cold_start.measure("NarrowPassage", {"action_repeat": -1}, episodes=1)
