@@ -149,11 +149,13 @@ class ReferenceTrajectory:
             floor: Standard deviation, (O,) or scalar, as in `from_demonstrations`.
 
         Raises:
-            InputError: If the times are wrong, or a covariance is singular: give a floor.
+            InputError: If the times are wrong, the floor is negative, or a covariance is singular: give a floor.
         """
         times = as_numbers(times, "times")
         if times.ndim != 1 or len(times) < 2 or not times[-1] > times[0]:
             raise InputError(f"a reference trajectory needs at least two increasing times (N,), not {times.shape}")
+        if not (np.isfinite(floor).all() and np.greater_equal(floor, 0.0).all()):
+            raise InputError(f"floor is a standard deviation and must not be negative: {floor}")
         means, covariances = promp.moments((times - times[0]) / (times[-1] - times[0]))
         return cls(times, means, covariances + np.eye(promp.num_outputs) * np.square(floor))
 

@@ -89,6 +89,9 @@ def test_reference_of_a_promp_equals_that_of_demonstrations():
         ReferenceTrajectory.from_demonstrations(d, model="dmp")
     with pytest.raises(InputError, match="increasing times"):
         ReferenceTrajectory.from_promp(ProMp.fit(d), [1.0, 1.0])
+    for floor in (-0.01, [0.01, np.nan]):
+        with pytest.raises(InputError, match="floor"):
+            ReferenceTrajectory.from_promp(ProMp.fit(d), T, floor=floor)
 
 
 def spread(scale, seed):
