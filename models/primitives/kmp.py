@@ -203,6 +203,8 @@ def _check_covariance(covariance: np.ndarray, what: str, outputs: int | None = N
     shape = covariance.shape if outputs is None else (outputs, outputs)
     if covariance.shape != shape or not np.isfinite(covariance).all():
         raise InputError(f"the {what}'s covariance must be finite and of shape {shape}, not {covariance.shape}")
+    if np.abs(covariance - covariance.T).max(initial=0.0) > 1e-9 * np.abs(covariance).max(initial=0.0):
+        raise InputError(f"the {what}'s covariance is not symmetric")  # a Cholesky factorization reads only one half
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError as error:

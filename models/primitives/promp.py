@@ -74,7 +74,8 @@ class ProMp:
             covariance: Covariance (O, O) of that output, positive definite.
 
         Raises:
-            InputError: If the phase is out of range, shapes do not match, or the covariance is not positive definite.
+            InputError: If the phase is out of range, shapes do not match, or the covariance is not symmetric or not
+                positive definite.
         """
         output, covariance = as_numbers(output, "a via-point"), as_numbers(covariance, "a via-point's covariance")
         if not 0.0 <= phase <= 1.0:
@@ -83,6 +84,8 @@ class ProMp:
             raise InputError(f"a via-point has {self.num_outputs} outputs and their covariance, not {output.shape}")
         if not (np.isfinite(output).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
             raise InputError("a via-point must be finite, and its covariance positive definite")
+        if np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
+            raise InputError("a via-point's covariance is not symmetric")
         blocks = self._blocks(np.array([phase]))[0]
         across = self.covariance @ blocks.T
         gain = np.linalg.solve(covariance + blocks @ across, across.T).T

@@ -87,6 +87,7 @@ def test_kmp_accepts_a_state_as_input():
         ((np.nan, [0.0, 0.0], np.eye(2)), "finite"),
         ((0.0, [0.0, np.inf], np.eye(2)), "finite"),
         ((0.0, [0.0, 0.0], np.zeros((2, 2))), "positive definite"),
+        ((0.0, [0.0, 0.0], np.array([[1.0, 0.5], [0.0, 1.0]])), "not symmetric"),
         ((0.0, [0.0, 0.0], np.eye(3)), "shape"),
     ],
 )

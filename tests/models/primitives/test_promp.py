@@ -62,6 +62,7 @@ def test_via_point_is_reached_and_moves_what_is_correlated():
         (0.5, np.zeros(3), np.eye(2)),
         (0.5, np.array([0.0, np.nan]), np.eye(2)),
         (0.5, np.zeros(2), -np.eye(2)),
+        (0.5, np.zeros(2), np.array([[1.0, 0.5], [0.0, 1.0]])),
     ],
 )
 def test_via_point_of_a_promp_is_refused(phase, output, covariance):
