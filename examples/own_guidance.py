@@ -16,7 +16,7 @@ from guiderail.diagrams.guidance.primitive import KgrlGuidance
 class AlongOptions(Options):
     """Options of the guidance, for `gymnasium.make` and `--env`."""
 
-    angle: float = Field(0.0, ge=-180, le=180, description="of the direction in the plane [degrees]")
+    angle: float = Field(0.0, ge=-180, le=180, description="angle of the direction in the plane [degrees]")
 
 
 @register_guidance("kgrl_along", needs=(("demonstrations",),), label="KGRL along a line", options=AlongOptions)

@@ -35,7 +35,7 @@ def reference_of_file(
         InputError: If there is no such file, or its demonstrations are not poses.
     """
     if not path.is_file():
-        raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teleoperate --record writes")
+        raise InputError(f"there is no file {path}: give one, such as guiderail teleoperate --record writes")
     with path.open("rb") as file:
         key = hashlib.file_digest(file, "sha256").digest(), components, floor, count, *sorted(fit.items())
     if key in _REFERENCES:

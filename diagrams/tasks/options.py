@@ -88,7 +88,7 @@ class PriorOptions(ReferenceOptions):
         ge=0.01,
         le=100,
         description="factor of the standard deviation, and so of exploration, where all demonstrations have a gap: "
-        "below 1 it stops exploration there, above 1 it widens it",
+        "below 1 it narrows exploration there, above 1 it widens it",
     )
 
     prior_std: PriorStd | None = Field(

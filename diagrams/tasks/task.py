@@ -299,7 +299,7 @@ class Task(ABC):
 
     @classmethod
     def declares_collision(cls) -> bool:
-        """Return True if the class or its constructor declares what a collision is."""
+        """Return True if the class declares `collision`, or has a constructor, which may declare it."""
         return cls.collision is not Task.collision or cls.__init__ is not Task.__init__
 
     @classmethod

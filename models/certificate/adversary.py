@@ -182,7 +182,7 @@ class Adversary:
         return order, o, int(steps[best]), -1.0 if middle[best] < 0.0 else 1.0
 
     def _variation(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return a worst sequence so far with parts negated, resampled or moved in time."""
+        """Return one of the worst sequences so far, with parts negated or resampled, and sometimes shifted in time."""
         worst, rng = self.result.worst, self._rng
         names = [name for name in worst if (name[0] not in QUANTITIES) or not self._attacks_budgets]
         if not names or not len(self._moved):

@@ -34,7 +34,7 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         The motion without actions (P + N, O), which begins with P copies of the start, and the generators around it
-        (P + N, O, B): one for each action, then one for each output of the start.
+        (P + N, O, B): one for each action of each step and, with a history, one for each output of the start.
     """
     primitive, past = loop.primitive, loop.primitive.history
     steps, outputs = primitive.num_steps, primitive.num_outputs

@@ -17,7 +17,7 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 # LIGHT [kg], only the impedance acts in this direction; above HEAVY [kg], only the posture's torque.
 LIGHT, HEAVY = 300.0, 3000.0
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
-_ROUNDING = 1e-9  # change of a wrench by a bound above which the wrench counts as saturated [N, Nm]
+_ROUNDING = 1e-9  # a wrench that a bound changes by more than this is saturated [N, Nm]
 _SCALE = np.repeat([1.0, LEVER], 3)
 
 

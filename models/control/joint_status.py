@@ -125,7 +125,7 @@ class StatusLimits:
         velocity_noise: Largest error of a velocity [rad/s], positive.
         settling_time: Time for which messages must have been valid before they are used [s], not negative. A driver
             that has just started accepts no commands during this time.
-        clock_drift: Largest drift between the two clocks [s/s], not negative; slower changes are no fault.
+        clock_drift: Largest drift between the two clocks [s/s], not negative; a slower drift is no fault.
         max_check_interval: Largest wall-clock time between two checks before a missed deadline is reported [s],
             positive.
     """

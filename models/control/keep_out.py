@@ -37,7 +37,7 @@ class KeepOut:
         if constraints.num_outputs != self._lower.shape[1] or constraints.num_steps is not None:
             raise InputError(f"constraints must be constant and on {self._lower.shape[1]} outputs, as the boxes are")
         if not margin >= 0:
-            raise InputError(f"a margin is a distance from 0, not {margin}")
+            raise InputError(f"a margin must be 0 or more, not {margin}")
         self.margin = float(margin)
         norms = np.linalg.norm(constraints.G, axis=1)
         self._constraints = LinearConstraints(constraints.G, constraints.c + self.margin * norms)

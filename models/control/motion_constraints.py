@@ -296,7 +296,7 @@ class MotionLimits:
             InputError: If the factor is out of range.
         """
         if not 0.0 < factor <= 1.0:
-            raise InputError(f"a share of the limits of a motion is from 0 to 1, not {factor}")
+            raise InputError(f"a factor of the limits of a motion is above 0 and at most 1, not {factor}")
         linear, angular = ((factor * v, factor * a, factor * j) for v, a, j in (self.linear, self.angular))
         return MotionLimits(linear, angular)
 

@@ -57,8 +57,8 @@ class EstimatorState:
     accepted_time: float  # time stamp of the accepted status [s]; NaN before the first
     accepted_offset: float  # clock offset after the accepted status [s]
     last_values: np.ndarray  # `JointStatus.values` of the last readable status, valid or not, (3n,)
-    # `JointStatus.values` of the accepted status, (3n,), with its velocity limited to the interval of the other two
-    # sources of the velocity; zero before the first.
+    # `JointStatus.values` of the accepted status, (3n,), with the velocity limited as described in `StateEstimator`;
+    # zero before the first accepted status.
     accepted_values: np.ndarray
     velocity: np.ndarray  # velocity estimate from several sources, (n,) [rad/s]; zero where it is unknown
     residual: np.ndarray  # recent difference between positions and integrated velocities, (n,) [rad]
@@ -187,7 +187,7 @@ class StateEstimator:
             return self._finish(state, before, fault, now)
 
         if fault == Fault.CONFLICT and not is_doubted:
-            # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
+            # The last statuses may be from a second robot, which does not react: the effect of the torques is added.
             reported = before.last_values[self._velocities]
             state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values
@@ -242,7 +242,7 @@ class StateEstimator:
     def _predict(self, before: EstimatorState, now: float, M: np.ndarray, drag: np.ndarray) -> EstimatorState:
         """Return the state with the effect of the torques since the last check."""
         step = max(now - before.check_time + self._period, 0.0)
-        # Without a recent status the external torque is unknown, and a wrong one may be why statuses are in doubt.
+        # The external torque is unknown without a recent status, and may be wrong while statuses are in doubt.
         age = now - step - (before.accepted_time + before.accepted_offset)
         is_known = np.isfinite(age) and not np.isfinite(before.doubt_time)
         freshness = np.clip(2.0 - age / self._period, 0.0, 1.0) if is_known else 0.0

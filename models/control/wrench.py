@@ -214,7 +214,7 @@ def external_wrench(
         The wrench of the surroundings on the tool (6,), [torque, force].
     """
     omega = V[:3]
-    momentum = M[:, :3] @ omega  # I ω, and m ω × p_PCom by the inertia's own coupling block
+    momentum = M[:, :3] @ omega  # I ω, and m ω × p_PCom from the coupling block of M
     wrench = M @ A - M[:, 3:] @ gravity - F_reaction
     wrench[:3] += cross(omega, momentum[:3])
     wrench[3:] += cross(omega, momentum[3:])

@@ -137,8 +137,8 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
 
     offset_shape: Literal["ring", "square"] = Field(
         "ring",
-        description="region of the fixture's offset: a ring with the radii offset_range, or the square of |x|, |y| up "
-        "to its greatest value",
+        description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
+        "and |y| are at most the greater of these radii",
     )
     fixture_turn: Number = Field(
         0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
@@ -172,8 +172,9 @@ class PartUncertainty(BncUncertainty):
 class ScriptedSearch:
     """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
 
-    A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows it sideways and so does
-    not push it against a wall. If the task has a `search_turn`, a third action turns a blocked plug back and forth.
+    A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows its sideways position,
+    so that the plug is not pushed against a wall. If the task has a `search_turn`, a third action turns a blocked plug
+    back and forth.
 
     An observed time that does not increase starts a new episode with a zero action. The search integrates the
     action and not the displacement, because the displacement per action depends on the guidance and changes during the

@@ -18,7 +18,7 @@ from guiderail.models.templates import SharedControlTemplate, load_template
 
 FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]
 FULL_TILT = 0.8  # tilting speed at an input of 1 [rad/s]
-SPARSE_INPUT_SPEED = 1.7  # default input_speed with the sparse reward: random inputs must sometimes succeed
+SPARSE_INPUT_SPEED = 1.7  # default input_speed of "sct" with the sparse reward: random inputs must succeed sometimes
 
 
 def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
@@ -80,7 +80,7 @@ class PouringOptions(Options):
         None,
         ge=0.2,
         le=2.0,
-        description="factor of the template's input speed; default: 1, or 1.7 with the sparse reward",
+        description="factor of the template's input speed; default: 1, or 1.7 with guidance=sct and the sparse reward",
     )
     mug_inner_diameter: Number = Field(MUG.inner_diameter, description="inner diameter of the mug [m]")
     mug_depth: Number = Field(MUG.depth, description="inner depth of the mug [m]")

@@ -280,7 +280,7 @@ class Pouring(Task):
             return sum(mug.contains(p_MB) for p_MB in positions(balls_in_mug)) >= needed
 
         def spilled(balls_in_mug: np.ndarray, balls_in_thermos: np.ndarray) -> bool:
-            # A ball that is in neither vessel and has fallen to the table, or past it.
+            # A ball has fallen if it is in neither vessel, and as low as a ball on the table or lower.
             fallen = sum(
                 p_MB[2] < radius - fall + 0.01 and not mug.contains(p_MB) and not thermos.contains(p_PB, 0.01)
                 for p_MB, p_PB in zip(positions(balls_in_mug), positions(balls_in_thermos), strict=True)

@@ -34,7 +34,8 @@ class ChunkGuardProcessorStep(ProcessorStep):
         jerk: Jerk limits [unit/s³].
         period: Control period [s], one over `--fps`.
         mode: "projection" or "slowdown".
-        start: Position at which an episode starts at rest; by default that of the observation in the first transition.
+        start: Position at which an episode starts at rest; by default the position within the bounds that is nearest to
+            the observation in the first transition.
         names: Names of the numbers, for actions and observations by name.
     """
 
@@ -70,8 +71,8 @@ class ChunkGuardProcessorStep(ProcessorStep):
         """Return the transition with its action within the limits.
 
         Raises:
-            ValueError: If the action has the wrong shape or names or is not finite, or the start is unknown or outside
-                of the bounds.
+            ValueError: If the action has the wrong shape or names or is not finite, the start is unknown, or `start` is
+                outside of the bounds.
         """
         action = transition.get(TransitionKey.ACTION)
         by_name = isinstance(action, dict)

@@ -57,7 +57,7 @@ class GuiderailRobot(Robot):
 
     @cached_property
     def _description(self) -> dict[str, Any]:
-        """First line that guiderail's process prints. If no process runs, one is started and ended for it."""
+        """First line that guiderail's process prints. If no process runs, one is started to read it."""
         if self._process is not None:
             return self._receive()
         self._start()

@@ -55,7 +55,8 @@ WAYPOINTS = np.array(
         [8.0, 0.0, 0.0],
     ]
 )
-# Standard deviations of the hand in addition to the circle: begin and end of the search, inserted, turned and locked.
+# Standard deviations of the hand in addition to the circle: at the start, where the circle begins to shrink, inserted,
+# turned and locked.
 _TIMES = [0.0, HOLD_UNTIL, IN_BY, 7.0, 8.0]  # [s]
 _DEVIATIONS = {
     "x": np.array([0.05, 0.05, 0.15, 0.15, 0.10]) * MM,

@@ -21,7 +21,7 @@ class PassageGeometry:
         wall_length: Length of each wall, beyond the reach of the robot.
         zone_x: Lower bound of x in the restricted zone.
         obstacle, obstacle_radius: Disc on the path of the demonstrations, which were recorded without it. It has a
-            cost and does not collide.
+            cost, and the robot can pass through it.
         second_obstacle: Position of a second such disc, or None.
         obstacles_move: True if the positions of the discs are sampled in every episode.
         obstacle_margin: Distance from a disc within which it has a cost.

@@ -36,7 +36,7 @@ def test_scaled_limits_are_a_share_of_each_limit():
 
 @pytest.mark.parametrize("factor", [0.0, -0.1, 1.001, np.nan])
 def test_scaled_refuses_a_factor_out_of_range(factor):
-    with pytest.raises(InputError, match="from 0 to 1"):
+    with pytest.raises(InputError, match="above 0 and at most 1"):
         FRANKA_LIMITS.scaled(factor)
 
 
