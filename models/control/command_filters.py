@@ -1,13 +1,15 @@
 """Filters of commanded positions that depend on the last command: a control barrier function, and ATACOM.
 
 Each filter bounds the change of a command from one control step to the next by constraints with rows of unit norm,
-h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one.
+h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. A desired command that
+is not finite repeats the last command.
 """
 
 from typing import Protocol
 
 import numpy as np
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import UnsolvableError
@@ -70,6 +72,8 @@ class BarrierFilter(_LastCommand):
 
         If the last command violates a constraint and no allowed command is found, the last command is repeated.
         """
+        if not is_finite(desired):
+            return last.copy(), True
         G, c = self._keep_out.half_spaces(last)
         bounds = c + (1.0 - self._decay) * (G @ last - c)
         missing = bounds - G @ desired
@@ -112,10 +116,12 @@ class TangentSpaceFilter(_LastCommand):
         self.num_outputs = keep_out.num_outputs
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the safe command (O,), and True if the step had to be shortened at a constraint.
+        """Return the safe command (O,), and True if the step had to be shortened.
 
         Outside a constraint the error c − G y is corrected by the same pseudoinverse, as in ATACOM.
         """
+        if not is_finite(desired):
+            return last.copy(), True
         G, c = self._keep_out.half_spaces(last)
         if not c.size:
             return desired.copy(), False

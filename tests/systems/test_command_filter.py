@@ -74,6 +74,17 @@ def test_command_outside_returns_to_the_constraints(law):
     assert (np.diff([1.4, *distances]) <= 1e-9).all()
 
 
+@pytest.mark.parametrize("desired", [[np.nan, 0.0], [np.inf, 0.0]])
+@pytest.mark.parametrize(
+    "keep_out", [KEEP_OUT, KeepOut(np.empty((0, 2)), np.empty((0, 2)), LinearConstraints.none(2), 0.0)]
+)
+def test_command_that_is_not_finite_repeats_the_last_one(keep_out, desired):
+    for law in (BarrierFilter(keep_out, 0.3), TangentSpaceFilter(keep_out, 0.2)):
+        command, is_changed = law.apply(np.array([0.1, 0.2]), np.array(desired))
+        np.testing.assert_array_equal(command, [0.1, 0.2])
+        assert is_changed
+
+
 @pytest.mark.parametrize("decay", [0.0, -0.1, 1.1, np.nan])
 def test_barrier_raises_when_the_decay_is_out_of_range(decay):
     with pytest.raises(InputError, match="fraction"):
