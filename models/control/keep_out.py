@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 
 class KeepOut:
@@ -18,10 +19,10 @@ class KeepOut:
         lower: Lower corners of the boxes (B, O).
         upper: Upper corners of the boxes (B, O); a box may extend to infinity.
         constraints: G y ≥ c on positions (O,), the same at every step.
-        margin: Distance from boxes and constraints, not negative.
+        margin: Distance from boxes and constraints, finite and not negative.
 
     Raises:
-        InputError: If shapes do not match, a box is empty, or the margin is negative.
+        InputError: If shapes do not match, a box is empty, or the margin is out of range.
 
     Attributes:
         margin: Distance from boxes and constraints [unit of a position].
@@ -36,8 +37,8 @@ class KeepOut:
             raise InputError("each box needs a lower corner below its upper corner")
         if constraints.num_outputs != self._lower.shape[1] or constraints.num_steps is not None:
             raise InputError(f"constraints must be constant and on {self._lower.shape[1]} outputs, as the boxes are")
-        if not margin >= 0:
-            raise InputError(f"a margin must be 0 or more, not {margin}")
+        if not 0 <= margin < math.inf:
+            raise InputError(f"a margin must be finite and 0 or more, not {margin}")
         self.margin = float(margin)
         norms = np.linalg.norm(constraints.G, axis=1)
         self._constraints = LinearConstraints(constraints.G, constraints.c + self.margin * norms)
@@ -50,7 +51,13 @@ class KeepOut:
         return self._lower.shape[1]
 
     def project(self, position: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the allowed position (O,) for a current and a desired one (O,), and True if a box changed it."""
+        """Return the allowed position (O,) for a current and a desired one (O,), and True if a box changed it.
+
+        Raises:
+            UnsolvableError: If a position is not finite.
+        """
+        if not (is_finite(position) and is_finite(desired)):
+            raise UnsolvableError(f"positions must be finite to stop before walls, not {position} and {desired}")
         target, was_in_box = self._project_to_faces(self._project_to_constraints(desired))
         if was_in_box:
             target = self._project_to_constraints(target)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 SEEDS = st.integers(0, 2**32 - 1)
 MARGIN = 0.05
@@ -173,6 +173,16 @@ def test_constructor_refuses_invalid_arguments():
     ):
         with pytest.raises(InputError):
             KeepOut(lower, upper, constraints, 0.1)
-    with pytest.raises(InputError):
-        KeepOut([[0, 0]], [[1, 1]], none, np.nan)
+    for margin in (np.nan, np.inf, -0.1):
+        with pytest.raises(InputError, match="margin"):
+            KeepOut([[0, 0]], [[1, 1]], none, margin)
     assert KeepOut([[0, 0]], [[1, 1]], none, 0.0).margin == 0.0
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_position_that_is_not_finite_is_refused(wrong):
+    wall = KeepOut([[0.4, -9.0]], [[0.6, 9.0]], LinearConstraints.none(2), 0.02)
+    positions = np.array([0.2, 0.2]), np.array([wrong, 0.2])
+    for position, desired in (positions, positions[::-1]):
+        with pytest.raises(UnsolvableError, match="finite"):
+            wall.project(position, desired)
