@@ -91,18 +91,24 @@ class MotionConstraints:
         return None
 
     def violations(self, output: np.ndarray, step: int = 0) -> Violations:
-        """Return the largest violation of each kind of constraint by one command (O,); negative inside."""
+        """Return the largest violation of each kind of constraint by one command (O,); negative inside.
+
+        A violation is NaN if a constraint's own violation is NaN, as for a command with NaN.
+        """
         shapes = [-shape.distance(output[: shape.num_dims]) for shape in self.outside]
         shapes += [shape.distance(output[: shape.num_dims]) for shape in self.inside]
-        state = (constraint.violation(output) for constraint in self.state)
-        return Violations(
-            self.linear.violation(output, step), max(shapes, default=-np.inf), max(state, default=-np.inf)
-        )
+        state = [constraint.violation(output) for constraint in self.state]
+        return Violations(self.linear.violation(output, step), _largest(shapes), _largest(state))
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
         """Return the largest of the `violations` of a command (O,); an angle counts as its arc at `LEVER`."""
         linear, shapes, state = self.violations(output, step)
-        return max(linear, shapes, LEVER * state)
+        return _largest([linear, shapes, LEVER * state])
+
+
+def _largest(violations: list[float]) -> float:
+    """Return the largest violation, −inf if there is none; NaN if one is NaN, which Python's `max` may ignore."""
+    return float(np.max(violations, initial=-np.inf))
 
 
 class MotionConstraintFilter:

@@ -64,6 +64,13 @@ def test_allowed_command_is_unchanged_and_another_one_is_nearest():
     np.testing.assert_allclose(law.apply(state, np.array([0.3, -0.2]))[0][:2], [0.3, 0.0], atol=1e-9)
 
 
+@pytest.mark.parametrize("linear", [LINEAR, LinearConstraints.none(2)])
+def test_violation_by_a_command_with_nan_is_nan(linear):
+    constraints = MotionConstraints(linear, OUTSIDE, [Sphere([0.0, 0.0], 1.0)])
+    assert np.isnan(constraints.violation(np.full(2, np.nan)))
+    assert np.isnan(constraints.violations(np.full(2, np.nan)).shapes)
+
+
 @pytest.mark.parametrize("desired", [[np.nan, 0.0], [np.inf, 0.0]])
 def test_command_that_is_not_finite_brakes(desired):
     law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE, (), SPEED, ACCELERATION), PERIOD)
