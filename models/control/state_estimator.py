@@ -158,6 +158,8 @@ class StateEstimator:
             raise InputError(f"a robot with {n} joints needs a torque tolerance for each of them")
         if not ((self._torque_tolerance > 0.0) & (self._torque_tolerance < np.inf)).all():
             raise InputError("the torque tolerances of a robot must be positive and finite")
+        if not 0.0 < period < np.inf:
+            raise InputError(f"the period of an estimator must be positive, not {period} s")
         self._zeros = np.zeros(n)
         self._positions, self._velocities, self._torques = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
 

@@ -969,6 +969,12 @@ def test_constructor_refuses_torque_tolerances_out_of_range(tolerance):
         StateEstimator(LIMITS, tolerance, period=PERIOD)
 
 
+@pytest.mark.parametrize("period", [0.0, -PERIOD, np.nan, np.inf])
+def test_constructor_refuses_a_period_out_of_range(period):
+    with pytest.raises(InputError, match="period"):
+        StateEstimator(LIMITS, TOLERANCE, period=period)
+
+
 def test_commanded_impulse_is_not_learned_when_the_command_ends():
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     for _ in range(10):
