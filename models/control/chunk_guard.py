@@ -106,13 +106,16 @@ class ChunkGuard:
 
         Args:
             chunk: Requested outputs (K, O), from the next control step on; values that are not finite are refused.
-            num_executed: Steps of the result that are executed before the next call; all by default.
+            num_executed: Steps of the result that are executed before the next call, from 0 to K; all by default.
 
         Raises:
-            InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite.
+            InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite, or
+                `num_executed` is out of range.
         """
         result = self.limit(chunk, self._past, self._plan)
         number = len(result.outputs) if num_executed is None else num_executed
+        if number not in range(len(result.outputs) + 1):
+            raise InputError(f"{brief(num_executed)} steps of a chunk of {len(result.outputs)} can't be executed")
         self._past = np.concatenate([self._past, result.outputs[:number]])[-3:]
         self._plan = result.outputs[min(number, len(result.outputs) - 1) :]
         return result

@@ -69,6 +69,12 @@ def test_guard_is_refused_when_an_argument_is_out_of_range():
         with pytest.raises(InputError, match="chunk"):
             make().guard(chunk)
     make().guard(np.zeros((4, 2)))
+    refusing, plain = make(), make()
+    for number in (-1, 5, 1.5):
+        with pytest.raises(InputError, match="executed"):
+            refusing.guard(np.full((4, 2), 0.01), number)
+    outputs = [one.guard(np.full((4, 2), 0.01)).outputs for one in (refusing, plain)]
+    np.testing.assert_array_equal(*outputs)
 
 
 def test_constraint_on_two_outputs_holds_and_couples_only_them():
