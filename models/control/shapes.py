@@ -116,7 +116,8 @@ class Box(ConvexShape):
 
     def __init__(self, lower: ArrayLike, upper: ArrayLike, margin: float = 0.0):
         self.lower, self.upper = as_numbers(lower, "a lower corner"), as_numbers(upper, "an upper corner")
-        if self.lower.ndim != 1 or self.lower.shape != self.upper.shape or not (self.lower < self.upper).all():
+        is_corner = self.lower.ndim == 1 and self.lower.size > 0 and self.lower.shape == self.upper.shape
+        if not is_corner or not (self.lower < self.upper).all():
             raise InputError(f"a box needs a lower corner below its upper one, not {brief(lower)} and {brief(upper)}")
         self.margin, self.num_dims = _length(margin, "a margin", can_be_zero=True), len(self.lower)
 

@@ -131,6 +131,7 @@ def test_linearized_constraints_without_shapes_are_the_given_ones():
         (lambda: Sphere([0.0, 0.0], 0.1, -1e-3), "margin"),
         (lambda: Box([0.0, 0.0], [1.0, 0.0]), "lower corner"),
         (lambda: Box([0.0], [1.0, 1.0]), "lower corner"),
+        (lambda: Box([], []), "lower corner"),
         (lambda: Cylinder([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.1), "different points"),
         (lambda: Cylinder([0.0, 0.0], [0.0, 1.0], 0.1), "different points"),
         (lambda: Cylinder([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], np.inf), "radius"),
