@@ -225,11 +225,11 @@ def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) 
     """Return copies of stiffness and damping (6,) of a pose's coordinates; `owner` is a name for messages.
 
     Raises:
-        InputError: If a shape is wrong, a stiffness is not positive, or a damping is negative.
+        InputError: If a shape is wrong, a stiffness is not positive, a damping is negative, or one is not finite.
     """
     K, D = np.array(stiffness, dtype=float), np.array(damping, dtype=float)
-    if not K.shape == D.shape == (6,) or not (K > 0.0).all() or not (D >= 0.0).all():
-        raise InputError(f"{owner} needs six positive stiffnesses and six dampings, none negative")
+    if not K.shape == D.shape == (6,) or not ((K > 0.0) & (D >= 0.0) & np.isfinite(K) & np.isfinite(D)).all():
+        raise InputError(f"{owner} needs six positive stiffnesses and six dampings, none negative, all finite")
     return K, D
 
 

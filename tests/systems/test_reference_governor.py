@@ -58,6 +58,8 @@ def test_motion_leaves_less_for_the_spring():
     [
         ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
         ({"damping": np.full(5, 1.0)}, "six positive stiffnesses"),
+        ({"stiffness": np.full(6, np.inf)}, "all finite"),
+        ({"damping": np.full(6, np.inf)}, "all finite"),
         ({"mass": 0.0}, "moving mass must be positive"),
         ({"step": 0.0}, "period must be positive"),
     ],
