@@ -40,8 +40,8 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
 
     def add(task: TaskClass) -> TaskClass:
         _check(name, task)
-        task.name = name
         TASKS.register(name, task)
+        task.name = name
         _register_env(name)
         return task
 

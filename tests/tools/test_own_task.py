@@ -303,3 +303,10 @@ def test_check_accepts_the_name_of_a_shipped_template(monkeypatch):
     loaded, none = validate_template(Path("pouring"))["transitions"]
     assert loaded == "translational → tilt below 0.25 m, back above 0.27 m"
     assert none == "tilt → pour below 0.075 m, no way back"
+
+
+def test_task_keeps_its_name_when_another_name_is_taken():
+    task, _ = TASKS.get("NarrowPassage"), TASKS.get("GridClamp")
+    with pytest.raises(InputError, match="already"):
+        register_task("GridClamp")(task)
+    assert task.name == "NarrowPassage"
