@@ -133,10 +133,13 @@ def test_settings_of_another_guidance_are_accepted():
         ({"reward": lambda self, pose: np.nan}, "reward term 'a' of lab/Own is not finite, but nan"),
         ({"reward": lambda self, pose: pose}, "reward term 'a' of lab/Own must be one number, and it is array"),
         ({"reward": lambda self, pose: None}, "reward term 'a' of lab/Own must be one number, and it is None"),
-        ({"reward": lambda self, place: 0.0}, "reward term 'a' of lab/Own is called with .*, pose, and takes place"),
+        (
+            {"reward": lambda self, place: 0.0},
+            "reward term 'a' of lab/Own is called with .*pose.*, but its .* parameters .place",
+        ),
         (
             {"termination_terms": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
-            "the condition 'success' of lab/Own is called with .*, pose, and takes position",
+            "the condition 'success' of lab/Own is called with .*pose.*, but its .* parameters .position",
         ),
         (
             {"reset": lambda self, *given: None},
