@@ -36,14 +36,23 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
         raw = np.asarray(values)
         if raw.dtype.kind not in "fiubO":
             raise InputError(f"{what} is not an array of numbers: it holds {raw.dtype}")
+        if any(isinstance(value, str | bytes) for value in _objects(raw)):
+            raise InputError(f"{what} is not an array of numbers: it holds text")
         array = np.array(raw, dtype=float)
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is not an array of numbers: {error}") from error
-    if raw.dtype.kind in "iu" and raw.dtype.itemsize == 8 and (np.abs(array) >= _EXACT).any():
+    is_rounded = raw.dtype.kind in "iu" and raw.dtype.itemsize == 8 and bool((np.abs(array) >= _EXACT).any())
+    # NumPy holds whole numbers of 2^64 and more as objects.
+    if is_rounded or any(isinstance(value, int | np.integer) and abs(int(value)) >= _EXACT for value in _objects(raw)):
         raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
     return array
+
+
+def _objects(array: np.ndarray) -> Iterable[object]:
+    """Return the elements of an array of objects, none of an array of numbers."""
+    return array.flat if array.dtype.kind == "O" else ()
 
 
 def find_streak(successes: Iterable[bool], length: int) -> int | None:

@@ -1,0 +1,25 @@
+import numpy as np
+import pytest
+
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError
+
+
+@pytest.mark.parametrize("values", [[2**53], [2**63], [2**64], [0.5, 2**70], np.array([1, 2**60], dtype=object)])
+def test_whole_numbers_that_a_double_rounds_are_refused(values):
+    with pytest.raises(InputError, match="the lengths holds whole numbers"):
+        as_numbers(values, "the lengths")
+
+
+@pytest.mark.parametrize(
+    "values", [["1.5", "2"], np.array(["1.5", 2.0], dtype=object), np.array([b"3", 1], dtype=object)]
+)
+def test_text_is_refused_even_if_it_is_a_number(values):
+    with pytest.raises(InputError, match="the lengths is not an array of numbers"):
+        as_numbers(values, "the lengths")
+
+
+def test_objects_that_are_numbers_are_converted_to_doubles():
+    numbers = as_numbers(np.array([1, np.float32(2.5), True, 2**53 - 1], dtype=object), "the lengths")
+    np.testing.assert_array_equal(numbers, [1.0, 2.5, 1.0, 2.0**53 - 1.0])
+    assert numbers.dtype == float
