@@ -87,7 +87,9 @@ def test_actions_by_name_start_at_the_observed_position(guard):
         (torch.full((1, 2), float("nan")), "finite"),
         (torch.zeros(1, 3), "shape"),
         (torch.zeros(2, 2), "shape"),
+        (torch.zeros(1, 0, 2), "shape"),
         ({"a.pos": 0.0}, "b.pos"),
+        ({"a.pos": 0.0, "b.pos": 0.0, "gripper.pos": 1.0}, "drop.*gripper.pos"),
     ],
 )
 def test_action_is_refused_when_it_does_not_fit(guard, action, words):

@@ -76,12 +76,15 @@ class ChunkGuardProcessorStep(ProcessorStep):
         """
         action = transition.get(TransitionKey.ACTION)
         by_name = isinstance(action, dict)
+        if by_name and (unknown := sorted(set(action) - set(self.names))):
+            raise ValueError(f"the guard would drop the numbers {unknown} of an action: give limits and names for them")
         values = self._of_names(action) if by_name else np.asarray(torch.as_tensor(action).detach().cpu(), dtype=float)
         if not self._is_started:
             self._guard.reset(self._find_start(transition.get(TransitionKey.OBSERVATION)))
             self._is_started = True
         size = len(self.velocity)
-        if not 1 <= values.ndim <= 3 or values.shape[-1] != size or (values.ndim > 1 and len(values) != 1):
+        is_alone = values.ndim == 1 or (values.ndim in (2, 3) and len(values) == 1)
+        if not is_alone or values.shape[-1] != size or not values.size:
             raise ValueError(f"an action has the shape ({size},), (1, {size}) or (1, K, {size}), not {values.shape}")
         chunk = values.reshape(-1, size)
         number = len(chunk)
