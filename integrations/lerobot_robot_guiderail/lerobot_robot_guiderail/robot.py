@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 SUFFIX = ".pos"  # LeRobot's rollout gives a policy only numbers with this ending
 POSE_NAMES = ("x", "y", "z", "rz", "ry", "rx")
 WRENCH_NAMES = ("fx", "fy", "fz", "tx", "ty", "tz")
-STOP_TIME = 10.0  # longest wait for the end of guiderail's process [s]
+STOP_TIME = 10.0  # longest wait for the end of guiderail's process before it is killed [s]
 
 
 @RobotConfig.register_subclass("guiderail")
@@ -154,6 +154,7 @@ class GuiderailRobot(Robot):
             raise ConnectionError(f"{self} is not connected: call connect() first")
 
     def _start(self) -> None:
+        self._stop()  # closes the pipes of a process that has ended
         config = self.config
         command = [config.python, "-m", "guiderail.tools.env_server", config.environment, json.dumps(config.options)]
         try:
@@ -164,8 +165,11 @@ class GuiderailRobot(Robot):
     def _stop(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            process.communicate()  # closes the input of the process, which then ends
-            process.wait(STOP_TIME)
+            try:
+                process.communicate(timeout=STOP_TIME)  # closes the input of the process, which then ends
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.communicate()
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         assert self._process is not None
