@@ -35,7 +35,7 @@ def export(run: Path | str, out: Path | str) -> GuiderailPolicy:
     description, weights = json.loads((run / "policy.json").read_text()), load_file(run / "policy.safetensors")
     if description.get("format") != FORMAT:
         raise ValueError(f"{run} has no policy of the format {FORMAT!r}")
-    if len(description["observation_shape"]) != 1:
+    if len(description["observation_shape"]) != 1 or description.get("image_shape") is not None:
         raise ValueError("a policy that observes images cannot be exported")
     number = len(weights) // 2
     sizes = [weights["layers.0.weight"].shape[1], *(len(weights[f"layers.{i}.bias"]) for i in range(number))]

@@ -1,0 +1,51 @@
+"""Export of a policy to LeRobot, with doubles of LeRobot's modules.
+
+`make lerobot` tests it with the real library.
+"""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/export.py"
+IMPORTED = {
+    "lerobot.configs": ("FeatureType", "PolicyFeature"),
+    "lerobot.utils.constants": ("ACTION", "OBS_STATE"),
+    "lerobot_robot_guiderail.configuration_guiderail": ("GuiderailConfig",),
+    "lerobot_robot_guiderail.modeling_guiderail": ("GuiderailPolicy",),
+    "lerobot_robot_guiderail.processor_guiderail": ("make_guiderail_pre_post_processors",),
+}
+
+
+@pytest.fixture
+def module(monkeypatch):
+    """Return the module, imported with doubles of LeRobot's modules and of those that need LeRobot."""
+    for name in ("lerobot", "lerobot.utils", "lerobot_robot_guiderail"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    for name, contents in IMPORTED.items():
+        double = ModuleType(name)
+        vars(double).update({content: MagicMock() for content in contents})
+        monkeypatch.setitem(sys.modules, name, double)
+    spec = importlib.util.spec_from_file_location("guiderail_lerobot_export", FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    "observation", [{"observation_shape": [8, 8, 3]}, {"observation_shape": [199], "image_shape": [8, 8, 3]}]
+)
+def test_policy_that_observes_images_is_refused(module, observation, tmp_path):
+    weights = {"layers.0.weight": np.zeros((2, 19), np.float32), "layers.0.bias": np.zeros(2, np.float32)}
+    save_file(weights, tmp_path / "policy.safetensors")
+    description = {"format": module.FORMAT, "action_low": [-1.0] * 2, "action_high": [1.0] * 2, "pool": 4} | observation
+    (tmp_path / "policy.json").write_text(json.dumps(description))
+    with pytest.raises(ValueError, match="observes images"):
+        module.export(tmp_path, tmp_path / "out")
