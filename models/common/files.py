@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import threading
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -15,10 +16,12 @@ from guiderail.models.common.errors import InputError
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file atomically: readers find the old content or the new, even if the process is killed.
 
+    Several processes and threads may write the same file; the last of them to finish wins.
+
     Raises:
         InputError: If the file cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f".{path.name}.{threading.get_native_id()}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as file:

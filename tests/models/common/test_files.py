@@ -1,3 +1,7 @@
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from guiderail.models.common.errors import InputError
@@ -9,3 +13,13 @@ def test_write_atomically_refuses_a_path_below_a_file(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         write_atomically(tmp_path / "file" / "table.csv", b"")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_threads_that_write_one_file_do_not_mix_their_contents(tmp_path, monkeypatch):
+    both_have_written, contents = threading.Barrier(2, timeout=20.0), (b"a" * 1000, b"b" * 2000)
+    monkeypatch.setattr(os, "fsync", lambda file: both_have_written.wait())
+    with ThreadPoolExecutor(2) as pool:
+        for written in [pool.submit(write_atomically, tmp_path / "file", content) for content in contents]:
+            written.result()
+    assert (tmp_path / "file").read_bytes() in contents
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
