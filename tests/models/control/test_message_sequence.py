@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.control import message_sequence as module
 from guiderail.models.control.joint_status import MALFORMED_STATUS, MAX_MISSED_MESSAGES, JointStatus
 from guiderail.models.control.message_sequence import CommandSequence, StatusSequence
@@ -203,3 +204,10 @@ def test_level_does_not_fall_below_zero():
     times = [0.0, *(10.0 + 1e-3 * np.arange(9))]
     nows = [0.0, *np.full(9, 10.0)]
     assert count(times, nows) == 1
+
+
+@pytest.mark.parametrize("period", [0.0, -PERIOD, np.nan, np.inf])
+@pytest.mark.parametrize("kind", [StatusSequence, CommandSequence])
+def test_constructor_refuses_a_period_out_of_range(kind, period):
+    with pytest.raises(InputError, match="period"):
+        kind(period)
