@@ -372,9 +372,9 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
             gyration=part.gyration,
             color=COLORS[name],
         )
-        path = folder / f"{name}.sdf"
-        if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            write_atomically(path, text.encode())  # other processes may read it meanwhile
+        path, content = folder / f"{name}.sdf", text.encode()
+        if not path.is_file() or path.read_bytes() != content:
+            write_atomically(path, content)  # other processes may read it meanwhile
     return PartWorkcell(
         folder,
         cast(tuple[float, float, float], file.place),

@@ -14,7 +14,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE
 from guiderail.diagrams.tasks.part.file import Bounds, read_task_file
-from guiderail.diagrams.tasks.part.task import load_task_folder
+from guiderail.diagrams.tasks.part.task import load_task_folder, write_workcell
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.sdf import lathe
@@ -126,6 +126,15 @@ def test_folder_is_the_same_task_until_a_file_changes(tmp_path):
             (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
         tasks.append(load_task_folder(folder))
     assert len(set(tasks)) == 5
+
+
+def test_sdf_files_are_written_again_when_they_are_damaged(tmp_path):
+    folder = write(tmp_path / "damaged")
+    workcell = write_workcell(folder, read_task_file(folder))
+    content = workcell.sdf("plug").read_bytes()
+    workcell.sdf("plug").write_bytes(b"\xff" + content)
+    write_workcell(folder, read_task_file(folder))
+    assert workcell.sdf("plug").read_bytes() == content
 
 
 def test_part_offers_no_station_that_cannot_simulate_meshes(tmp_path):
