@@ -138,7 +138,7 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
     offset_shape: Literal["ring", "square"] = Field(
         "ring",
         description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
-        "and |y| are at most the greater of these radii",
+        "and |y| are at most the greater of these radii, which needs fixture_offset=per_episode",
     )
     fixture_turn: Number = Field(
         0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
@@ -239,6 +239,11 @@ class PartInsertion(DemonstratedInsertion):
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
+        if self.options.offset_shape == "square" and self.options.fixture_offset != "per_episode":
+            raise InputError(
+                "offset_shape=square samples the fixture's offset in every episode: choose fixture_offset=per_episode, "
+                "or offset_shape=ring"
+            )
         self.offsets = PartUncertainty(self.options)
         self.collision = Threshold("contact_force", self.options.largest_force_limit)
         self.num_steps = self.reference().num_steps

@@ -128,6 +128,14 @@ def test_folder_is_the_same_task_until_a_file_changes(tmp_path):
     assert len(set(tasks)) == 5
 
 
+@pytest.mark.parametrize("kind", ["per_run", "none"])
+def test_square_of_offsets_is_refused_unless_sampled_per_episode(tmp_path, kind):
+    folder = str(write(tmp_path / "square"))
+    assert EnvConfig.resolve(folder, {"difficulty": "automate"}).make_task().offsets.is_square
+    with pytest.raises(InputError, match="choose fixture_offset=per_episode"):
+        EnvConfig.resolve(folder, {"difficulty": "automate", "fixture_offset": kind}).make_task()
+
+
 def test_sdf_files_are_written_again_when_they_are_damaged(tmp_path):
     folder = write(tmp_path / "damaged")
     workcell = write_workcell(folder, read_task_file(folder))
