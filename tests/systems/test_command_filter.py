@@ -14,8 +14,6 @@ BOX = LinearConstraints.box([-1.0, -np.inf], [1.0, np.inf])
 WALL = ([[0.5, 2.0]], [[9.0, 3.0]])  # above y = 2 where x > 0.5
 KEEP_OUT = KeepOut(*WALL, BOX, margin=0.1)
 LAWS = {"barrier": BarrierFilter(KEEP_OUT, 0.3), "tangent": TangentSpaceFilter(KEEP_OUT, 0.2)}
-UNBOUNDED = LinearConstraints.box([-np.inf, -np.inf], [np.inf, np.inf])
-FREE = TangentSpaceFilter(KeepOut(np.empty((0, 2)), np.empty((0, 2)), UNBOUNDED, margin=0.0), 0.2)
 
 
 def margin(point):
@@ -118,7 +116,19 @@ def test_system_starts_at_the_measured_pose_and_keeps_the_last_command():
     assert system.get_safe_pose_output_port().Eval(context)[0] == pytest.approx(0.3 * 0.9)
 
 
-@pytest.mark.parametrize("law", [*LAWS.values(), FREE], ids=[*LAWS, "free"])
+class PassThrough:
+    """A user's law that returns every desired command."""
+
+    num_outputs = 2
+
+    def apply(self, last, desired):
+        return desired.copy(), False
+
+    def start(self, pose):
+        return pose.copy()
+
+
+@pytest.mark.parametrize("law", [LAWS["barrier"], PassThrough()])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_last_command_repeats_when_desired_one_is_not_finite(law, bad):
     system = CommandFilter(law, PERIOD)
