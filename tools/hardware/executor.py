@@ -141,12 +141,11 @@ class SkillExecutor:
         self._clock.advance(self._simulator, station, round((station.limits.damping_time + 0.1) / station.period))
 
     def _return_control(self) -> None:
-        """Give control back to the approach's station, because a simulator that raised cannot be advanced."""
+        """Control the arm by the approach's station in a new simulator: one that raised cannot be advanced."""
         station, root_context = self._active_station()
-        if station is self._skill_station:
-            context = station.GetMyContextFromRoot(root_context)
-            self._simulator = start_simulator(self._station, self._clock)
-            self._station.copy_state_from(self._simulator.get_mutable_context(), station, context)
+        context = station.GetMyContextFromRoot(root_context)
+        self._simulator = start_simulator(self._station, self._clock)
+        self._station.copy_state_from(self._simulator.get_mutable_context(), station, context)
 
     def _active_station(self) -> tuple[HardwareStation, Context]:
         """Return the station that controls the arm, and the root context."""

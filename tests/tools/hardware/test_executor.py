@@ -133,6 +133,24 @@ def test_arm_rests_when_the_policy_returns_no_action(make_executor, valid):
     assert np.abs(velocities).max() < 0.01
 
 
+def test_arm_rests_when_a_step_of_the_approach_raises(make_executor):
+    def interrupt(context):
+        raise KeyboardInterrupt
+
+    executor, clock = make_executor()
+    clock.happens[200] = lambda: executor._simulator.set_monitor(interrupt)
+    commands = []
+    executor._station.driver.lcm.Subscribe(
+        "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        executor.run(print)
+    assert len(executor.trace) == 0
+    assert commands[-1] == (0.0,) * 7
+    velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(clock.simulator.get_context()))
+    assert np.abs(velocities).max() < 0.01
+
+
 def test_execution_ends_when_statuses_stop(make_executor):
     executor, clock = make_executor()
     clock.happens[300] = lambda: setattr(clock, "is_silent", True)
