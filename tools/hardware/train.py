@@ -168,7 +168,9 @@ def _train(
             finally:
                 # An error in one step must not skip the others: the disk or the training process may have failed. The
                 # current policy is saved before the training process finishes, and again after it.
-                for save in (*due, save_learned, learner.finish, save_learned):
+                # Only waiting is skipped, because it would resume the arm; the checkpoint waits without the arm.
+                left = (save for save in due if save is not wait_until_learned)
+                for save in (*left, save_learned, learner.finish, save_learned):
                     with suppress(Exception):
                         save()
         raise

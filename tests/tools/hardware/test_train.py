@@ -29,6 +29,7 @@ from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import RobotSession, robot_session
 from guiderail.tools.hardware.sim_driver import START
 from guiderail.tools.hardware.train import _train, train_on_robot
+from guiderail.tools.learning.pipelined import PipelinedLearner
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 
@@ -142,6 +143,11 @@ def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path,
         if len(before) == 6:  # the first call of the second episode
             raise InputError("not confirmed: nothing moves")
 
+    receive = PipelinedLearner.receive_learned
+    # The first episode is being learned until the exception.
+    monkeypatch.setattr(
+        PipelinedLearner, "receive_learned", lambda one: (not one.submitted or len(before) > 6) and receive(one)
+    )
     monkeypatch.setattr(env, "idle", refuse)
     with pytest.raises(InputError, match="not confirmed"):
         _train(folder, config, env, waits=True, report=lambda row: None)
@@ -150,6 +156,7 @@ def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path,
     assert len(read_step_log(folder.steps)) == 20
     assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
     assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP  # at rest
+    assert env.asked == []
 
     monkeypatch.undo()
     first = folder.episodes()
