@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.checkpoint import entries_of
 
 
@@ -27,7 +28,16 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     num_demonstrated = 0
 
     def add(self, *args: np.ndarray, **kwargs: np.ndarray) -> None:  # type: ignore[override]
-        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations."""
+        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations.
+
+        Raises:
+            InputError: If the buffer is full of demonstrations.
+        """
+        if self.num_demonstrated >= self.buffer_size:
+            raise InputError(
+                f"the demonstrations fill the replay buffer of {self.buffer_size} transitions: give a larger "
+                "--set buffer_size=..."
+            )
         super().add(*args, **kwargs)  # type: ignore[arg-type]
         if self.full and self.pos < self.num_demonstrated:
             self.pos = self.num_demonstrated

@@ -159,6 +159,13 @@ def test_demonstrations_are_not_overwritten():
     np.testing.assert_array_equal(rewards[10:15], [6.0] * 5)
 
 
+def test_demonstrations_that_fill_the_buffer_are_refused():
+    learner = make_with_demonstrations(0.5, buffer_size=8)
+    with pytest.raises(InputError, match="fill the replay buffer of 8 transitions"):
+        fill(learner, 2)
+    assert learner.model.replay_buffer.num_demonstrated == 8
+
+
 def test_demonstration_fraction_needs_demonstrations():
     with pytest.raises(InputError, match="needs demonstrations: give --set demonstration_episodes"):
         resolve_preset(None, "tqc", {"demonstration_fraction": 0.5})
