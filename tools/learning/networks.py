@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -287,19 +288,23 @@ def export_layers(
     """
     linear: list[tuple[torch.Tensor, torch.Tensor]] = []
     activations: list[str | None] = []
+    order = ""  # a letter for each layer
     scale, shift = torch.ones(1), torch.zeros(1)
     for layer in copy.deepcopy([*layers]):
         layer.cpu()
         if isinstance(layer, torch.nn.Linear):
             linear.append((layer.weight * scale, layer.bias + layer.weight @ shift.expand(layer.in_features)))
             scale, shift = torch.ones(1), torch.zeros(1)
+            order += "l"
         elif isinstance(layer, BatchRenorm):
             renorm: Any = layer  # its buffers have no type
             scale = renorm.scale / (renorm.ra_var + renorm.eps).sqrt()
             shift = renorm.bias - renorm.ra_mean * scale
+            order += "n"
         else:
             activations.append(_ACTIVATIONS.get(type(layer), getattr(layer, "kind", None)))
-    if len(activations) + 1 != len(linear) or len({*activations}) != 1 or None in activations:
+            order += "a"
+    if not re.fullmatch("n?l(an?l)+", order) or len({*activations}) != 1 or None in activations:
         raise InputError(
             f"an actor of {', '.join(type(layer).__name__ for layer in layers)} can't be exported: use linear layers "
             "with one kind of rectifier between them"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from sb3_contrib.common.torch_layers import BatchRenorm1d
 from stable_baselines3 import DDPG
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
@@ -16,7 +17,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import load_checkpoint
 from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner
-from guiderail.tools.learning.networks import export_policy
+from guiderail.tools.learning.networks import export_layers, export_policy
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
 
 
@@ -353,6 +354,14 @@ def test_export_refuses_unsupported_layers(config):
     actor.latent_pi[1] = torch.nn.GELU()
     with pytest.raises(InputError, match="GELU"):
         export_policy(actor, {"observation_shape": [3]})
+
+
+@pytest.mark.parametrize("order", ["lla", "all", "laln", "lnal", "lnl", "laal", "ll"])
+def test_export_refuses_layers_in_another_order(order):
+    kinds = {"l": lambda: torch.nn.Linear(3, 3), "a": torch.nn.ReLU, "n": lambda: BatchRenorm1d(3)}
+    layers = [kinds[letter]() for letter in order]
+    with pytest.raises(InputError, match="can't be exported"):
+        export_layers(layers, spaces.Box(-1, 1, (3,)), {"observation_shape": [3], "squash": "clip"})
 
 
 def test_transition_is_not_stored_when_the_simulation_failed(config):
