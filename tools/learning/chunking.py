@@ -115,8 +115,9 @@ class ChunkLearner(BcLearner):
 
     def _training_rows(self, random: np.random.Generator) -> np.ndarray:
         """Return the indices of the samples in a bootstrap sample of the demonstrations, for training one network."""
-        groups = np.array(self._groups)
-        drawn = random.integers(1, self.episodes + 1, size=self.episodes)
+        # Not `self.episodes`: a run that is resumed after further episodes trains again.
+        groups, number = np.array(self._groups), self.config.demonstration_episodes
+        drawn = random.integers(1, number + 1, size=number)
         return np.concatenate([np.flatnonzero(groups == one) for one in drawn])
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
