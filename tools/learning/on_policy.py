@@ -84,15 +84,21 @@ class OnPolicyLearner(Learner):
         return np.clip(self._sampled[0][0].numpy(), space.low, space.high)
 
     def on_step(self, transition: Transition) -> None:
-        """Store a transition and train if the buffer is full; drop a transition whose simulation failed."""
+        """Store a transition and train if the buffer is full.
+
+        A transition in which the simulation failed is not stored. The transition before it becomes the episode's last,
+        as at a time limit.
+        """
+        buffer = self.model.rollout_buffer
         if "simulation_failure" in transition.info or self._sampled is None:
+            if not self._is_start and buffer.pos:
+                buffer.rewards[buffer.pos - 1] += self.model.gamma * float(self._value(transition.observation))
             self._is_start = True
             return
         action, value, log_prob = self._sampled
         reward = transition.reward
         if transition.truncated and not transition.terminated:  # bootstrapped, because truncation is not termination
             reward += self.model.gamma * float(self._value(transition.next_observation))
-        buffer = self.model.rollout_buffer
         starts = np.array([self._is_start])
         buffer.add(transition.observation[None], action.numpy(), np.array([reward]), starts, value, log_prob)
         self._sampled, self._is_start = None, transition.is_last

@@ -123,6 +123,19 @@ def test_on_policy_learner_leaves_a_failed_simulation_out():
     assert learner.model.rollout_buffer.pos == 0
 
 
+def test_on_policy_learner_bootstraps_before_a_failed_simulation():
+    learner = make(make_config("ppo", {"n_steps": 8, "gamma": 0.5, "net_arch": "4"}))
+    reached, failure = np.full(3, 0.5, np.float32), {"simulation_failure": "diverged"}
+    buffer = learner.model.rollout_buffer
+    for is_last, expected in ((False, 2.0 + 0.5 * float(learner._value(reached))), (True, 2.0)):
+        learner.on_episode_start()
+        learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 2.0, reached, is_last, False, {}))
+        if is_last:  # another episode fails at once
+            learner.on_episode_start()
+        learner.on_step(Transition(reached, learner.act(reached), 0.0, reached, False, True, failure))
+        assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
+
+
 def make_with_demonstrations(fraction, **more_settings):
     settings = {"net_arch": "4", "batch_size": 8, "learning_starts": 50, "demonstration_episodes": 2, **more_settings}
     return make(resolve_preset(None, "tqc", {**settings, "demonstration_fraction": fraction}))
