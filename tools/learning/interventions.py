@@ -96,8 +96,8 @@ class InterventionPolicy(Callback):
         return self._act(observation) if offset is None else np.clip(offset, -1.0, 1.0).astype(np.float32)
 
     def on_step(self, transition: Transition) -> None:
-        """Store the correction at the control step that has been reached."""
-        if self._offset is not None:
+        """Store the correction at the control step that has been reached; none has if the simulation failed at once."""
+        if self._offset is not None and transition.info["control_steps"]:
             self._offsets[int(transition.info["control_steps"]) - 1] = self._offset
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:

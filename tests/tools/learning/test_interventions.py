@@ -1,5 +1,7 @@
 """Human-in-the-loop training: corrections, labels and stops, and their record in the run folder."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.reference import pass_through
-from guiderail.tools.learning.interventions import LABEL_REWARDS, VIA_POINT_SPACING, Supervisor, ViaPointCorrections
+from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.learning.interventions import (
+    LABEL_REWARDS,
+    VIA_POINT_SPACING,
+    InterventionPolicy,
+    Supervisor,
+    ViaPointCorrections,
+)
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
@@ -123,6 +132,21 @@ def test_held_correction_applies_to_the_rest_of_the_motion():
     newer = np.reshape(corrections.with_offsets({20: np.array([-0.1, 0.0]), 30: np.array([-0.1, 0.0])}), (-1, 3))
     assert sum(newer[:, 0] <= 30) == 2
     assert (newer[newer[:, 0] > 34] == kept[kept[:, 0] > 34]).all()
+
+
+def test_correction_of_a_failed_first_step_is_no_via_point():
+    """By hand: steps are counted from zero, and none was completed."""
+    corrections, seen = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"}), np.zeros(2, np.float32)
+    supervisor = Scripted({0: (0, 400, [0.5, 0.5])})
+    env = SimpleNamespace(unwrapped=SimpleNamespace(_control_steps=0))
+    policy = InterventionPolicy(env, supervisor, lambda observation: seen, corrections)
+    for control_steps, number in ((0, 0), (1, 1)):
+        policy.on_episode_start()
+        supervisor.episode = 0
+        info = {"control_steps": control_steps, "simulation_failure": "diverged"}
+        policy.on_step(Transition(seen, policy(seen), 0.0, seen, False, True, info))
+        assert len(policy._offsets) == number
+        assert min(policy.via_points[::3], default=0.0) >= 0.0
 
 
 def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
