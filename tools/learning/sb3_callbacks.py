@@ -13,8 +13,9 @@ from guiderail.tools.learning.learner import Learner
 class Sb3Callbacks(Callback):
     """Callback of an episode that calls callbacks of Stable-Baselines3.
 
-    The callbacks receive the learner's `model`, an algorithm of Stable-Baselines3. `num_timesteps` counts transitions,
-    and `locals` has the names `infos`, `rewards`, `dones`, `actions` and `new_obs`, with values of one environment.
+    The callbacks receive the learner's `model`, an algorithm of Stable-Baselines3. `num_timesteps` counts the run's
+    transitions, including those before it was resumed, and `locals` has the names `infos`, `rewards`, `dones`,
+    `actions` and `new_obs`, with values of one environment.
 
     Attributes:
         is_stopped: True once a callback returned False from `on_step`; training ends after the episode.
@@ -36,11 +37,13 @@ class Sb3Callbacks(Callback):
             if not isinstance(one, BaseCallback):
                 raise InputError(f"{brief(one)} is no callback: give those of Stable-Baselines3 (BaseCallback)")
         self._model, self._callback, self._is_started = model, CallbackList(callback_list), False
+        self._learner, self._first = learner, getattr(learner, "transitions", 0)  # those of `init_from` do not count
         self.is_stopped = False
 
     def on_episode_start(self) -> None:
         """Report the start of training before the first episode, and the start of a rollout in each episode."""
         if not self._is_started:
+            self._model.num_timesteps = getattr(self._learner, "transitions", 0) - self._first
             self._callback.init_callback(self._model)
             self._callback.on_training_start({"self": self._model}, {})
             self._is_started = True

@@ -48,6 +48,15 @@ def test_callbacks_see_every_transition_and_the_model(bead_config, tmp_path):
     assert [row["return"] for row in plain] == [row["return"] for row in rows]
 
 
+def test_count_of_transitions_continues_when_resumed(bead_config, tmp_path):
+    config, folder = replace(bead_config, episodes=1), RunFolder(tmp_path / "run")
+    first, second = Recorder(), Recorder()
+    run_training(folder, config, sb3_callbacks=first)
+    run_training(folder, replace(config, episodes=2), resume=True, sb3_callbacks=second)
+    counts = [count for count, _, _ in [*first.seen, *second.seen]]
+    assert counts == list(range(1, len(counts) + 1))
+
+
 def test_callback_that_returns_false_ends_the_training(bead_config, tmp_path):
     recorder = Recorder(last=1)
     rows = run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=recorder)
