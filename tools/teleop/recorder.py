@@ -273,12 +273,12 @@ class DemonstrationRecorder:
             A sentence on the demonstration.
 
         Raises:
-            InputError: If the demonstration is too short or cannot be written; it is then not kept.
+            InputError: If the demonstration is too short, has no motion or cannot be written; it is then not kept.
         """
-        if self.steps < MIN_STEPS:
+        commands = np.array(self.recording.commands)
+        if self.steps < MIN_STEPS or not np.ptp(commands, axis=0).any():
             raise InputError("nothing was shown yet: move the sliders or press the keys first")
         is_success = self.is_success()
-        commands = np.array(self.recording.commands)
         demonstrations = [*self.demonstrations, (self._period * np.arange(len(commands)), commands)]
         _to_demonstrations(demonstrations).save(self.out)
         self.demonstrations = demonstrations

@@ -247,6 +247,14 @@ def test_gamepad_moves_the_sliders(session):
     assert session.panel.meshcat.sliders["y [mm]"] == 0.0
 
 
+def test_keep_refuses_a_demonstration_without_motion(session):
+    session.reset()
+    lead(session, "x [mm]", 0.0, 40)
+    with pytest.raises(InputError, match="nothing was shown yet"):
+        session.keep()
+    assert not session.out.exists()
+
+
 def test_keep_omits_rests(session):
     session.reset()
     lead(session, "x [mm]", 2.0, 60)
