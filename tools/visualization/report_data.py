@@ -293,4 +293,6 @@ def command(config: RunConfig, out: str) -> str:
         words += ["--import", module]
     if not config.step_log:
         words.append("--no-step-log")
+    if config.human_in_the_loop:
+        words.append("--human-in-the-loop")
     return shlex.join([*words, "--out", out])

@@ -185,6 +185,8 @@ def test_command_of_a_run_reproduces_its_configuration(bead_config):
         episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=arguments, step_log=False,
     )  # fmt: skip
     assert second == config
+    corrected = replace(config, human_in_the_loop=True)
+    assert "--human-in-the-loop" in shlex.split(command(corrected, "runs/bead"))
 
 
 @pytest.mark.parametrize("name", ["report.pdf", "report"])
