@@ -90,11 +90,13 @@ def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
 def write_table(path: Path, rows: Rows) -> Path:
     """Write rows as `path`.csv and as `path`.md, and return the path of the Markdown file."""
     table = pd.DataFrame(rows, dtype=object)
-    write_atomically(path.with_suffix(".csv"), table_text(table).encode())
+    # Not `with_suffix`, which would replace a part of a name such as "bound-0.5".
+    csv_file, markdown_file = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.md")
+    write_atomically(csv_file, table_text(table).encode())
     lines = [[name.replace("_", " ") for name in table], ["---"] * len(table.columns)]
     lines += [[cell(value).replace("|", "\\|") for value in row] for row in table.itertuples(index=False)]
-    write_atomically(path.with_suffix(".md"), "".join(f"| {' | '.join(line)} |\n" for line in lines).encode())
-    return path.with_suffix(".md")
+    write_atomically(markdown_file, "".join(f"| {' | '.join(line)} |\n" for line in lines).encode())
+    return markdown_file
 
 
 def cell(value: Any) -> str:

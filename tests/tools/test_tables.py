@@ -46,6 +46,12 @@ def test_markdown_has_the_rows_of_the_csv(tmp_path):
     assert read_table(tmp_path / "t.csv")["a_b"].tolist() == [0.123456, 2]
 
 
+def test_tables_whose_names_have_dots_are_separate_files(tmp_path):
+    written = [write_table(tmp_path / f"bound-0.{digit}", [{"a": digit}]) for digit in (5, 6)]
+    assert [file.name for file in written] == ["bound-0.5.md", "bound-0.6.md"]
+    assert [read_table(file.with_suffix(".csv"))["a"].tolist() for file in written] == [[5], [6]]
+
+
 def test_column_is_numeric_when_all_cells_are_numbers(tmp_path):
     (tmp_path / "t.csv").write_text("a,b,c,d\n1,0x10,True,1e400\n,2,False,-inf\n", encoding="utf-8")
     table = read_table(tmp_path / "t.csv")

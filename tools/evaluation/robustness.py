@@ -314,7 +314,7 @@ def robustness(
     given |= {"episodes": episodes} if episodes != EPISODES else {}
     given |= {"seed": seed} if seed != HELD_OUT_SEED else {}
     names = [*([actor.name for actor in compared] if len(compared) > 1 else []), *sorted(baselines)]
-    table = write_table(out / f"{_table_name(axes, given, names)}.csv", rows).with_suffix(".csv")
+    table = write_table(out / _table_name(axes, given, names), rows).with_suffix(".csv")
     picture = draw(table.with_suffix(".png"), rows)
     return {"table": table, "picture": picture, "rows": rows, "policies": [actor.name for actor in compared]}
 
