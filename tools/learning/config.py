@@ -30,6 +30,7 @@ from guiderail.tools.learning.learner import (
 )
 
 DEFAULT_PRESET = "tqc_contact"
+MAX_EPISODES = 10**9  # largest number of episodes of a run
 
 
 def _check_ent_coef(ent_coef: str) -> str:
@@ -366,9 +367,11 @@ def check_choices(
 
 
 def check_episodes(episodes: int) -> None:
-    """Raise an InputError if a run has no episode."""
+    """Raise an InputError if a run has no episode, or too many."""
     if episodes < 1:
         raise InputError(f"a run needs at least one episode, not {episodes}")
+    if episodes > MAX_EPISODES:
+        raise InputError(f"a run has at most {MAX_EPISODES} episodes, not {episodes}")
 
 
 def config_values(config: LearnerConfig) -> dict[str, Any]:

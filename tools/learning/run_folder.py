@@ -21,7 +21,7 @@ from guiderail.tools.environments import check_environment, task_content
 from guiderail.tools.evaluation.metrics import check_rows
 from guiderail.tools.files import LOCK, refuse_existing_run, remove_partial_files, write_atomically, write_error
 from guiderail.tools.imports import import_stored
-from guiderail.tools.learning.config import config_values, make_config
+from guiderail.tools.learning.config import MAX_EPISODES, config_values, make_config
 from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
@@ -37,7 +37,7 @@ class RunConfig:
     environment: dict[str, Any]  # arguments of gymnasium.make
     learner: SkipValidation[LearnerConfig]  # all settings, an instance of the learner's `Config`
     preset: str | None  # preset that the learner's settings were derived from
-    episodes: Annotated[int, Field(ge=1, le=10**9, strict=True)]  # total number of episodes
+    episodes: Annotated[int, Field(ge=1, le=MAX_EPISODES, strict=True)]  # total number of episodes
     seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # seed of everything random
     versions: dict[str, str] = field(default_factory=dict)  # versions of the packages that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register the task, the learner, …

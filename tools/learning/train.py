@@ -279,6 +279,7 @@ def resumed_config(
         raise InputError(
             f"the run in {folder.path} has other learner settings: leave --set out, or train again in another folder"
         )
+    check_episodes(given.get("episodes", config.episodes))
     return replace(config, episodes=given.get("episodes", config.episodes), versions=_merged_versions(folder, config))
 
 

@@ -44,6 +44,7 @@ def trained(bead_run):
         (["train", "Bead", "--out", "new", "--preset", "tqc_contct"], "did you mean tqc_contact?"),
         (["train", "Bead", "--out", "new", "--fixture-offset", "per_episode"], "no option 'fixture_offset'"),
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
+        (["train", "Bead", "--out", "new", "--episodes", "1000000001"], "at most 1000000000 episodes"),
         (["train", "Bead", "--out", "new", "--episodes", "many"], "see guiderail train --help"),
         (["train", "Bead", "--out", "new", "--seed", "-1"], "a seed is a whole number"),
         (["train", "Bead", "--out", "new", "--set", "batch_size"], "name=value"),

@@ -20,7 +20,7 @@ from guiderail.tools.evaluation.cache import episodes_file
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, start_or_resume, with_defaults
+from guiderail.tools.learning.train import configure, resumed_config, start_or_resume, with_defaults
 from guiderail.tools.learning.trainer import run_training
 
 # Trains the run of the fixture and prints the number of each finished episode; the parent kills it then.
@@ -318,6 +318,12 @@ def test_resume_refuses_other_settings(bead_config, tmp_path):
         start_or_resume(None, tmp_path / "run", environment={}, seed=7, resume=True)
     with pytest.raises(InputError, match="other learner settings"):
         start_or_resume(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+
+
+def test_resume_refuses_too_many_episodes(bead_config, tmp_path):
+    RunFolder(tmp_path).write_config(bead_config)
+    with pytest.raises(InputError, match="at most 1000000000 episodes"):
+        resumed_config(RunFolder(tmp_path), None, {}, {"episodes": 10**9 + 1}, None)
 
 
 def test_resume_refuses_rows_with_other_columns(bead_config, tmp_path):
