@@ -71,6 +71,8 @@ def run_sim_driver(
     for name, value in {"seconds": seconds, "command_timeout": command_timeout}.items():
         if not 0.0 < value < np.inf:
             raise InputError(f"{name} must be a positive number, not {value:g}")
+    if joint_friction is not None and not 0.0 <= joint_friction < np.inf:
+        raise InputError(f"joint_friction must be at least 0 and finite, not {joint_friction:g}")
     if rate is not None:
         check_rate(rate)
     if driver and driver not in SIMULATED:

@@ -3,15 +3,28 @@
 from functools import partial
 
 import numpy as np
+import pytest
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
-from guiderail.tools.hardware.sim_driver import PartRandomizer, publish_part_offsets, subscribe_part_offsets
+from guiderail.models.common.errors import InputError
+from guiderail.tools.hardware.sim_driver import (
+    PartRandomizer,
+    publish_part_offsets,
+    run_sim_driver,
+    subscribe_part_offsets,
+)
 
 SEED = 30
+
+
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+def test_driver_refuses_an_impossible_joint_friction(value):
+    with pytest.raises(InputError, match="joint_friction must be at least 0"):
+        run_sim_driver("", 1.0, 1.0, driver="fci", joint_friction=value)
 
 
 def test_offsets_equal_those_of_simulation_for_the_same_seed():
