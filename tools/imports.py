@@ -1,7 +1,8 @@
 """Imports of user code by name: modules, files and task folders that register tasks, guidance, stations or learners.
 
 Importing executes code. `import_modules` imports what the user names. `import_stored` imports what a file names, such
-as the configuration of a run, and executes new code only while `trust_imports` is active.
+as the configuration of a run; a module or file that this process has not imported before is executed only while
+`trust_imports` is active.
 """
 
 import sys
@@ -69,10 +70,10 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
 
 
 def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
-    """Import the modules that a file names, as `import_modules`, if that executes no new code or is trusted.
+    """Import the modules that a file names, as `import_modules`, if importing executes no new code or is trusted.
 
-    A task folder holds no code. A module that this process has imported, and a file that the user has named in this
-    process, need no trust.
+    A task folder holds no code. A module or file that this process has imported before needs no trust; such a file is
+    executed again if its content has changed.
 
     Raises:
         InputError: If code would be executed without trust, or if `import_modules` raises one.
@@ -89,7 +90,7 @@ def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
 
 
 def _executes(module: str) -> bool:
-    """Return True if importing would execute code that the user has not named."""
+    """Return True if importing would execute a module or file that this process has not imported before."""
     path = Path(module)
     if is_task_folder(path):
         return False

@@ -94,7 +94,8 @@ class SkillExecutor:
         self._task, self._skill, self._clock, self._is_stop_requested = task, skill, clock, is_stop_requested
         self._diagram = skill.diagram
         self._skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
-        # The guidance starts with its first control step, so another station on the same driver does the approach.
+        # The guidance begins its motion when its diagram is first advanced, so a clone of the station, on the same
+        # driver, does the approach.
         self._station = self._skill_station.clone(task.workcell())
         self._steps = round(skill.control_period / self._skill_station.period)
         self._start = task.start_pose(np.random.default_rng(0))
@@ -217,7 +218,8 @@ class SkillExecutor:
             else station.GetOutputPort(name).Eval(station_context)
             for name in SIGNALS
         }
-        # Joint signals first: an interruption before the trace then leaves one sample too many, never one too few.
+        # Joint signals are appended before the trace: after an interruption in between they have one sample more than
+        # the trace, never one less.
         for name, values in self._joints.items():
             values.append(station.GetOutputPort(f"{station.driver.name}.{name}").Eval(station_context).copy())
         self.trace.append(
@@ -278,8 +280,8 @@ def deploy(
     """Execute the policy of a run on a robot.
 
     The run is a folder or `pretrained:NAME`. The recording is written to `out`, by default `recordings_folder`. With
-    `assume_yes` the pre-flight checks need no confirmation. A `force_limit` [N] below that of the training bounds the
-    forces of a first motion.
+    `assume_yes` the pre-flight checks need no confirmation. The `force_limit` [N] is at most that of the training; a
+    lower one limits the forces of a first motion.
 
     Returns:
         The exit code: 0 if the skill was executed to its end, 1 if it was stopped.
@@ -295,7 +297,7 @@ def deploy(
     environment |= connection.environment_options(station)
     task = EnvConfig.resolve(config.task, environment).make_task()
     if not isinstance(task, InsertionTask):
-        raise InputError(f"{config.task} has no pose that an arm could approach to begin: run an insertion")
+        raise InputError(f"{config.task} has no start pose for an arm: deploy the policy of an insertion")
     if force_limit is not None:
         if not force_limit <= task.collision.above:
             raise InputError(

@@ -16,7 +16,7 @@ from guiderail.models.common.transforms import DEGREE, MM, pose_difference
 from guiderail.tools.hardware.operator import confirm
 
 SPEED, ANGULAR_SPEED = 0.02, 0.1  # speeds of a slow approach [m/s], [rad/s]
-MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum speeds of the way back; slower parts are skipped [m/s], [rad/s]
+MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum speeds of the way back [m/s], [rad/s]
 POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # tolerances of a reached pose [m], [rad]
 SETTLING_TIME = 0.5  # time that the target is held at the end of an approach [s]
 
@@ -45,9 +45,10 @@ def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.nda
 
 
 def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
-    """Return commands backwards along poses (n, 6) at the recorded speed, without segments that are nearly at rest.
+    """Return commands backwards along poses (n, 6) at the recorded speed, but not below the minimum speeds.
 
-    The time between poses is `period` [s].
+    The time between poses is `period` [s]. A pose is skipped if both its distance and its angle from the last
+    pose that was not skipped are less than the minimum speeds cover in a period.
     """
     poses: list[np.ndarray] = []
     for pose in path[::-1]:
@@ -89,7 +90,7 @@ class PreflightChecks:
 
     @property
     def error(self) -> str:
-        """Reason for which the robot stopped by itself before, empty if there is none."""
+        """Reason why the robot stopped by itself earlier; empty if there is none or it is unknown."""
         return self._station.driver.error
 
     def clear_error(self) -> None:
@@ -183,7 +184,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
         Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < MAX_JOINT_SPEED),
         Check("payload", f"{payload:.2f} kg on the flange, which {payload_set_by}"),
         Check("load", f"{force:.1f} N of external force at rest", force < MAX_FORCE),
-        Check("target", f"at {_numbers(p_WT)} m of the base"),
+        Check("target", f"at {_numbers(p_WT)} m in the base frame"),
         Check(
             "tool",
             f"at {_numbers(pose[:3] / MM, 1)} mm from the target, turned about z, y, x by "

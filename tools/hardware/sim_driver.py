@@ -59,7 +59,7 @@ def run_sim_driver(
         scenario: Scenario file with the surroundings; see `load_scenario`.
         driver: "fci" for a Franka arm on the Franka Control Interface at the address `url`. It runs in lockstep while a
             `FciLockstepClock` is connected, otherwise by the wall clock.
-        joint_friction: Friction of each joint of the Franka [Nm]; by default what friction compensation may leave.
+        joint_friction: Friction of each joint of the Franka [Nm]; by default the residual of friction compensation.
         log: Function that shows a message.
 
     Returns:
@@ -151,7 +151,7 @@ def run_safety_monitor(
 def _insertion_task(name: str) -> InsertionTask:
     task = EnvConfig.resolve(name, {}).make_task()
     if not isinstance(task, InsertionTask):
-        raise InputError(f"{name} is done by no arm with a tool: name an insertion")
+        raise InputError(f"{name} is not a task of an arm with a tool: name an insertion")
     return task
 
 

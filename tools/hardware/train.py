@@ -116,7 +116,7 @@ def _train(
     )
     rows: list[dict[str, Any]] = []
     due: list[Callable[[], None]] = []  # remaining work of the last episode
-    learned_before = 0  # episodes that were learned from before the run was resumed
+    learned_before = 0  # number of episodes used for training before the run was resumed
 
     def wait_until_learned() -> None:
         while not learner.receive_learned():

@@ -22,7 +22,7 @@ Entry = TypeVar("Entry")
 
 @dataclass
 class Candidate:
-    """Actor of a greedy episode, with the numbers of consecutive greedy successes before and from this episode on."""
+    """Actor of a greedy episode, with the numbers of consecutive greedy successes before it and beginning with it."""
 
     actor: Actor  # parameters by name
     before: int  # number of successes before the episode

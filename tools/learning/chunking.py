@@ -1,4 +1,7 @@
-"""Chunk cloning: an ensemble learns to predict the next commanded poses from an observation (ACT's objective)."""
+"""Chunk cloning: an ensemble learns to predict the next commanded poses from an observation.
+
+The objective is that of action chunking with transformers (ACT).
+"""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -74,7 +77,10 @@ class ChunkLearner(BcLearner):
         return super().on_episode_end(row)
 
     def _add(self, observations: np.ndarray, chunks: np.ndarray) -> None:
-        """Store observations (n, …) and chunks (n, K, O) with symmetric copies; outputs `_dims` map like actions."""
+        """Store observations (n, …) and chunks (n, K, O) with symmetric copies.
+
+        A symmetry transforms the outputs `_dims` as it transforms actions.
+        """
         symmetries = [(np.eye(observations.shape[1]), None)]
         if self._symmetry is not None:
             symmetries += [*zip(self._symmetry.observations, self._symmetry.actions, strict=True)]

@@ -96,7 +96,10 @@ class InterventionPolicy(Callback):
         return self._act(observation) if offset is None else np.clip(offset, -1.0, 1.0).astype(np.float32)
 
     def on_step(self, transition: Transition) -> None:
-        """Store the correction at the control step that has been reached; none has if the simulation failed at once."""
+        """Store the correction at the last completed control step.
+
+        No step is completed if the simulation failed in the first one.
+        """
         if self._offset is not None and transition.info["control_steps"]:
             self._offsets[int(transition.info["control_steps"]) - 1] = self._offset
 

@@ -284,7 +284,7 @@ def export_layers(
     Batch renormalization is merged into the next linear layer. The encoder has weight and bias of each convolution.
 
     Raises:
-        InputError: If there are other layers.
+        InputError: If there are other layers, or the layers are in another order.
     """
     linear: list[tuple[torch.Tensor, torch.Tensor]] = []
     activations: list[str | None] = []

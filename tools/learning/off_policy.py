@@ -257,7 +257,8 @@ class OffPolicyLearner(Learner):
     def _follows_base_motion(self) -> bool:
         """Return True if this action is zero, so that the base motion has no residual (Policy Decorator).
 
-        The progressive exploration of Yuan et al. (2025): the policy acts with a probability that grows linearly.
+        This is the progressive exploration of Yuan et al. (2025): the policy acts with a probability that grows
+        linearly.
         """
         steps = self.config.base_motion_steps
         return not self.is_greedy and self.transitions < steps and self.random.random() * steps >= self.transitions
@@ -269,8 +270,8 @@ class OffPolicyLearner(Learner):
     def _temporally_extended(self) -> np.ndarray | None:
         """Return a uniformly sampled action that is repeated for several transitions; None if no repetition is active.
 
-        The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves states in
-        which a policy has settled, such as free space, and shows the value of continuing in one direction.
+        This is the εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves
+        states in which a policy has settled, such as free space, and shows the value of continuing in one direction.
         """
         if self._extended_steps == 0:
             is_over = 0 < self.config.ez_greedy_until <= self.greedy_successes

@@ -111,7 +111,7 @@ class PipelinedLearner(Learner):
         self._acting.transitions += record_transition(self._transitions, transition)
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """End an episode; an excluded episode does not advance the exploration state."""
+        """End an episode; an excluded one does not count and does not advance the acting learner's `random`."""
         if row["termination"] in self._excluded:
             self._acting.transitions -= len(self._transitions)
             self._acting.episodes -= 1

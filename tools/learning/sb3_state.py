@@ -43,7 +43,10 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
             self.pos = self.num_demonstrated
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Return a batch; its demonstrated rows are evenly spaced, so that equal slices contain equally many."""
+        """Return a batch with evenly spaced demonstrated rows.
+
+        Several batches can be sampled at once: each of equal parts of the rows has the same fraction of demonstrations.
+        """
         size, first = self.size(), self.num_demonstrated
         if not 0 < first < size:
             return super().sample(batch_size, env)

@@ -22,8 +22,9 @@ from guiderail.models.parts.solids import join_surfaces
 MODULUS = 2e9  # first modulus of the compliant part [Pa]
 MAX_MODULUS = 5e10
 SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
-PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded depth below the target; the first that seats the plug is used
-MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug
+# Commanded depths below the target [m]: tried in turn if bodies snap, until one seats the plug; otherwise the first.
+PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)
+MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug [m]
 MIN_SPEED = 2.0  # smallest desired real-time factor
 MAX_TRIALS = 5  # settings tried for each compliant part
 MIN_TIME_STEP = 0.0025  # time step that is not halved further [s]

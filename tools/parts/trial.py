@@ -52,7 +52,7 @@ class Trial:
     penetration: float  # largest penetration of the parts [m], without snapping pieces
     resting_penetration: float  # largest penetration at the end of the motion, while the resting plug is pushed [m]
     snap: float  # largest penetration of snapping pieces [m]
-    real_time_factor: float  # simulated time per CPU time
+    real_time_factor: float  # duration of the motion per CPU time, also if a blocked plug ended the trial early
     recording: Recording  # poses, wrench and force at the control steps
 
 
@@ -187,7 +187,7 @@ def _plug_pose(driven: DrivenStation) -> np.ndarray:
 
 
 def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:
-    """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, and -1 if away from it.
+    """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, otherwise -1.
 
     Each trial is given by the offset (x, y) of the socket [m] and its recording.
     """

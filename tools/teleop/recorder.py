@@ -285,7 +285,7 @@ class DemonstrationRecorder:
         self.successes.append(is_success)
         end = {None: "", True: ", at the target", False: ", NOT at the target"}[is_success]
         duration = (self.steps - 1) * self._period
-        lasts = f"{duration:.1f} s, {self.demonstrations[-1][0][-1]:.1f} s of them without rests"
+        lasts = f"{duration:.1f} s, {self.demonstrations[-1][0][-1]:.1f} s after rests were shortened"
         return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {self.out}"
 
     def is_success(self) -> bool | None:
@@ -435,7 +435,7 @@ def teleoperate(
     base, size = cast(Any, env.unwrapped), int(env.action_space.shape[0])  # type: ignore[index]
     if size > len(GAMEPAD_AXES):
         raise InputError(
-            f"an action of {task} has {size} numbers and a device {len(GAMEPAD_AXES)}: choose another --guidance"
+            f"an action of {task} has {size} numbers, a device only {len(GAMEPAD_AXES)}: choose another --guidance"
         )
     device = MeshcatDevice(base.task.meshcat, GAMEPAD_AXES[:size], KEY_PAIRS[:size], base.task.control_period)
     log(f"Teleoperate at {page_address(base.task.meshcat)} with a gamepad, the sliders, or the keys:")

@@ -1,4 +1,4 @@
-"""Camera images of an episode: some frames in one picture, or all of them as an animation."""
+"""Camera images of an episode: some frames in one picture, or many of them as an animation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Frames(EnvCallback):
     """
 
     def __init__(self, env: Any, max_frames: int = MAX_FRAMES):
-        """Construct the callback; the largest number of frames is even."""
+        """Construct the callback; `max_frames` must be even, so that the frames stay evenly spaced."""
         super().__init__(env)
         self._max_frames = max_frames
 

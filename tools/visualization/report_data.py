@@ -40,7 +40,10 @@ STEP_LOG_COLUMNS = (
 
 
 def _extremes(rows: pd.DataFrame, prefix: str, force: str) -> dict[str, Any]:
-    """Return numbers and maxima of violations, and the peak force; columns of violations begin with a prefix."""
+    """Return the number and the maximum of commanded and of measured violations, and the peak force.
+
+    The columns of violations begin with `prefix`, and `force` is the column of forces.
+    """
     result: dict[str, Any] = {}
     for kind in ("commanded", "measured"):
         values = rows[f"{prefix}{kind}_violation"]

@@ -259,7 +259,7 @@ def test_keep_omits_rests(session):
     session.reset()
     lead(session, "x [mm]", 2.0, 60)
     lead(session, "y [mm]", 2.0, 60)
-    assert "2.4 s, 0.3 s of them without rests" in session.keep()
+    assert "2.4 s, 0.3 s after rests were shortened" in session.keep()
     times, commands = session.demonstrations[0]
     np.testing.assert_allclose(np.diff(times), 0.02)
     np.testing.assert_allclose(commands[-1] - session.start, [2e-3, 2e-3, 0, 0, 0, 0])
