@@ -85,7 +85,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     """Build the environment `gymnasium.make("guiderail/<Task>-v0", ...)`.
 
     From this call on, numerical libraries use one thread in this process. Matrices are small here: if other processes
-    use the cores, threads that wait for each other take eighty times as long. Sums depend on the number of threads.
+    use the cores, threads that wait for each other take eighty times as long. The number of threads also changes the
+    rounding of sums.
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.
@@ -133,7 +134,7 @@ def make_skill(
     Args:
         task: Configuration, or name of the task that the policy was trained on.
         policy: Saved `Policy`, function from observation to action, or system with ports `observation` and `action`.
-        render_mode: None, or "human" for a browser view.
+        render_mode: None, "human" (browser view) or "rgb_array" (output `rgb_image`).
         options: Options of the environment that the policy was trained in, if `task` is a name.
 
     Raises:

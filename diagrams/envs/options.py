@@ -75,7 +75,7 @@ PositiveNumbers = Annotated[Numbers, _positive]
 
 
 class CommonOptions(Options):
-    """Options of every environment; an empty string selects the task's default."""
+    """Options of every environment. `EnvConfig.resolve` replaces an empty default by the task's own default."""
 
     guidance: str = Field("", description="guidance between the policy and the robot")
     station: str = Field("", description="station that the task is done on")
@@ -105,8 +105,8 @@ class PrimitiveOptions(Options):
     adaptive_history: bool = Field(False, description="shorten the history during contact")
     gains: Numbers | None = Field(None, description="raw null-space units per action; default: computed from κ")
     horizon: Integer = Field(40, ge=0, le=200, description="H, future points at which constraints are satisfied")
-    lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
-    beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
+    lambda_: Number = Field(6.0, ge=0, description="λ of the thesis's problem 4.5")
+    beta: Number = Field(6.0, gt=0, description="β of the thesis's problem 4.5")
     kernel: str = Field(DEFAULT_KERNEL, description="name of a registered kernel k(ζ, ζ')")
     length_scale: Number = Field(
         DEFAULT_LENGTH_SCALE, gt=0, description="ℓ of the kernel [s]; the thesis's l is 1 / (2 ℓ²)"

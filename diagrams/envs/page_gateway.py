@@ -154,7 +154,7 @@ class Gateway:
     """Server of a page; it is the only client of Meshcat's server.
 
     Args:
-        port: Port of Meshcat's server, used for the page as well if it is still free.
+        port: Port of Meshcat's server. When that server has been closed, the page has this port if it is still free.
         token: Secret part of the page's address.
         files: Paths of the page's files by name.
     """
@@ -232,7 +232,7 @@ class Gateway:
             sender.cancel()
             del self._queues[browser]
             print(len(self._queues), flush=True)
-            if browser is self._gamepad_owner:  # else its sticks would stay deflected
+            if browser is self._gamepad_owner:  # Meshcat would keep the last deflection of its sticks
                 self._gamepad_owner = None
                 with suppress(ConnectionClosed):
                     await self._meshcat.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": {}}))

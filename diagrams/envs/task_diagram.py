@@ -108,7 +108,7 @@ class TaskDiagram:
         query: Query port of the scene, for a browser view.
         view: Browser view of an environment made with `render_mode="human"`.
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
-        near_symmetry: Like `symmetry`, with symmetries that hold only for most of an episode.
+        near_symmetry: `symmetry`, extended by symmetries that hold only for most of an episode.
         declaration: `Task` that the diagram was built from, if there is one.
     """
 

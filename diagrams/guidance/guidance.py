@@ -1,4 +1,4 @@
-"""Contract of all guidance, the ports between a policy's action and the commanded pose; guidance by a function.
+"""Ports of all guidance, from a policy's action to the commanded pose, and guidance by a function.
 
 =================  =====  ==========================================================================================
 input              size   meaning
@@ -40,7 +40,7 @@ OUTPUTS = ("desired_pose", "held_action", "constraint_violation", "fallback")
 
 
 class Guidance(Diagram):
-    """Diagram with the ports of the contract.
+    """Diagram with the ports of all guidance.
 
     .. pydrake_system::
 
@@ -115,7 +115,7 @@ def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, ki
     The error message names the `kind` of guidance, or the diagram if `kind` is empty.
 
     Raises:
-        InputError: If a port of the contract is missing or has another size.
+        InputError: If a port of all guidance is missing or has another size.
     """
     name_of_guidance = f"guidance '{kind or guidance.get_name()}'"
     missing_inputs = [name for name in INPUTS if not guidance.HasInputPort(name)]

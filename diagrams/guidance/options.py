@@ -39,8 +39,8 @@ class GuardOptions(BasePolicyOptions):
 
     guard: Literal["none", "projection", "slowdown"] = Field(
         "projection",
-        description="filter of the chunks to the bounds, max_speed and max_jerk: the nearest chunk, a slower one on "
-        "the same path, or none",
+        description="filter that keeps chunks within the bounds, max_speed and max_jerk: projection to the nearest "
+        "chunk, slowdown on the same path, or none",
     )
     max_jerk: PositiveNumbers = Field(
         (),

@@ -57,8 +57,8 @@ class PrimitiveConfig:
             measured history at a high rate, commands would follow the robot, and the force would vanish. Use measured
             poses if an operator may push a robot that tracks well.
         horizon: H, number of future points at which the constraints are satisfied.
-        lambda_: λ of problem 4.5.
-        beta: β of problem 4.5.
+        lambda_: λ of the thesis's problem 4.5.
+        beta: β of the thesis's problem 4.5.
         kernel: k of the movement primitive.
         action_scale: κ; a constant action of ±1 moves the outputs by √3 κ standard deviations of the demonstrations.
         action_dims: Indices of the outputs that an action moves, one entry each; default: all.

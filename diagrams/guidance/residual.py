@@ -29,7 +29,8 @@ from guiderail.systems.safety_filter import SafetyFilter
 class ResidualDescent(Guidance):
     """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t is a straight descent.
 
-    ``action`` is (3,); the command also respects the template's speed limits. Exports ``measured_violation`` too.
+    ``action`` is (3,); the command also respects the template's speed limits. In addition to the ports of all guidance
+    there are ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
 
     def __init__(self, prior: PriorKnowledge):

@@ -38,7 +38,7 @@ from guiderail.diagrams.stations.workcell import ConvexWorkcell
 from guiderail.diagrams.tasks.insertion import part_poses
 from guiderail.models.common.errors import InputError
 
-ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # prefix of names in the simulator; from seventh link to flange [m]
+ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # prefix of the simulator's names; distance of flange and link 7 [m]
 STEP = 0.001  # period of the protocol [s]
 # Steps of the engine in a period. With one step, a contact with a time constant of 2 ms lasts a single step: the tool
 # bounces from it every 5 ms, and joint velocities jump by 0.07 rad/s.

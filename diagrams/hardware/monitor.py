@@ -76,7 +76,7 @@ class SafetyMonitor:
         # Local times [s]: last command, last change of state, last check.
         self._commanded_at = self._entered_at = self._checked_at = -np.inf
         self._sender = secrets.randbits(48)
-        self._num_heartbeats = self._num_repeats = 0  # repetitions of the torque since the last check
+        self._num_heartbeats = self._num_repeats = 0  # heartbeats sent; repetitions of the torque since the last check
         driver.add_listener(self._on_command)
 
     def receive(self, timeout: float = 0.0) -> None:
@@ -128,8 +128,9 @@ class SafetyMonitor:
             return
         self._commanded_at = self._clock()
         heartbeats = self._driver.read_heartbeats()
+        # While another monitor stops the arm, the command may be that monitor's.
         if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
-            self._commands.add(torque, command_time, self._commanded_at)  # else the command may be another monitor's
+            self._commands.add(torque, command_time, self._commanded_at)
         if self._is_stopping and self._command is not None and not self._is_holding:
             # The robot executes the last command, so the torque is sent again, up to a limit: two monitors could
             # answer each other endlessly.

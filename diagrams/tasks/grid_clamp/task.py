@@ -271,7 +271,7 @@ class GridClamp(InsertionTask):
         return self._workcell
 
     def template(self) -> PlacedTemplate:
-        """Return the template with one phase: an upright clamp in a cuboid above the hole."""
+        """Return the template with one state: an upright clamp in a cuboid above the hole."""
         active = self.config.options["active_constraints"]
         return PlacedTemplate(
             make_template(),
