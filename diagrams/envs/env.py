@@ -288,9 +288,10 @@ class DiagramEnv(DrakeGymEnv):
                 break  # this control step is dropped
             self._control_steps += 1
             total += reward
-            peak_force = max(peak_force, force)
-            commanded_violation = max(commanded_violation, float(now["commanded_violation"][0]))
-            measured_violation = max(measured_violation, float(now["measured_violation"][0]))
+            # Not the built-in max, which would ignore NaN: an unknown violation must not be reported as slack.
+            peak_force = float(np.maximum(peak_force, force))
+            commanded_violation = float(np.maximum(commanded_violation, now["commanded_violation"][0]))
+            measured_violation = float(np.maximum(measured_violation, now["measured_violation"][0]))
             fallback = fallback or bool(now["fallback"][0])
             for name, value in gained:
                 terms[name] += value

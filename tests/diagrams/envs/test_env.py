@@ -29,6 +29,7 @@ class Toy(LeafSystem):
         super().__init__()
         self.error: Exception | None = None
         self.failing, self.fails_from = "", 0.0  # port, or "initialize", that fails from a time on [s]
+        self.nan_port = ""  # port that is NaN at the position 0.1
         self.action = self.DeclareVectorInputPort("action", 1)
         self.state = self.DeclareDiscreteState(4)
         self.DeclareInitializationDiscreteUpdateEvent(self.initialize)
@@ -38,7 +39,8 @@ class Toy(LeafSystem):
         def port(name, size, value):
             def calc(context, output):
                 self.fail(name, context)
-                output.SetFromVector(np.atleast_1d(value(self.x(context))))
+                is_nan = name == self.nan_port and abs(self.x(context)[0] - 0.1) < 1e-9
+                output.SetFromVector(np.full(size, np.nan) if is_nan else np.atleast_1d(value(self.x(context))))
 
             self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={self.xd_ticket()})
 
@@ -189,6 +191,23 @@ def test_repeated_action_sums_rewards_and_stops_at_the_end():
     *_, terminated, _, info = env.step([1.0])
     assert terminated
     assert info["control_steps"] == 2
+
+
+@pytest.mark.parametrize(
+    ("port", "key"),
+    [
+        ("commanded_violation", "constraint_violation"),
+        ("measured_violation", "measured_violation"),
+        ("contact_force", "contact_force"),
+    ],
+)
+@pytest.mark.parametrize("action_repeat", [1, 3])
+def test_info_is_nan_when_a_control_step_is_nan(port, key, action_repeat):
+    env = make(action_repeat=action_repeat)
+    env.reset(options={"start": 0.0})
+    env.toy.nan_port = port
+    info = env.step([1.0])[-1]
+    assert {name for name, value in info.items() if value != value} == {key}
 
 
 def test_the_trace_has_every_control_step():
