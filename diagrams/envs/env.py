@@ -119,7 +119,7 @@ class DiagramEnv(DrakeGymEnv):
         # The parent class writes into `metadata`, so each environment needs its own copy.
         self.metadata = {
             "render_modes": ["human", "rgb_array"],
-            "render_fps": round(1 / (action_repeat * task.control_period)),
+            "render_fps": max(round(1 / (action_repeat * task.control_period)), 1),  # a video needs at least 1
         }
         super().__init__(
             simulator=Simulator(diagram),

@@ -403,6 +403,7 @@ def test_metadata_is_not_shared_between_environments():
     first, second = make(action_repeat=1), make(action_repeat=5)
     assert (dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(DiagramEnv.metadata)) == before
     assert (first.metadata["render_fps"], second.metadata["render_fps"]) == (10, 2)
+    assert make(action_repeat=30).metadata["render_fps"] == 1
 
 
 @pytest.mark.parametrize(
