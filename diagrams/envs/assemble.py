@@ -12,7 +12,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
-from guiderail.diagrams.envs.cameras import Camera, add_meshcat, add_observation_camera, add_picture
+from guiderail.diagrams.envs.cameras import Camera, add_meshcat, add_observation_camera, add_picture, scene_of
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import (
     CLOCKS,
@@ -408,7 +408,7 @@ def build_skill_diagram(
         builder.ExportOutput(station.GetOutputPort(name), name)
     for name in OUTPUTS:
         builder.ExportOutput(guidance.GetOutputPort(name), name)
-    meshcat = add_meshcat(builder, station.GetOutputPort("query")) if render_mode == "human" else None
+    meshcat = add_meshcat(builder, scene_of(station)) if render_mode == "human" else None
     if render_mode == "rgb_array":
         add_picture(builder, station, task.camera(), task.name)
     diagram = builder.Build()

@@ -139,13 +139,24 @@ def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, ta
     """Add the camera for pictures of a task and export its image; `task` is the name of the task.
 
     Raises:
-        InputError: If the task has no camera, or as `add_camera`.
+        InputError: If the task has no camera, the station has no scene, or as `add_camera`.
     """
     if camera is None:
         raise InputError(f"{task} has no camera: leave out render_mode='rgb_array' or --image, or write its camera()")
-    query = station.GetOutputPort("query")
+    query = scene_of(station)
     picture = add_camera(builder, station.scene_graph, query, "picture", camera, is_picture=True)
     builder.ExportOutput(picture, "rgb_image")
+
+
+def scene_of(station: Any) -> OutputPort:
+    """Return the query port of a station's scene.
+
+    Raises:
+        InputError: If the station has no scene, because it is a real robot.
+    """
+    if not station.HasOutputPort("query"):
+        raise InputError("this station has no scene to draw: choose a simulated one, or leave render_mode out")
+    return station.GetOutputPort("query")
 
 
 def check_rendering() -> None:

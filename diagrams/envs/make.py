@@ -140,6 +140,7 @@ def make_skill(
     Raises:
         InputError: As `make_env`, or if the sizes of the policy's ports do not match the environment.
     """
+    check_render_mode(render_mode)
     declared = _config(task, options).make_task()
     threadpool_limits(1)
     station = make_station(declared)

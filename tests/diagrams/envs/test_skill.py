@@ -72,3 +72,16 @@ def test_a_system_of_another_size_is_refused():
     builder.ExportOutput(system.get_output_port(), "action")
     with pytest.raises(InputError, match="takes 1 numbers and returns 2, this one 3 and 3"):
         make_skill("NarrowPassage", builder.Build(), guidance="kgrl")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"render_mode": "ascii"}, "no render mode 'ascii'"),
+        ({"render_mode": "human", "station": "hardware", "robot_url": "memq://"}, "no scene to draw"),
+        ({"render_mode": "rgb_array", "station": "hardware", "robot_url": "memq://"}, "no scene to draw"),
+    ],
+)
+def test_skill_refuses_a_view_that_it_cannot_draw(options, message):
+    with pytest.raises(InputError, match=message):
+        make_skill("GridClamp", policy(3), **options)
