@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gymnasium
@@ -101,25 +101,35 @@ class Observation(Diagram):
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
             raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
-        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[term.signal] for term in terms]))
+        signals = {term.signal for term in terms}
+        multiplexer = builder.AddNamedSystem(
+            _unused("observed", signals), Multiplexer([sizes[term.signal] for term in terms])
+        )
         ports: dict[str, OutputPort] = {}
         if waits:
-            motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
+            motion_time = builder.AddNamedSystem(
+                _unused(MOTION_TIME, signals), Saturation(np.zeros(1), np.full(1, duration))
+            )
             builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
         for index, term in enumerate(terms):
-            if term.signal in CLOCKS:
+            if term.signal in CLOCKS and term.signal not in ports:
                 ports[term.signal] = _add_clock(builder, term.signal, duration, motion_time if waits else None)
             elif term.signal not in ports:
                 signal = builder.AddNamedSystem(term.signal, PassThrough(sizes[term.signal]))
-                builder.ExportInput(signal.get_input_port(), term.signal)
+                if waits and term.signal == MOTION_TIME:
+                    builder.ConnectInput(MOTION_TIME, signal.get_input_port())
+                else:
+                    builder.ExportInput(signal.get_input_port(), term.signal)
                 ports[term.signal] = signal.get_output_port()
             builder.Connect(ports[term.signal], multiplexer.get_input_port(index))
         scale = np.concatenate([scale for _, _, scale in rows])
         center = np.concatenate([center for _, center, _ in rows])
         D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]
-        scaled = add_system(builder, "scaled", affine(D, -center / scale), multiplexer.get_output_port())
+        scaled = add_system(
+            builder, _unused("scaled", signals), affine(D, -center / scale), multiplexer.get_output_port()
+        )
         limit = np.full(self.size, clip)
-        clipped = add_system(builder, "clipped", Saturation(-limit, limit), scaled.get_output_port())
+        clipped = add_system(builder, _unused("clipped", signals), Saturation(-limit, limit), scaled.get_output_port())
         builder.ExportOutput(clipped.get_output_port(), "observation")
         builder.BuildInto(self)
         self.space = gymnasium.spaces.Box(-clip, clip, (self.size,), np.float32)
@@ -132,6 +142,13 @@ class Observation(Diagram):
     def get_observation_output_port(self) -> OutputPort:
         """Return the port of the observation, (n,)."""
         return self.GetOutputPort("observation")
+
+
+def _unused(name: str, signals: Collection[str]) -> str:
+    """Return the name of a system that no signal has: `name`, with underscores at its end if needed."""
+    while name in signals:
+        name += "_"
+    return name
 
 
 def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:

@@ -1,6 +1,7 @@
 """Addition of a system together with its connections."""
 
 import numpy as np
+import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Adder, ConstantVectorSource, PassThrough
 
@@ -17,6 +18,20 @@ def test_ports_are_connected_in_order_and_the_system_is_returned():
     context = adder.GetMyContextFromRoot(diagram.CreateDefaultContext())
     assert [adder.get_input_port(index).Eval(context) for index in range(2)] == [1.0, 2.0]
     assert diagram.GetSubsystemByName("sum") is adder
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_observation_has_a_signal_of_any_name_twice(waits):
+    sizes = dict.fromkeys(("observed", "scaled", "clipped", "motion_time"), 1)
+    terms = [ObservationTerm(name, scale=scale) for scale in (1.0, 0.5) for name in (*sizes, "time", "phase")]
+    observation = Observation(terms, sizes, duration=4.0, clip=100.0, waits=waits)
+    context = observation.CreateDefaultContext()
+    context.SetTime(2.0)
+    for value, name in enumerate(sizes):
+        observation.GetInputPort(name).FixValue(context, [float(value)])
+    once = np.array([0.0, 1.0, 2.0, 3.0, *((3.0, 0.5) if waits else (2.0, 0.0))])
+    seen = observation.get_observation_output_port().Eval(context)
+    np.testing.assert_allclose(seen, [*once, *(2.0 * once)], atol=1e-12)
 
 
 def test_ports_are_connected_by_any_name():
