@@ -119,7 +119,7 @@ class RtdeDriver(PoseDriver):
         )
         self._check(self._control.setTcp(transform_to_vector(impedance.X_FlangeTool).tolist()), "tool center")
         force = float(np.linalg.norm(self._receiver.getActualTCPForce()[:3]))
-        if force > MAX_ZEROED_FORCE:
+        if not force <= MAX_ZEROED_FORCE:  # refuses NaN
             raise InputError(f"the robot measures {force:.0f} N: free its tool before the force sensor is zeroed")
         self._check(self._control.zeroFtSensor(), "zeroing of the force sensor")
 
@@ -265,7 +265,7 @@ class RtdeDriver(PoseDriver):
             InputError: If they differ by more than `MAX_POSE_DIFFERENCE`.
         """
         distance = self._kinematic_distance()
-        if distance > MAX_POSE_DIFFERENCE:
+        if not distance <= MAX_POSE_DIFFERENCE:  # refuses NaN
             raise InputError(
                 f"the tool center of the robot at {self.url} is {1e3 * distance:.0f} mm from that of the {self.name}'s "
                 "model: it is another robot, or another tool is active"

@@ -82,7 +82,7 @@ def test_configuration_sets_tool_and_payload(robot, driver, impedance):
     np.testing.assert_allclose(robot.payload[4:], expected)
 
 
-@pytest.mark.parametrize(("share", "is_refused"), [(0.95, False), (1.05, True)])
+@pytest.mark.parametrize(("share", "is_refused"), [(0.95, False), (1.05, True), (np.nan, True)])
 def test_loaded_tool_is_refused_before_zeroing(robot, impedance, share, is_refused):
     robot.bias = np.array([0.0, 0.0, share * rtde.MAX_ZEROED_FORCE, 0.0, 0.0, 0.0])
     driver = RtdeDriver(robot.host, client=DirectClient(robot))
@@ -166,7 +166,7 @@ def test_protective_stop_is_a_fault_until_recovery(robot, driver, monkeypatch):
         driver.recover()
 
 
-@pytest.mark.parametrize(("share", "is_refused"), [(0.9, False), (1.1, True)])
+@pytest.mark.parametrize(("share", "is_refused"), [(0.9, False), (1.1, True), (np.nan, True)])
 def test_other_kinematics_are_refused(robot, driver, model, share, is_refused):
     robot.calibration = np.array([0.0, share * rtde.MAX_POSE_DIFFERENCE, 0.0])
     driver.read()
