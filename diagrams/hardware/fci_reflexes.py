@@ -61,11 +61,11 @@ class ReflexDetector:
         """
         step = np.abs(command - self._last_command)
         self._last_command = np.array(command)
-        reasons = {
-            Reflex.CONTROLLER_TORQUE_DISCONTINUITY: step > MAX_TORQUE_STEP + ROUNDING,
-            Reflex.JOINT_POSITION_LIMITS_VIOLATION: (position < self._lower) | (position > self._upper),
-            Reflex.JOINT_VELOCITY_VIOLATION: np.abs(velocity) > self._speed,
-            Reflex.JOINT_REFLEX: np.abs(external_torque) > self._max_torque,
-            Reflex.CARTESIAN_REFLEX: np.abs(external_wrench) > self._max_wrench,
+        within = {  # NaN is not within a limit
+            Reflex.CONTROLLER_TORQUE_DISCONTINUITY: step <= MAX_TORQUE_STEP + ROUNDING,
+            Reflex.JOINT_POSITION_LIMITS_VIOLATION: (position >= self._lower) & (position <= self._upper),
+            Reflex.JOINT_VELOCITY_VIOLATION: np.abs(velocity) <= self._speed,
+            Reflex.JOINT_REFLEX: np.abs(external_torque) <= self._max_torque,
+            Reflex.CARTESIAN_REFLEX: np.abs(external_wrench) <= self._max_wrench,
         }
-        return next((reason for reason, is_exceeded in reasons.items() if is_exceeded.any()), None)
+        return next((reason for reason, is_within in within.items() if not is_within.all()), None)

@@ -44,6 +44,11 @@ def test_no_reflex_within_the_limits(detector):
         ("external_wrench", 2, 10.1, Reflex.CARTESIAN_REFLEX),
         ("external_wrench", 3, -5.1, Reflex.CARTESIAN_REFLEX),
         ("command", 4, 1.01, Reflex.CONTROLLER_TORQUE_DISCONTINUITY),
+        ("position", 1, np.nan, Reflex.JOINT_POSITION_LIMITS_VIOLATION),
+        ("velocity", 1, np.nan, Reflex.JOINT_VELOCITY_VIOLATION),
+        ("external_torque", 1, np.nan, Reflex.JOINT_REFLEX),
+        ("external_wrench", 1, np.nan, Reflex.CARTESIAN_REFLEX),
+        ("command", 1, np.nan, Reflex.CONTROLLER_TORQUE_DISCONTINUITY),
     ],
 )
 def test_reflex_beyond_a_limit(detector, name, index, value, reflex):
