@@ -108,7 +108,12 @@ def max_wrench(force: float, torque: float = np.inf) -> np.ndarray:
     """Return the value (8,) of a station's `max_wrench` that keeps the impedance below a force [N] and a torque [Nm].
 
     A torque is limited to 1/√3 of `torque` about each axis, so that the norm never exceeds `torque`.
+
+    Raises:
+        InputError: If the force or the torque is not positive.
     """
+    if not torque > 0.0:
+        raise InputError(f"the largest torque of an impedance must be positive, not {torque} Nm")
     bound = Impedance().with_max_force(force).bound
     assert bound is not None
     numbers = bound.numbers
@@ -122,9 +127,9 @@ def whole_multiple(control_period: float, unit: float) -> float:
     """Return a control period [s] as an exact multiple of `unit` [s].
 
     Raises:
-        InputError: If the period is not a whole multiple of `unit`.
+        InputError: If the period is not a whole multiple of `unit`, or one of the two is not positive and finite.
     """
-    number = round(control_period / unit)
+    number = round(control_period / unit) if 0.0 < unit <= 2.0 * control_period < np.inf else 0
     if number < 1 or abs(number * unit - control_period) > 1e-6:
         raise InputError(f"control_period must be a whole multiple of {unit:g} s, not {control_period:g} s")
     return number * unit

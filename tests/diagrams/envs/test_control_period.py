@@ -81,6 +81,13 @@ def test_period_of_a_robot_is_a_multiple_of_its_drivers():
         whole_multiple(0.0125, station.period)
 
 
+@pytest.mark.parametrize("nonsense", [0.0, -0.01, np.nan, np.inf])
+def test_period_or_unit_that_is_nonsense_is_refused(nonsense):
+    for period, unit in ((nonsense, 0.01), (0.02, nonsense)):
+        with pytest.raises(InputError, match="whole multiple"):
+            whole_multiple(period, unit)
+
+
 def test_reference_of_another_clock_is_refused():
     class Deaf(task_of("NarrowPassage").__class__):
         def on_clock(self, reference, time_scale=1.0):

@@ -141,6 +141,12 @@ def test_torque_limit_bounds_the_norm():
     np.testing.assert_array_equal(max_wrench(20.0, 1e3), max_wrench(20.0))
 
 
+@pytest.mark.parametrize("limits", [(20.0, np.nan), (20.0, -1.0), (20.0, 0.0), (np.nan,), (-1.0,), (0.0,)])
+def test_limit_that_is_not_positive_is_refused(limits):
+    with pytest.raises(InputError, match=r"positive|negative"):
+        max_wrench(*limits)
+
+
 def test_template_of_task_has_no_limits():
     task = EnvConfig.resolve("GridClamp", {}).make_task()
     assert make_phase_wrench_limit(task.template().template, None, 0.01) is None
