@@ -111,11 +111,17 @@ def _num_steps(task: Task, period: float) -> int:
 
 
 def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
-    """Return a task's motion constraints with the limits from its options, or None if it has neither."""
+    """Return a task's motion constraints with the limits from its options, or None if it has neither.
+
+    Raises:
+        InputError: If the station has no joints for `joint_margin`, or `min_singular_value` is given without it.
+    """
     motion, options = task.motion_constraints(), task.config.part("primitive")
     limits: dict[str, Any] = {}
     if options.get("joint_margin") is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
+    elif options.get("min_singular_value"):
+        raise InputError("min_singular_value has an effect with joint_margin only: give joint_margin=0 as well")
     outputs = constraints.num_outputs
     limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options.get(name)}
     if motion is None:

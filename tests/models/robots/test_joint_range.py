@@ -105,6 +105,11 @@ def test_range_raises_when_an_argument_is_out_of_range(model):
             joint_range(model, **arguments)
 
 
+def test_singular_value_needs_a_margin():
+    with pytest.raises(InputError, match="joint_margin=0 as well"):
+        make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", min_singular_value=0.05)
+
+
 def test_option_needs_an_arm():
     with pytest.raises(InputError, match="station=arm"):
         make_prior_knowledge("BncConnector", guidance="kgrl", joint_margin=0.1)
