@@ -114,8 +114,11 @@ class _Gateway:
         return line
 
     def read_browsers(self) -> int:
-        """Return the number of connected browsers."""
-        *lines, self._rest = (self._rest + (self._output.read() or b"")).split(b"\n")
+        """Return the number of connected browsers; 0 after the process has ended."""
+        received = b"" if self._output.closed else self._output.read()
+        if received == b"":  # end of the output; without a new number it is None
+            return 0
+        *lines, self._rest = (self._rest + (received or b"")).split(b"\n")
         if lines:
             self._num_browsers = int(lines[-1])
         return self._num_browsers

@@ -127,6 +127,21 @@ def test_tokens_differ(page):
     other.close()
 
 
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_ended_page_has_no_connections(is_killed):
+    PAGES.append(page := MeshcatPage())
+    with browser(page):
+        wait_until(lambda: page.GetNumActiveConnections() == 1)
+        assert page.GetNumActiveConnections() == 1  # without a new message
+        if is_killed:
+            page._gateway._process.kill()
+        else:
+            page.close()
+        wait_until(lambda: page.GetNumActiveConnections() == 0)
+    page.close()
+    assert page.GetNumActiveConnections() == 0
+
+
 def test_meshcat_itself_accepts_no_connection():
     """Only the gateway listens, because one malformed byte can end the server inside Meshcat."""
     PAGES.append(page := MeshcatPage(is_served=False))
