@@ -16,16 +16,20 @@ import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 
-from guiderail.diagrams.hardware.driver import CommandCallback, Driver, register_driver
+from guiderail.diagrams.hardware.driver import STATUS_PERIOD, CommandCallback, Driver, register_driver
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.joint_status import MALFORMED_STATUS, MAX_SENDERS, Heartbeat, JointStatus
 from guiderail.models.control.message_sequence import StatusSequence
+from guiderail.systems.heartbeat_monitor import FORGET_TIME
 
 PROVIDERS = ("udpm", "mpudpm", "tcpq", "memq")
 MICROSECOND = 1e-6  # unit of a message's time [s]
 HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
 HEARTBEAT_FORMAT = struct.Struct(">q?q")
+# A safety monitor has ended if this many heartbeats of others arrived after its last one. `MAX_SENDERS` monitors send
+# them in `FORGET_TIME`.
+MAX_HEARTBEATS_MISSED = MAX_SENDERS * round(FORGET_TIME / STATUS_PERIOD)
 
 
 def open_bus(url: str) -> DrakeLcm:
@@ -128,8 +132,9 @@ class LcmDriver(Driver):
         self._status: JointStatus | None = None  # newest status
         self._sequence = StatusSequence(self.period)
         self._num_contested = 0  # foreign commands after the first command of this program
-        # Newest heartbeat and the number of its channel by sender, latest sender last.
-        self._heartbeats: dict[int, tuple[Heartbeat, int]] = {}
+        # Newest heartbeat, number of its channel, and its place among all heartbeats, by sender; latest sender last.
+        self._heartbeats: dict[int, tuple[Heartbeat, int, int]] = {}
+        self._num_heartbeats = 0
         self._number = 0  # number of the channel of this program's heartbeat
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
         self._listeners: list[CommandCallback] = []
@@ -200,12 +205,15 @@ class LcmDriver(Driver):
         self._listeners.append(on_command)
 
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
-        """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`."""
-        return tuple(heartbeat for heartbeat, _ in self._heartbeats.values())
+        """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`.
+
+        A monitor is left out after others have sent `MAX_HEARTBEATS_MISSED` heartbeats without one of its own.
+        """
+        return tuple(heartbeat for heartbeat, *_ in self._heartbeats.values())
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat of the safety monitor, on a channel on which no other monitor has been received."""
-        taken = {number for other, number in self._heartbeats.values() if other.sender != heartbeat.sender}
+        taken = {number for other, number, _ in self._heartbeats.values() if other.sender != heartbeat.sender}
         if self._number in taken:
             # Two monitors that see each other choose at random, because the same choice would collide again.
             self._number = secrets.choice(sorted(set(range(MAX_SENDERS)) - taken) or [self._number])
@@ -238,12 +246,18 @@ class LcmDriver(Driver):
     def _on_heartbeat(self, number: int, message: bytes) -> None:
         if len(message) == HEARTBEAT_FORMAT.size:
             heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
-            newest, _ = self._heartbeats.pop(heartbeat.sender, (heartbeat, number))
+            newest, *_ = self._heartbeats.pop(heartbeat.sender, (heartbeat,))
             # After a monitor has changed its channel, an older heartbeat may still be unread on its previous channel.
             is_older = heartbeat.sequence < newest.sequence
-            self._heartbeats[heartbeat.sender] = (newest if is_older else heartbeat), number
-            while len(self._heartbeats) > MAX_SENDERS:
+            self._num_heartbeats += 1
+            self._heartbeats[heartbeat.sender] = (newest if is_older else heartbeat), number, self._num_heartbeats
+            # A monitor that ended during a stop must not excuse the commands of other programs forever.
+            while len(self._heartbeats) > MAX_SENDERS or self._num_missed() > MAX_HEARTBEATS_MISSED:
                 self._heartbeats.pop(next(iter(self._heartbeats)))
+
+    def _num_missed(self) -> int:
+        """Return the number of heartbeats that arrived after the last one of the longest silent monitor."""
+        return self._num_heartbeats - next(iter(self._heartbeats.values()))[2]
 
 
 @register_driver("iiwa14")

@@ -5,7 +5,7 @@ import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
+from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, MAX_HEARTBEATS_MISSED, IiwaDriver
 from guiderail.models.control.joint_status import Heartbeat
 
 OWN, OTHER = np.full(7, 0.5), np.full(7, -0.5)
@@ -64,6 +64,21 @@ def test_commands_of_a_safety_monitor_are_not_foreign(is_stopping):
     pair.other.write_heartbeat(Heartbeat(2, False, 4))
     pair.other.write(OTHER, 1.005)
     assert pair.read().foreign_commands == 1 + (not is_stopping)
+
+
+def test_monitor_that_ended_during_a_stop_excuses_no_commands():
+    pair = Pair()
+    pair.driver.write(OWN, 1.0)
+    pair.other.write_heartbeat(Heartbeat(7, True, 4))
+    for sequence in range(MAX_HEARTBEATS_MISSED + 1):
+        pair.other.write(OTHER, sequence * 0.005)
+        assert pair.read() is None
+        assert pair.driver.num_foreign_commands == 0
+        pair.other.write_heartbeat(Heartbeat(sequence, False, 5))  # of the monitor that replaces it
+    pair.read()
+    assert {heartbeat.sender for heartbeat in pair.driver.read_heartbeats()} == {5}
+    pair.other.write(OTHER, 9.0)
+    assert pair.status().foreign_commands == pair.driver.num_foreign_commands == 1
 
 
 def test_every_status_is_compared_also_if_it_is_not_read():
