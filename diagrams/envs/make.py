@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import BASE_POLICIES
 
 logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO
 
@@ -183,6 +185,17 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments with equal diagrams."""
     config = task.config
     try:
-        return type(task), config.guidance_kind, config.station_kind, render_mode, freeze(config.options)
-    except TypeError:
-        return object()  # an option is not comparable, so the diagram is not shared
+        kinds = config.guidance_kind, config.station_kind, _base_policy_key(config.options.get("base_policy"))
+        return type(task), *kinds, render_mode, freeze(config.options)
+    except (TypeError, OSError):
+        return object()  # an option is not comparable, or the base policy has no file: the diagram is not shared
+
+
+def _base_policy_key(source: str | None) -> Hashable:
+    """Return a key of the base policy that an option names, which a later training run or registration may replace."""
+    if not source:
+        return None
+    if source in BASE_POLICIES.names():
+        return id(BASE_POLICIES.get(source))  # unique, because a diagram with this policy is never freed
+    file = (Path(source) / "policy.safetensors").stat()
+    return file.st_ino, file.st_mtime_ns, file.st_size

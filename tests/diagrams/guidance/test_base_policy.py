@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.make import _base_policy_key, make_env
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import BASE_POLICIES
 
@@ -52,6 +52,27 @@ def test_command_follows_the_chunk_of_the_observation(kind, registered):
     env.step(np.zeros(2))
     assert len(seen) == 2
     assert np.allclose(env.unwrapped.trace.commanded[-1], [0.052, 0.02], atol=3e-3)
+
+
+def test_diagram_is_not_reused_when_the_base_policy_was_replaced(registered):
+    def made(y):
+        registered("line", lambda observation: np.tile([[0.05, y]], (8, 1)))
+        env = make_env("NarrowPassage", guidance="base_policy", base_policy="line", guard="none")
+        trace = run(env, np.zeros((2, 2)))
+        env.close()
+        return trace.commanded[-1, 1]
+
+    assert [made(y) for y in (0.02, 0.03)] == pytest.approx([0.02, 0.03])
+
+
+def test_key_changes_when_a_run_is_trained_again(tmp_path):
+    file = tmp_path / "policy.safetensors"
+    file.write_bytes(b"one")
+    before = _base_policy_key(str(tmp_path))
+    assert before == _base_policy_key(str(tmp_path))
+    (tmp_path / "new").write_bytes(b"two")
+    (tmp_path / "new").replace(file)
+    assert before != _base_policy_key(str(tmp_path))
 
 
 def test_no_command_violates_a_constraint_whatever_base_policy_and_actions(registered):
