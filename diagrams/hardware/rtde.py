@@ -87,6 +87,7 @@ class RtdeDriver(PoseDriver):
         self._impedance: RobotImpedance | None = None
         self._status: JointStatus | None = None
         self._is_active = self._is_lost = False
+        self._has_failed_to_stop = False  # the controller may still apply the last wrench
         self._stopping: threading.Thread | None = None
         self._plant = MultibodyPlant(0.0)
         self._flange = add_robot(self._plant, find_robot(self.name)).flange
@@ -197,7 +198,7 @@ class RtdeDriver(PoseDriver):
             self._finish_stop()
             self._check_kinematics()
             self._check(self._control.setWatchdog(WATCHDOG_FREQUENCY), "watchdog")
-            self._is_active = True
+            self._is_active, self._has_failed_to_stop = True, False
         # Computed by the station's model, so that driver and station agree; the robot's pose may differ by 1 mm.
         X_BaseActual = self._calc_pose(status.positions)
         turn = (X_BaseTool.rotation() @ X_BaseActual.rotation().inverse()).ToAngleAxis()
@@ -215,8 +216,18 @@ class RtdeDriver(PoseDriver):
         if self._is_active:
             self._is_active = False
             # In a thread, because the call blocks until the arm has stopped, and this program's loop must not block.
-            self._stopping = threading.Thread(target=self._control.forceModeStop, daemon=True)
+            self._stopping = threading.Thread(target=self._stop_force_mode, daemon=True)
             self._stopping.start()
+
+    def _stop_force_mode(self) -> None:
+        """Leave force mode. If the robot refuses, its watchdog is not fed any more, and ends its program."""
+        try:
+            has_stopped = bool(self._control.forceModeStop())
+        except Exception:  # the client raises RuntimeError and its own types
+            has_stopped = False
+        if not has_stopped:
+            self._has_failed_to_stop = True
+            logger.error("the robot at %s does not leave force mode: its watchdog ends its program", self.url)
 
     def recover(self) -> None:
         """End a protective stop, and start the controller's program again; the arm does not move.
@@ -234,8 +245,9 @@ class RtdeDriver(PoseDriver):
             dashboard.closeSafetyPopup()
             dashboard.unlockProtectiveStop()
             dashboard.disconnect()
-        if self._control is not None and not self._control.isProgramRunning():
+        if self._control is not None and (self._has_failed_to_stop or not self._control.isProgramRunning()):
             self._control.reuploadScript()
+            self._has_failed_to_stop = False
         end = clock.monotonic() + RECOVERY_TIME
         while self.error and clock.monotonic() < end:
             clock.sleep(0.01)
@@ -245,7 +257,7 @@ class RtdeDriver(PoseDriver):
     def _keep_alive(self, time: float) -> None:
         """Feed the controller's watchdog while no wrench is commanded."""
         is_new = self._status is None or time != self._status.time
-        is_stopping = self._stopping is not None and self._stopping.is_alive()
+        is_stopping = self._has_failed_to_stop or (self._stopping is not None and self._stopping.is_alive())
         if is_new and self._control is not None and not self._is_active and not is_stopping:
             self._control.kickWatchdog()
 

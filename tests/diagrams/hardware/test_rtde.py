@@ -152,6 +152,32 @@ def test_robot_is_kept_alive_while_it_holds(robot, driver, model):
     assert robot.commands[-1] == FORCE_MODE
 
 
+def refuse():
+    return False
+
+
+def fail():
+    raise RuntimeError("connection lost")
+
+
+@pytest.mark.parametrize("stop", [refuse, fail])
+def test_watchdog_ends_a_program_that_does_not_stop(robot, driver, model, monkeypatch, stop):
+    driver.write_pose(model_pose(model, driver), 0.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(driver._control, "forceModeStop", stop, raising=False)
+        driver.stop()
+        driver._stopping.join()
+    for _ in range(4):
+        robot.advance(0.5 / rtde.WATCHDOG_FREQUENCY)
+        driver.read()
+    assert not robot.is_running
+    assert not driver.read().is_readable
+    driver.recover()
+    for _ in range(4):
+        robot.advance(0.5 / rtde.WATCHDOG_FREQUENCY)
+        assert driver.read().is_readable
+
+
 def test_protective_stop_is_a_fault_until_recovery(robot, driver, monkeypatch):
     monkeypatch.setattr(rtde, "RECOVERY_TIME", 0.0)
     robot.safety_bits = 1 + 4
