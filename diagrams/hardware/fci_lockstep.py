@@ -68,11 +68,12 @@ class FciLockstepClock:
 
     def _request(self, message: dict[str, Any]) -> float | None:
         """Return the robot's time after a request [s], or None if it does not answer."""
+        # Wait for the full timeout only once if the robot is silent, not in every step.
+        timeout = self._period if self._has_timed_out else self._timeout
         try:
             if self._socket is None:
-                self._socket = socket.create_connection(self._address, self._timeout)
-            # Wait for the full timeout only once if the robot is silent, not in every step.
-            self._socket.settimeout(self._period if self._has_timed_out else self._timeout)
+                self._socket = socket.create_connection(self._address, timeout)
+            self._socket.settimeout(timeout)
             self._socket.sendall(json.dumps(message).encode() + b"\n")
             answer = self._socket.recv(4096)
             if not answer:

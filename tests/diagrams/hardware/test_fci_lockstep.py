@@ -86,3 +86,17 @@ def test_silent_robot_is_waited_for_once():
         clock = FciLockstepClock(HOST, 0.01, PERIOD)
         clock.advance(simulator, recorder, 3)
     assert recorder.clocks == pytest.approx([PERIOD, 2 * PERIOD, 3 * PERIOD])
+
+
+def test_full_timeout_of_a_connection_passes_only_once(monkeypatch):
+    timeouts = []
+
+    def connect(address, timeout):
+        timeouts.append(timeout)
+        raise TimeoutError
+
+    monkeypatch.setattr(fci_lockstep.socket, "create_connection", connect)
+    clock = FciLockstepClock(HOST, 5.0, PERIOD)
+    clock.begin()
+    clock.advance(Simulator(ConstantVectorSource([0.0])), ClockRecorder(), 2)
+    assert timeouts == [5.0, PERIOD, PERIOD]
