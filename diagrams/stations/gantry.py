@@ -101,7 +101,8 @@ class GantryStation(Station):
         super().__init__()
         builder = DiagramBuilder()
         is_joint = impedance_control == "joint"
-        time_step = time_step or (PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD)
+        if time_step is None:
+            time_step = PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD
         self.control_period = control_period
         whole_multiple(control_period, time_step)
         if not is_joint:

@@ -217,7 +217,7 @@ class MujocoStation(Station):
                 period is no multiple of the time step.
         """
         super().__init__()
-        time_step, self.control_period = time_step or PLANT_PERIOD, control_period
+        time_step, self.control_period = PLANT_PERIOD if time_step is None else time_step, control_period
         whole_multiple(control_period, time_step)
         if not isinstance(workcell, ConvexWorkcell):
             raise InputError(

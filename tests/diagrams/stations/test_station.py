@@ -3,6 +3,10 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
+from guiderail.diagrams.stations.arm import ArmStation
+from guiderail.diagrams.stations.gantry import GantryStation
+from guiderail.diagrams.stations.mujoco import MujocoStation
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 
 PLACES = [
@@ -23,3 +27,10 @@ def test_set_pose_raises_when_the_pose_is_not_finite(task, place):
     for pose in broken:
         with pytest.raises(InputError, match=f"put to a pose of {station.pose_size} finite numbers, not"):
             station.set_pose(context, pose)
+
+
+@pytest.mark.parametrize("station", [ArmStation, GantryStation, MujocoStation])
+@pytest.mark.parametrize("time_step", [0.0, -0.01, np.nan])
+def test_station_raises_when_the_time_step_is_not_positive(station, time_step):
+    with pytest.raises(InputError, match="whole multiple"):
+        station(BncWorkcell(), time_step=time_step)
