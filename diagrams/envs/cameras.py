@@ -65,7 +65,13 @@ class Camera:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
-    """Return the pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), with a level horizon."""
+    """Return the pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), with a level horizon.
+
+    Raises:
+        InputError: If the camera looks straight up or down, where no horizon is level, or the two points are equal.
+    """
+    if not np.hypot(target[0] - eye[0], target[1] - eye[1]) > 0.0:
+        raise InputError(f"a camera at {eye} cannot look at {target} with a level horizon: write its pose instead")
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)

@@ -2,12 +2,14 @@ import subprocess
 import sys
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.envs.cameras import Camera, add_camera
+from guiderail.diagrams.envs.cameras import Camera, add_camera, look_at
+from guiderail.models.common.errors import InputError
 
 RENDERS = """
 import gymnasium, guiderail
@@ -16,6 +18,12 @@ env.reset(seed=0)
 import torch._dynamo
 env.step(env.action_space.sample())
 """
+
+
+@pytest.mark.parametrize("target", [[0.5, 0.0, 0.0], [0.5, 0.0, 2.0], [0.5, 0.0, 1.0], [np.nan, 0.0, 0.0]])
+def test_camera_without_a_level_horizon_is_refused(target):
+    with pytest.raises(InputError, match="level horizon"):
+        look_at(np.array([0.5, 0.0, 1.0]), np.array(target))
 
 
 def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
