@@ -51,7 +51,7 @@ def _check_url(url: str) -> None:
         host, port = parts.hostname, parts.port
     except ValueError as error:
         raise InputError(f"{brief(url)} is no URL of LCM: {error}") from None
-    if parts.scheme not in PROVIDERS or "://" not in url:
+    if url.partition("://")[0] not in PROVIDERS or "://" not in url:  # LCM distinguishes upper and lower case
         raise InputError(f"{brief(url)} is no URL of LCM, such as udpm://239.255.76.67:7667?ttl=0 or memq://")
     if parts.scheme in ("udpm", "mpudpm") and host is not None:
         try:

@@ -19,7 +19,7 @@ def test_open_bus_uses_lcms_default_without_a_url(monkeypatch):
 @pytest.mark.parametrize(
     "url",
     ["nonsense", "udp://239.255.76.67:7667", "memq:", "udpm://999.1.1.1:7667", "udpm://10.0.0.1:7667",
-     "udpm://239.255.76.67:70000", "udpm://239.255.76.67:0", "udpm://host:7667"],
+     "udpm://239.255.76.67:70000", "udpm://239.255.76.67:0", "udpm://host:7667", "UDPM://239.255.76.67:7667"],
 )  # fmt: skip
 def test_open_bus_raises_when_the_url_is_unusable(url):
     with pytest.raises(InputError, match="LCM"):
