@@ -56,7 +56,7 @@ class ActiveConstraintProjector(LeafSystem):
 
     Raises:
         InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the
-            measured pose is not finite.
+            measured pose or a frame is not finite.
 
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
@@ -148,14 +148,14 @@ class ActiveConstraintProjector(LeafSystem):
         return self._violation(context, self._pose_port.Eval(context))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
-        measured = self._pose_port.Eval(context)
-        if not np.isfinite(measured).all():
-            raise InputError(f"a template begins at the robot's pose: the measured pose must be finite, not {measured}")
+        measured = declare.start_pose(self._pose_port, context)
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
         # The state port cannot be used, because its source is initialized at this same instant.
         state = self._template.state_at(X_WE, frames)
-        command = self._template.command(state, X_WE, X_WE, frames, self._period)
-        discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
+        command = transform_to_pose(self._template.command(state, X_WE, X_WE, frames, self._period).X_WE)
+        if not np.isfinite(command).all():
+            raise InputError(f"the frames of the template {self._template.name} must be finite at the start")
+        discrete_state.set_value(np.concatenate([command, measured]))
 
     @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -49,7 +49,7 @@ class ChunkSafetyLimiter(LeafSystem):
         period: Control period [s], equal to the period of the guard.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, guard: ChunkGuard, num_steps: int, replan_steps: int, period: float):
@@ -80,7 +80,7 @@ class ChunkSafetyLimiter(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the previous chunk is executed further, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        start = self._guard.constraints.nearest(self._pose_port.Eval(context))
+        start = self._guard.constraints.nearest(declare.start_pose(self._pose_port, context))
         discrete_state.set_value(np.append(np.tile(start, 3 + self._num_steps), [1.0, 0.0, 0.0]))
 
     def _calc_plan(self, context: Context) -> _Plan:

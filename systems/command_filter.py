@@ -36,7 +36,7 @@ class CommandFilter(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If the period is not positive.
+        InputError: If the period is not positive; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, law: CommandLaw, period: float):
@@ -59,7 +59,7 @@ class CommandFilter(LeafSystem):
     get_intervention_output_port = output_getter("intervention", "flag that the law changed the command, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._law.start(self._pose_port.Eval(context)))
+        discrete_state.set_value(self._law.start(declare.start_pose(self._pose_port, context)))
 
     @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

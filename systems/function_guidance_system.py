@@ -44,7 +44,7 @@ class FunctionGuidanceSystem(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If a size or the period is out of range.
+        InputError: If a size or the period is out of range; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
@@ -71,7 +71,7 @@ class FunctionGuidanceSystem(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the function did not return O finite numbers, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._desired_pose, self._pose_port.Eval(context))
+        discrete_state.set_value(self._desired_pose, declare.start_pose(self._pose_port, context))
         self._step(context, discrete_state)
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:

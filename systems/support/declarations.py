@@ -21,6 +21,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 
 
@@ -158,6 +159,18 @@ def part_output(
     if size is None:
         return scalar_output(system, name, value, [source])
     return output(system, name, size, value, [source])
+
+
+def start_pose(port: InputPort, context: Context) -> np.ndarray:
+    """Return the measured pose (O,) of a port, at which a motion starts.
+
+    Raises:
+        InputError: If it is not finite, because it would then be the first command.
+    """
+    pose = port.Eval(context)
+    if not is_finite(pose):
+        raise InputError(f"the first command is the measured pose: the measured pose must be finite, not {pose}")
+    return np.asarray(pose)
 
 
 def after_start(

@@ -229,6 +229,14 @@ def test_projector_refuses_a_frame_that_is_not_finite():
     assert rig.value("fallback") == 0.0
 
 
+def test_frame_that_is_not_finite_at_the_start_is_refused():
+    rig = Rig()
+    valid = rig.context.get_numeric_parameter(0).CopyToVector()
+    rig.context.get_mutable_numeric_parameter(0).SetFromVector([*valid[:2], np.nan, *valid[3:]])
+    with pytest.raises(InputError, match="must be finite at the start"):
+        rig.simulator.Initialize()
+
+
 def test_nan_is_never_commanded_or_stored():
     """A NaN pose of an object that was written without `set` repeats the last command until the pose is finite."""
     rig = Rig()

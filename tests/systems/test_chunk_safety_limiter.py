@@ -85,3 +85,8 @@ def test_argument_is_refused_when_it_is_out_of_range():
     with pytest.raises(InputError, match="period"):
         ChunkSafetyLimiter(guard(), 4, 4, 0.0)
     ChunkSafetyLimiter(guard(), 4, 4, PERIOD)
+
+
+def test_measured_pose_at_initialization_must_be_finite():
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        run(np.zeros((1, STEPS, 2)), pose=(0.0, np.nan))

@@ -170,3 +170,12 @@ def test_system_keeps_the_velocity_of_a_law_that_limits_the_acceleration():
     desired.GetMutableData().set_value([np.nan, 0.0])
     assert system.get_intervention_output_port().Eval(context)[0] == 1.0
     assert system.get_safe_pose_output_port().Eval(context)[0] == pytest.approx(0.35 + 0.075)
+
+
+def test_measured_pose_at_initialization_must_be_finite():
+    system = CommandFilter(LAWS["tangent"], PERIOD)
+    simulator = Simulator(system)
+    system.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), [0.0, 0.0])
+    system.get_pose_input_port().FixValue(simulator.get_mutable_context(), [np.inf, 0.0])
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        simulator.Initialize()

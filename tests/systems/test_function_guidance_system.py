@@ -83,3 +83,8 @@ def test_constructor_refuses_arguments_out_of_range(sizes):
         FunctionGuidanceSystem(lambda action, pose, wrench: pose, *sizes, PERIOD)
     with pytest.raises(InputError, match="period"):
         FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 1, 1, 0.0)
+
+
+def test_measured_pose_at_initialization_must_be_finite():
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        running(lambda action, pose, wrench: pose, pose=(1.0, np.nan))

@@ -345,6 +345,8 @@ class TemplateGuide(Guide):
         X_WE = pose_to_transform(pose)
         self._state = self.template.state_at(X_WE, self._frames)
         self._X = self.template.command(self._state, X_WE, X_WE, self._frames, self._period).X_WE
+        if not np.isfinite(transform_to_pose(self._X)).all():
+            raise InputError(f"the pose and the frames of the template {self.template.name} must be finite at a reset")
         self._has_begun = False
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> None:

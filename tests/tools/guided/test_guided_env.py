@@ -374,3 +374,11 @@ def test_step_needs_a_reset():
     env = GuidedEnv(PointEnv(), demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         env.step(np.zeros(env.action_space.shape))
+
+
+@pytest.mark.parametrize(("x_of_frame", "x"), [(np.nan, 0.0), (0.0, np.nan)])
+def test_template_guide_refuses_a_start_that_is_not_finite(x_of_frame, x):
+    frames = {"mug_tip": RigidTransform([x_of_frame, 0.0, 0.0])}
+    template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
+    with pytest.raises(InputError, match="must be finite at a reset"):
+        template_guide.reset(None, None, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]))
