@@ -12,10 +12,11 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class PoseRateLimiter(LeafSystem):
     """Follow a desired pose with limited speed, starting from the measured pose.
 
-    While the blend factor is zero the output is the measured pose. If the factor is positive at initialization, the
-    output starts from the pose measured then. Afterwards it moves towards the desired pose. In each period the position
-    moves along a straight line by at most speed times period; each angle turns separately, in the shorter direction. A
-    desired pose within the speed limits is output unchanged. A desired pose that is not finite is ignored.
+    While the blend factor is zero the output is the measured pose. While it is positive the output moves from there
+    towards the desired pose; if it is positive at initialization, the output starts from the pose measured then. In
+    each period the position moves along a straight line by at most speed times period; each angle turns separately, in
+    the shorter direction. A desired pose within the speed limits is output unchanged. A desired pose that is not finite
+    is ignored.
 
     .. pydrake_system::
 

@@ -15,9 +15,9 @@ class ReferenceGovernor(LeafSystem):
 
         x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
-    for six joints with stiffness K and damping D, and time step h. Motion faster than F / √(k m) is slowed down, with
-    force bound F, contact stiffness k and moving mass m (see `governed_error`). A desired pose that needs no limiting
-    is output unchanged up to rounding.
+    with measured pose x and velocity v, stiffness K and damping D of six joints, and time step h. Motion faster than
+    F / √(k m) is slowed down, with force bound F, contact stiffness k and moving mass m (see `governed_error`). A
+    desired pose that needs no limiting is output unchanged up to rounding.
 
     .. pydrake_system::
 
@@ -49,7 +49,7 @@ class ReferenceGovernor(LeafSystem):
         check_period(step)
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "a reference governor")
         if not 0.0 < mass < np.inf:
-            raise InputError(f"the moving mass must be positive, not {mass} kg")
+            raise InputError(f"the moving mass must be positive and finite, not {mass} kg")
         self._mass, self._step, self._bound = mass, step, bound
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._state_port = self.DeclareVectorInputPort("state", 2 * POSE_SIZE)

@@ -34,7 +34,8 @@ class SensorDisturbance(LeafSystem):
     Args:
         period: Period h of noise, drift and delay [s], positive.
         noise: Standard deviations σ, (n,), not negative.
-        delay: Largest delay in periods, at least 0, and default of k; `set_delay` sets k from 1 to this delay.
+        delay: Largest delay in periods, at least 0, and the default of k. If it is positive, `set_delay` changes k to a
+            value from 1 to it.
         drift: Standard deviations of d after `DRIFT_TIME`, (n,), not negative; none by default.
         resolution: Resolution of the output, (n,), not negative; 0, the default, disables rounding.
         configuration_size: Size m of the configuration; 0 if the error does not depend on a configuration.

@@ -27,7 +27,7 @@ class TorquePublisher(LeafSystem):
 
     Args:
         write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
-        num_joints: n, at least 1.
+        num_joints: Number n of joints, at least 1.
         period: Publishing period [s], positive.
         hold: Function that asks the driver to hold the arm, such as `Driver.hold`.
 

@@ -60,7 +60,7 @@ class SafetyLimits:
         times = (self.damping_time, self.decay_time, self.ramp_time)
         for value in (*self.velocity, *self.torque, *self.external_torque, self.force, *times):
             if not 0.0 < value < np.inf:
-                raise InputError(f"an arm's limits and times must be positive, not {value}")
+                raise InputError(f"an arm's limits and times must be positive and finite, not {value}")
         if not (self.lower < np.array(self.upper)).all():
             raise InputError(f"a workspace from {self.lower} to {self.upper} is empty")
 
@@ -206,7 +206,7 @@ class TorqueSafetyLimiter(LeafSystem):
         """Resume after a stop, from the present pose of the arm; `context` is this system's.
 
         Raises:
-            InputError: If the arm is not stopped, not yet at rest, or a fault is present.
+            InputError: If the arm is not stopped, damping has not ended, or a fault is present.
         """
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state != ArmState.OFF:

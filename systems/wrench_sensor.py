@@ -19,7 +19,7 @@ class WrenchSensor(LeafSystem):
 
         F = M A + bias(V) − M [0, g] − F_wrist,  τ y' = F − y
 
-    See `external_wrench`. The wrist is a joint; the tool is rigid and welded to the child of the wrist. F is
+    See `external_wrench`. The wrist is a joint; the tool is the child of the wrist and the bodies welded to it. F is
     transformed to the center of compliance P and expressed in axes that are fixed in the world.
 
     .. pydrake_system::
@@ -61,7 +61,7 @@ class WrenchSensor(LeafSystem):
     ):
         super().__init__()
         if not 0.0 <= time_constant < np.inf:
-            raise InputError(f"a wrench sensor's time constant must not be negative, not {time_constant} s")
+            raise InputError(f"a wrench sensor's time constant must be finite and not negative, not {time_constant} s")
         if not tool or wrist.child_body().index() != tool[0].index():
             raise InputError(f"the first body of a wrench sensor's tool must be the child of {wrist.name()}")
         nominal = plant.CreateDefaultContext()

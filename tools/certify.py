@@ -34,7 +34,8 @@ from guiderail.tools.tables import write_table
 GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
 SEARCH_STEPS = 100_000  # steps of the adversary that determines the budgets
 BUDGET_MARGIN = 1.5  # ratio of the budgets to the worst corrections of the adversary
-MIN_EXCESS = ((0.01,), (0.1,))  # smallest budgets of excess at one step and in total, in units of the action
+# Smallest budgets, at one step and in total, of the excess over ±1 of the actions that are equivalent to corrections.
+MIN_EXCESS = ((0.01,), (0.1,))
 MIN_KEY_BYTES = 16  # shortest key that the checker accepts
 ROUNDING = 1.0 + 1e-6  # tolerance factor: an adversary may reach an exact bound up to rounding
 
@@ -61,8 +62,9 @@ def certify_skill(
         key: File of the key that signs the certificate; None: no signature.
 
     Returns:
-        Path of the certificate, verdict of the checker, and extreme bounds of each regime; after an attack also the
-        rows of `attack.csv` and the share of the budgets that corrections used.
+        Path of the certificate, verdict of the checker, and extreme bounds of each regime (until a constraint becomes
+        active, always, and within the budgets); after an attack also the rows of `attack.csv` and the share of the
+        budgets that corrections used.
 
     Raises:
         InputError: If there is no such run or task, or its guidance cannot be certified.

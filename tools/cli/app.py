@@ -238,7 +238,7 @@ Processes = Annotated[
 Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
 
 RobotUrl = Annotated[str | None, option("Hardware: LCM URL of the driver's bus, or host.  [default: LCM's default]")]
-Driver = Annotated[str | None, option("Hardware: driver: fci (Franka) or rtde (UR).  [default: the robot's on LCM]")]
+Driver = Annotated[str | None, option("Hardware: driver fci (Franka) or rtde (UR).  [default: the robot's on LCM]")]
 Robot = Annotated[
     str | None, option("Hardware: robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
 ]

@@ -125,7 +125,7 @@ def create_task(
     axis: Annotated[str, option("Direction in which the plug is removed: +x, -x, +y, -y, +z or -z.")] = "+z",
     center: Annotated[str | None, option("x,y,z of a point on the axis.  [default: the plug's center of mass]")] = None,
     turn: Annotated[
-        float, option("Rotation of the plug at the bottom [degrees]; its mesh must be in the rotated pose.")
+        float, option("Rotation of the plug at the bottom [degrees]; its mesh shows it after the rotation.")
     ] = 0.0,
     search_turn: Annotated[
         float, option("Largest unknown turn of the socket [degrees]; actions then turn the plug, too.")
@@ -135,15 +135,16 @@ def create_task(
     friction: Annotated[float, option("Friction coefficient of all surfaces.")] = 0.2,
     scenario: Annotated[list[Path] | None, option("Drake model directives of the surroundings; repeatable.")] = None,
     hard_episodes: Annotated[
-        int, option("Episodes of each baseline policy per setting that calibrate difficulty=hard; 0: not calibrated.")
+        int, option("Episodes of each baseline policy per setting to calibrate difficulty=hard; 0: no calibration.")
     ] = 10,
     as_json: cli.Json = False,
 ) -> None:
     """Create an insertion task from two mesh files.
 
-    The meshes are drawn assembled, or --plug-pose moves the plug there. The command checks them, selects a contact
-    geometry that is fast and stiff enough, inserts the plug by a script, aligned and misaligned, records demonstrations
-    and writes a task folder for guiderail train ./peg. Parameters are in its task.yaml; preview.html shows the task.
+    The meshes show the parts assembled, or --plug-pose moves the plug to the assembled pose. The command checks them,
+    selects a contact geometry that is fast and stiff enough, inserts the plug by a script, aligned and misaligned,
+    records demonstrations and writes a task folder for guiderail train ./peg. Parameters are in its task.yaml;
+    preview.html shows the task.
     """
     from guiderail.tools.parts.create_task import ask_unit
     from guiderail.tools.parts.create_task import create_task as create

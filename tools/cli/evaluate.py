@@ -44,7 +44,8 @@ def evaluate(
     scenario: cli.Scenario = None,
     yes: cli.Yes = False,
     out: Annotated[
-        Path | None, option("Hardware: folder of the table of episodes.  [default: hardware in the run]")
+        Path | None,
+        option("Hardware: folder of the episodes' table.  [default: RUN/hardware; NAME/hardware for pretrained:NAME]"),
     ] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,

@@ -28,7 +28,7 @@ def deploy(
     ] = None,
     yes: cli.Yes = False,
     out: Annotated[
-        Path | None, option("Folder of the recording.  [default: hardware in the run; NAME/hardware]")
+        Path | None, option("Folder of the recording.  [default: RUN/hardware; NAME/hardware for pretrained:NAME]")
     ] = None,
     trust_imports: cli.TrustImports = False,
 ) -> None:

@@ -29,8 +29,8 @@ def train(
     num_envs: Annotated[
         int | None,
         option(
-            "Episodes that are simulated at once in processes of their own, while this one learns; the result depends "
-            "on the number.  [default: 0, simulate and learn in turn]"
+            "Number of episodes simulated at once, each in a process of its own, while the main process learns; the "
+            "result depends on it.  [default: 0, simulate and learn in turn]"
         ),
     ] = None,
     env: cli.Env = None,

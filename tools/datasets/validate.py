@@ -183,7 +183,10 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
 
 
 def _other_units(outputs: np.ndarray) -> list[str]:
-    """Return a sentence for each demonstration (M, N, O) over `UNIT_RATIO` times larger or smaller than the median."""
+    """Return a sentence for each demonstration over `UNIT_RATIO` times larger or smaller than the median.
+
+    `outputs` are those of all demonstrations, (M, N, O).
+    """
     lengths = np.linalg.norm(np.ptp(outputs, axis=1), axis=1)
     median = float(np.median(lengths))
     return [

@@ -209,7 +209,7 @@ def evaluate(
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved, "commanded" or "measured". Under impedance control a primitive should learn the
             commanded poses, because their difference from the measured poses causes the contact force.
-        describe_differences: Returns sentences on how a configuration differs from a reference, for `differences`.
+        describe_differences: Function from a configuration to sentences on how it differs from a reference.
 
     Returns:
         Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, what the
@@ -304,7 +304,7 @@ def _check_saved(save: Path | None, signal: str) -> None:
 def _episodes_file(subject: Subject, name: str, environment: Mapping[str, Any], how: Mapping[str, Any]) -> Path | None:
     """Return the file in the run's folder that stores a policy's episodes; None if they are not stored.
 
-    Those of the run's own policy are stored only if they are evaluated in the run's own environment.
+    Those of the run's own policy are stored only if the environment is the run's own and nothing is resampled.
     """
     folder, config = subject.folder, subject.config
     if folder is None or config is None or not subject.is_stored:

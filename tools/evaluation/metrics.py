@@ -287,7 +287,7 @@ _STATISTICS = (
     Metric("success_rate", "", "fraction of the learner's own episodes that succeeded", _success_rate()),
     Metric("success_low", "", "lower end of the success rate's 95 % interval (Wilson)", _wilson(0)),
     Metric("success_high", "", "upper end of the success rate's 95 % interval (Wilson)", _wilson(1)),
-    Metric("success_rate_last_10", "", "success rate of the last ten of them", _success_rate(LAST)),
+    Metric("success_rate_last_10", "", "success rate of the learner's own last ten episodes", _success_rate(LAST)),
     Metric(
         "episodes_to_convergence",
         "episodes",

@@ -284,7 +284,7 @@ def robustness(
     compared = _actors(subjects, dict(environment or {}), log)
     first, folder = compared[0].config, subjects[0].folder if subjects[0].is_stored else None
     if out is None and (len(policies) > 1 or folder is None):
-        raise InputError("give the folder of the table and the picture of several runs, or of no run, with --out")
+        raise InputError("several runs, or a policy without a run, need a folder for table and picture: give --out")
     if baselines is None:
         baselines = [name for name in default_baselines(first.task, first.environment) if name != "constant"]
     baselines = make_baselines(first, first.environment, baselines)

@@ -55,9 +55,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         history_variance: ρ, variance of the past outputs [output²].
         horizon: H, future points at which the constraints are satisfied.
         orientation: Meaning of the last three of six outputs: "rotation_vector" or "euler_zyx".
-        observe: What is appended to the observation: "phase" (1,), and "command" (O,), the last command in the
-            segment's frame, scaled to the demonstrations' range. The command of a template is in the template's first
-            frame, in units of 0.2 m and π.
+        observe: What is appended to the observation: "phase" (1,), scaled to [−1, 1], and "command" (O,), the last
+            command in the segment's frame, scaled to the demonstrations' range. The command of a template is in the
+            template's first frame, in units of 0.2 m and π.
 
     Raises:
         InputError: If an argument is out of range. In `reset`, if the measured pose is not finite. In `step`, if the

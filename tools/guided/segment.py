@@ -104,14 +104,15 @@ class Segment:
         demonstrations: Demonstrations in the segment's frame, at least three, or their file.
         frame: (env, observation) → `Frame` or origin (O,), called when the segment begins; the world by default.
         constraints: Constraints in the frame, or (env, observation) → constraints, called when the segment begins.
-        extra: Value for `to_action` that no action changes, such as a gripper command, or (phase of the segment from 0
-            to 1, true while its last point is held) → value. By default, the value of `discrete`.
+        extra: Value for `to_action` that no action changes, such as a gripper command, or (phase, is_held) → value:
+            the phase of the segment from 0 to 1, and true while its last point is held. By default, the value of
+            `discrete`.
         discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
             the most frequent value of the demonstrations at its phase.
         until: (env, observation) → true to end the segment early; by default it ends with its steps.
         num_steps: Control steps; the mean duration of the demonstrations divided by the period by default.
         dwell: Control steps for which the last point is held after `num_steps`.
-        floor: Standard deviation (O,) or scalar added to every covariance [unit of the output].
+        floor: Standard deviation (O,) or scalar whose square is added to every variance [unit of the output].
         name: Name of the segment, in `info`.
 
     Raises:
