@@ -161,7 +161,7 @@ def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequen
             return
         try:
             answer = pickle.dumps((compute(argument), None, ""))
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
             text = traceback.format_exc()
             try:
                 answer = pickle.dumps((None, error, text))

@@ -1,4 +1,5 @@
 import os
+import sys
 import time
 
 import pytest
@@ -29,6 +30,8 @@ def test_forked_map_raises_the_error_of_a_process():
 
     with pytest.raises(InputError, match="is refused"):
         list(forked_map(refuse, 3, 2))
+    with pytest.raises(SystemExit, match="condition 'x > 0' failed"):  # a failed assertion of Drake, not a killed fork
+        list(forked_map(lambda index: sys.exit("condition 'x > 0' failed"), 3, 2))
     with pytest.raises(RuntimeError, match="_Unpicklable"):
         list(forked_map(lambda index: _raise(), 3, 2))
 
