@@ -101,10 +101,20 @@ def serve(server: EnvServer, requests: IO[str], answers: IO[str]) -> None:
     print(json.dumps(server.describe()), file=answers, flush=True)
     while line := requests.readline(MAX_LINE):
         try:
+            _check_complete(line, requests)
             answer = server.answer(json.loads(line))
         except (ValueError, RecursionError):
             answer = {"error": f"a request is one line of JSON, of at most {MAX_LINE} characters"}
         print(json.dumps(answer), file=answers, flush=True)
+
+
+def _check_complete(line: str, requests: IO[str]) -> None:
+    """Raise a ValueError if a line is too long, after reading it to its end, so that it is answered once."""
+    if len(line) < MAX_LINE or line.endswith("\n"):
+        return
+    while len(line) == MAX_LINE and not line.endswith("\n"):
+        line = requests.readline(MAX_LINE)
+    raise ValueError
 
 
 def main(arguments: list[str]) -> int:

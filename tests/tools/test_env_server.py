@@ -9,7 +9,7 @@ import pytest
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.models.common.errors import InputError
-from guiderail.tools.env_server import EnvServer, open_environment, serve
+from guiderail.tools.env_server import MAX_LINE, EnvServer, open_environment, serve
 
 OPTIONS = {"guidance": "kgrl", "action_repeat": 20}
 
@@ -79,6 +79,16 @@ def test_lines_are_answered_until_the_input_ends(server):
     first, second, third = map(json.loads, answers.getvalue().splitlines())
     assert first["action_size"] == 2
     assert first["period"] == pytest.approx(server._env.time_step)
+    assert "observation" in second
+    assert "one line of JSON" in third["error"]
+
+
+def test_line_that_is_too_long_has_one_answer(server):
+    answers = io.StringIO()
+    padded = " " * MAX_LINE + '{"reset": 1}'
+    serve(server, io.StringIO(f'{padded}\n{{"reset": 1}}\n{padded}'), answers)
+    _, first, second, third = map(json.loads, answers.getvalue().splitlines())
+    assert "one line of JSON" in first["error"]
     assert "observation" in second
     assert "one line of JSON" in third["error"]
 
