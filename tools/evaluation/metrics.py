@@ -203,7 +203,7 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     }
     for column, name in (("max_commanded_violation", "constraint_violation"), ("peak_force", "contact_force")):
         if values := [float(info[name]) for info in infos if name in info]:
-            row[column] = max(values)
+            row[column] = float(np.max(values))  # NaN if one is NaN
     return row
 
 

@@ -385,9 +385,9 @@ def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
         "success_low": low,
         "success_high": high,
         "peak_force_mean": float(rows["peak_force"].mean()),
-        "peak_force": float(rows["peak_force"].max()),
+        "peak_force": float(rows["peak_force"].max(skipna=False)),
         "mean_steps": float(rows["steps"].mean()),
-        "max_commanded_violation": float(rows["max_commanded_violation"].max()),
+        "max_commanded_violation": float(rows["max_commanded_violation"].max(skipna=False)),
     }
 
 

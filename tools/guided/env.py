@@ -162,7 +162,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         action = self._to_action(self.env, self._observation, command.output, command.extra)
         self._observation, reward, self._terminated, self._truncated, self._info = self.env.step(action)
         self._reward += float(reward)
-        self._violation = max(self._violation, command.violation)
+        self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
         self._fallbacks += command.is_fallback
         self._count += 1
         self._truncated = bool(self._truncated) or (self.guide.is_finished and not self._terminated)

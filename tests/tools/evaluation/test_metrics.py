@@ -5,7 +5,14 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS, episodes_to_convergence, find_streak, summary
+from guiderail.tools.evaluation.metrics import (
+    COLUMNS,
+    STATISTICS,
+    episodes_to_convergence,
+    find_streak,
+    outside_row,
+    summary,
+)
 from guiderail.tools.evaluation.rollout import Paths, rollout
 
 FAILS_AFTER = 215  # control steps
@@ -41,6 +48,9 @@ def test_nan_is_not_hidden_by_a_maximum():
     assert np.isnan(statistics["max_commanded_violation"])
     assert np.isnan(statistics["peak_force"])
     assert statistics["violating_episodes"] == 1
+    infos = [{"constraint_violation": value, "contact_force": value} for value in (1.0, np.nan, 2.0)]
+    row = outside_row(0, 0.0, infos, is_terminated=True)
+    assert np.isnan([row["max_commanded_violation"], row["peak_force"]]).all()
 
 
 @pytest.mark.parametrize(("successes", "number"), [(0, 10), (7, 10), (10, 10), (98, 100)])

@@ -71,6 +71,13 @@ def test_draw_accepts_a_name_with_dollar_signs(run, tmp_path):
     assert draw(tmp_path / "picture.png", rows).is_file()
 
 
+def test_table_has_nan_if_one_episode_has(run, monkeypatch):
+    columns = {"success": [1, 1], "steps": [5, 5], "peak_force": [np.nan, 2.0], "max_commanded_violation": [-1, np.nan]}
+    monkeypatch.setattr(module, "evaluate_once", lambda *_, **options: pd.DataFrame(columns))
+    for row in robustness([run], episodes=2)["rows"]:
+        assert np.isnan([row["peak_force"], row["max_commanded_violation"]]).all()
+
+
 def test_values_below_names_where_the_policy_fails(run):
     result = robustness([run], episodes=2)
     assert -0.5 in values_below(result["rows"], "policy")["wall"]

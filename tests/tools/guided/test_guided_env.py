@@ -1,5 +1,7 @@
 """Guidance around an environment of another origin: constraints, frames, segments, observations and refusals."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -86,6 +88,15 @@ def test_every_command_satisfies_the_constraints_for_any_actions(guidance, seed)
         assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
         assert sum(info["fallback"] for info in infos[1:]) == 0
     assert np.abs(local[:, 1] + 0.13).min() < 1e-6  # the last policy reaches the bound
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_violation_of_an_action_is_nan_if_that_of_one_command_is(number, monkeypatch):
+    env = guided()
+    finish, violations = env.guide.finish, iter([np.nan if k == number else -1.0 for k in range(3)])
+    monkeypatch.setattr(env.guide, "finish", lambda output: replace(finish(output), violation=next(violations)))
+    env.reset(seed=0)
+    assert np.isnan(env.step(np.zeros(3))[-1]["constraint_violation"])
 
 
 def test_residual_leaves_the_constraints_and_reports_it():
