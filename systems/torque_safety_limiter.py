@@ -38,7 +38,7 @@ class SafetyLimits:
         torque: Limit of the torque sent to each joint (n,) [Nm], positive.
         external_torque: Limit of the external torque of each joint (n,) [Nm], positive.
         force: Limit of the force on the tool [N], positive.
-        lower, upper: Corners of the workspace of the tool center in the target frame (3,) [m].
+        lower, upper: Corners of the workspace of the tool center in the target frame (3,) [m], finite.
         damping_time: Duration of damping in a stop, after which zero torque is sent [s], positive.
         decay_time: Decay time of the joint velocities during damping [s], at least two periods.
         ramp_time: Time in which the blend factor increases to 1 [s], positive.
@@ -63,6 +63,8 @@ class SafetyLimits:
                 raise InputError(f"an arm's limits and times must be positive and finite, not {value}")
         if not (self.lower < np.array(self.upper)).all():
             raise InputError(f"a workspace from {self.lower} to {self.upper} is empty")
+        if not np.isfinite([self.lower, self.upper]).all():
+            raise InputError(f"a workspace must be finite, not from {self.lower} to {self.upper}")
 
 
 class TorqueSafetyLimiter(LeafSystem):

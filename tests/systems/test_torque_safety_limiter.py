@@ -331,6 +331,8 @@ def test_default_limits_are_unchanged():
         {"decay_time": 0.0},
         {"ramp_time": 0.0},
         {"lower": (-0.2, -0.2, 0.3)},
+        {"lower": (-np.inf,) * 3},
+        {"upper": (0.2, 0.2, np.inf)},
     ],
 )
 def test_limits_refuse_values_out_of_range(wrong):
