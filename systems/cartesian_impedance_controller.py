@@ -100,7 +100,7 @@ class CartesianImpedanceController(LeafSystem):
         stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the impedance is
             not strictly passive: turning the axes of a loaded spring can add energy.
         compensate_gravity: False if the robot's own controller compensates gravity.
-        timeout: Age above which a desired pose is stale [s], positive.
+        timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
         InputError: If an argument is out of range.

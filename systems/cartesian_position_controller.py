@@ -80,7 +80,7 @@ class CartesianPositionController(LeafSystem):
         period: Period of the joint commands [s], positive.
         speed_limits: Speed limits of the tool center.
         posture_gain: Gain of the return to the posture [1/s], not negative.
-        timeout: Age above which a desired pose is stale [s], positive.
+        timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
         InputError: If an argument is out of range. At initialization, if a measured position is not finite.

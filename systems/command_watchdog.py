@@ -30,7 +30,7 @@ class CommandWatchdog(LeafSystem):
 
     Args:
         period: Period of the check [s], positive; ideally the period of the commands.
-        timeout: Age above which a command is stale [s], positive.
+        timeout: Age above which a command is stale [s], positive and finite.
         pose_size: Number of coordinates O, at least 1.
 
     Raises:

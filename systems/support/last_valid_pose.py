@@ -24,7 +24,7 @@ class CommandValidity:
         command_time: Input port of the time stamp of the command, (1,) [s]; if it is not connected, commands never time
             out.
         period: Period of the check [s], positive.
-        timeout: Age above which a command is stale [s], positive.
+        timeout: Age above which a command is stale [s], positive and finite.
 
     Raises:
         InputError: If an argument is out of range.
@@ -32,8 +32,8 @@ class CommandValidity:
 
     def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
         check_period(period)
-        if not timeout > 0.0:
-            raise InputError(f"the timeout of commands must be positive, not {timeout} s")
+        if not 0.0 < timeout < np.inf:
+            raise InputError(f"the timeout of commands must be positive and finite, not {timeout} s")
         self._desired_pose, self._command_time = desired_pose, command_time
         self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout
 
@@ -62,7 +62,7 @@ class LastValidPose:
         command_time: Input port of the time stamp, (1,) [s]; if it is not connected, commands never time out.
         measured_pose: Function of the system's context that returns the measured pose, (O,), for initialization.
         period: Period of the check [s], positive; ideally the period of the commands.
-        timeout: Age above which a command is stale [s], positive.
+        timeout: Age above which a command is stale [s], positive and finite.
 
     Attributes:
         tickets: Dependencies of `eval`.
