@@ -106,6 +106,8 @@ def _read_bag(
     times, remarks = _clock(rows)
     assumptions += remarks
     messages = [message for _, message in rows]
+    if target is not None and kinds[chosen] in (DATA, JOINTS):
+        raise InputError(f"{chosen} of {bag} does not state which numbers are a pose: leave --target out")
     if kinds[chosen] == DATA:
         names = tuple(dimension.label for dimension in messages[0].layout.dim) or POSE_NAMES
         for number, message in enumerate(messages):
@@ -163,7 +165,7 @@ def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
             return (stamps - stamps[0]) * _NANO, []
     received = np.array([stamp for stamp, _ in rows], dtype=np.int64)
     return (received - received[0]) * _NANO, [
-        "time is when the recorder received a message, because the stamps do not increase"
+        "time is when the recorder received a message, because the messages have no stamps that increase"
     ]
 
 

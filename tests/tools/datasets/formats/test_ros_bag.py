@@ -89,6 +89,18 @@ def test_arrays_of_other_sizes_are_refused(tmp_path):
         read_bags(bag, None, None)
 
 
+@pytest.mark.parametrize(("kind", "make", "one"), [(ARRAY, array, range(6)), (JOINTS, joints, ("ab", (1, 2)))])
+def test_target_is_refused_without_poses(kind, make, one, tmp_path):
+    with pytest.raises(InputError, match=r"/it of .* does not state which numbers are a pose: leave --target out"):
+        read_bags(write(tmp_path / "bag", kind, make, [one] * 2), None, (0.0,) * 6)
+
+
+def test_time_is_that_of_the_recorder_if_messages_have_no_stamps(tmp_path):
+    result = read_bags(write(tmp_path / "bag", POSE, pose, [1.0] * 3), None, None)
+    np.testing.assert_allclose(result.times[0], [0.0, 0.01, 0.02])
+    assert any("the messages have no stamps that increase" in text for text in result.assumptions)
+
+
 def test_bag_export_shifts_negative_time(tmp_path):
     t = 0.1 * np.arange(5)
     notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
