@@ -43,6 +43,8 @@ class Frame:
             raise InputError(f"a frame's origin must be finite numbers, not {brief(p)}")
         if self.R is not None and not (self.R.shape == (3, 3) and np.allclose(self.R @ self.R.T, np.eye(3), atol=1e-6)):
             raise InputError("a frame's rotation must be an orthonormal matrix (3, 3)")
+        if self.R is not None and np.linalg.det(self.R) < 0.0:
+            raise InputError("a frame's rotation must not be a reflection: its determinant is -1")
 
     def to_world(self, output: np.ndarray, orientation: Orientation) -> np.ndarray:
         """Transform an output (O,) from F to W; if F has a rotation, the last 3 of 6 entries are an orientation."""

@@ -66,6 +66,7 @@ def test_number_of_steps_follows_from_the_period():
         (([np.nan, 0, 0],), "origin must be finite"),
         (([0, 0, 0], np.eye(2)), "orthonormal"),
         (([0, 0, 0], 2 * np.eye(3)), "orthonormal"),
+        (([0, 0, 0], np.diag([1.0, 1.0, -1.0])), "must not be a reflection"),
     ],
 )
 def test_wrong_frame_is_refused(arguments, message):
