@@ -49,6 +49,8 @@ def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen[Any]]:
     finally:
         process.terminate()
         process.wait()
+        assert process.stdin is not None
+        process.stdin.close()
 
 
 def exit_with_parent() -> None:

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from guiderail.tools.hardware.connection import subprocess_tied_to_parent
+
 SLEEPS = """
 from guiderail.tools.hardware.connection import subprocess_tied_to_parent
 
@@ -36,3 +38,10 @@ def test_child_exits_when_its_parent_ends(starts, ends):
         parent.send_signal(ends)
         # Both processes write there, so it is closed when neither is left.
         assert parent.communicate(timeout=50)[0] == b""
+
+
+def test_pipe_to_the_child_is_closed():
+    with subprocess_tied_to_parent("import time; time.sleep(60)") as process:
+        assert process.poll() is None
+    assert process.poll() is not None
+    assert process.stdin.closed
