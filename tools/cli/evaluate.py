@@ -10,6 +10,7 @@ from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
 
 QUICK = 20  # episodes of a quick evaluation
+SEED = 1_000_000  # default seed of the first held-out episode
 
 
 @cli.command("evaluate runs/passage --episodes 100 --json")
@@ -19,7 +20,7 @@ def evaluate(
     quick: Annotated[
         bool, option(f"Evaluate {QUICK} episodes: a fifth of the default, with a wider interval.", "--quick")
     ] = False,
-    seed: cli.Seed = 1_000_000,
+    seed: cli.Seed = SEED,
     task: cli.PolicyTask = None,
     trust_policy: cli.TrustPolicy = False,
     processes: cli.Processes = None,
@@ -63,12 +64,13 @@ def evaluate(
         raise InputError("--quick sets the number of episodes: leave --episodes out")
     episodes = QUICK if quick else 100 if episodes is None else episodes
     environment = cli.parse_environment(env, station=station, robot=robot, robot_url=robot_url, driver=driver)
+    name = cli.find_task(subject, imports)[0]  # first, because an import may register the station
     if cli.is_hardware(environment.get("station")):
         given = environment.keys() - {"station", "robot", "robot_url", "driver"} or task or baselines or save
-        if given or resample_offsets:
+        if given or resample_offsets or seed != SEED:
             raise InputError(
                 "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "
-                "--save and --resample-offsets out"
+                "--save, --seed and --resample-offsets out"
             )
         from guiderail.tools.evaluation.baselines import make_baseline
         from guiderail.tools.hardware.evaluate import evaluate_on_robot
@@ -91,7 +93,6 @@ def evaluate(
         print_result(on_robot, as_json)
         return
     cli.refuse_hardware_options(sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes, out=out)
-    name = cli.find_task(subject, imports)[0]
     if policy is not None and (task is not None or Path(name).is_dir()):
         raise InputError("--policy is evaluated in a task: name the task instead of a folder, or give --baselines")
     from guiderail.tools.evaluation.evaluate import evaluate as evaluate_policy
@@ -134,7 +135,7 @@ def robustness(
     ],
     task: cli.PolicyTask = None,
     episodes: Annotated[int, option("Number of held-out episodes of each policy at each value.")] = 30,
-    seed: cli.Seed = 1_000_000,
+    seed: cli.Seed = SEED,
     axes: Annotated[str | None, option("Disturbances, comma-separated: {axes}.  [default: all]")] = None,
     env: cli.Env = None,
     baselines: cli.Baselines = None,

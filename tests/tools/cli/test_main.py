@@ -66,6 +66,7 @@ def trained(bead_run):
         (["evaluate", "new"], "not a run"),
         (["evaluate", "new", "--sim"], "give --station hardware too"),
         (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --env"),
+        (["evaluate", "new", "--station", "hardware", "--sim", "--seed", "7"], "--seed and --resample-offsets out"),
         (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
         (["evaluate", "Bead", "--policy", "scripted"], "Bead has no policy 'scripted'"),
         (["evaluate", "Bead"], "Bead is a task: name the policy that acts in it"),
@@ -397,6 +398,21 @@ def test_train_passes_robot_and_imports_to_hardware(typed, robot, capsys, tmp_pa
     assert call(capsys, *typed)[0] == 0
     assert (asked["other"].robot, asked["other"].rate) == (robot, 0.5)
     assert asked["given"]["imports"] == (str(file),)
+
+
+def test_evaluate_imports_the_station_before_it_is_used(capsys, tmp_path, monkeypatch, trained):
+    asked = {}
+
+    def evaluate(run, other, episodes, **more):
+        asked.update(more)
+        return {"episodes": episodes}
+
+    monkeypatch.setattr("guiderail.tools.hardware.evaluate.evaluate_on_robot", evaluate)
+    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # undone after the test
+    file = tmp_path / "other_desk.py"
+    file.write_text(STATION)
+    assert call(capsys, "evaluate", trained, "--station", "desk", "--import", file, "--rate", "0.5")[0] == 0
+    assert asked["station"] == "desk"
 
 
 @pytest.mark.parametrize(
