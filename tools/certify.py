@@ -149,7 +149,7 @@ def verify_certificate(
         elif (budgeted := json.loads(files[CERTIFICATE])["budgeted"]) is not None:
             worst = _search_budget(skill.loop)
             for name in checker.BUDGETS:
-                if (getattr(worst, name) > np.array(budgeted[name])).any():
+                if not (getattr(worst, name) <= np.array(budgeted[name])).all():  # NaN exceeds every budget
                     verdict = f"no: corrections of {subject} exceed its budget of {name}"
     return {"certificate": str(folder / CERTIFICATE), "checker": verdict}
 
@@ -254,7 +254,7 @@ def _attack(loop: CertifiedLoop, certified: CertifiedBounds, steps: int, out: Pa
                     "bound": float(bound.max()),
                     "worst_found": float(value.max()),
                     "ratio": float(bound.max() / value.max()) if value.max() > 0.0 else None,
-                    "violations": int((value > bound * ROUNDING).sum()),
+                    "violations": int((~(value <= bound * ROUNDING)).sum()),  # NaN counts as a violation
                 }
             )
     write_table(out / "attack", rows)

@@ -7,6 +7,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
+from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.common.errors import InputError
 from guiderail.tools.certify import _declared_start, certify_skill, verify_certificate
 
@@ -41,9 +42,10 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
         verdict = verify_certificate("NarrowPassage", environment | other, folder)["checker"]
         assert verdict == "no: its about is not that of NarrowPassage"
     assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
-    needed = SimpleNamespace(excess=np.full((2, 2), 9.0), residue=np.zeros((2, 2)))
-    monkeypatch.setattr("guiderail.tools.certify._search_budget", lambda loop: needed)
-    assert "exceed its budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
+    for excess in (9.0, np.nan):
+        needed = SimpleNamespace(excess=np.full((2, 2), excess), residue=np.zeros((2, 2)))
+        monkeypatch.setattr("guiderail.tools.certify._search_budget", lambda loop, needed=needed: needed)
+        assert "exceed its budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
     with pytest.raises(InputError, match="name the folder of a certificate"):
         verify_certificate("NarrowPassage", environment, tmp_path)
     key.write_bytes(b"short")
@@ -57,6 +59,19 @@ def test_certify_skill_accepts_demonstrations_alone(tmp_path):
     result = certify_skill("NarrowPassage", {"guidance": "kmp"}, out=tmp_path)
     assert result["checker"] == "yes"
     assert result["constrained_steps"] == 0
+
+
+def test_command_of_an_attack_violates_a_bound_if_it_is_nan(tmp_path, monkeypatch):
+    attack = Adversary.attack
+
+    def failing(adversary, steps):
+        result = attack(adversary, steps)
+        result.largest["pose"][3, 0] = np.nan
+        return result
+
+    monkeypatch.setattr(Adversary, "attack", failing)
+    rows = certify_skill("NarrowPassage", COARSE | {"guidance": "kmp"}, out=tmp_path, attack=200)["attack"]
+    assert sum(row["violations"] for row in rows) == 1
 
 
 @pytest.mark.parametrize(
