@@ -139,6 +139,8 @@ def train(
     if cli.is_hardware(environment.get("station")):
         if human_in_the_loop:
             raise InputError("training on hardware has no human in the loop: leave --human-in-the-loop out")
+        if log:
+            raise InputError("training on hardware writes no learning log: leave --log out")
         if settings.get("num_envs", "0") != "0":
             raise InputError("there is one robot: leave --num-envs out")
         from guiderail.tools.hardware.train import train_on_robot

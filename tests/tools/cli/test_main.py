@@ -63,6 +63,7 @@ def trained(bead_run):
         (["train", "BncConnector", "--out", "new", "--robot-url", "memq://"], "it is one of station='hardware'"),
         (["train", "BncConnector", "--out", "new", "--rate", "0.5"], "give --station hardware too"),
         (["train", "BncConnector", "--out", "new", "--scenario", "lab.yaml"], "give --station hardware too"),
+        (["train", "BncConnector", "--out", "new", "--station", "hardware", "--log", "csv"], "leave --log out"),
         (["evaluate", "new"], "not a run"),
         (["evaluate", "new", "--sim"], "give --station hardware too"),
         (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --env"),
