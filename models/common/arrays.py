@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,11 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def is_finite(values: np.ndarray) -> bool:
     """Return True if a few numbers (n,) are all finite; several times faster than `np.isfinite(values).all()`."""
     return all(map(math.isfinite, values.tolist()))
+
+
+def is_whole(value: object, least: int) -> bool:
+    """Return True for a whole number of at least `least`; False for NaN, infinity and anything but a real number."""
+    return isinstance(value, Real) and float(value).is_integer() and float(value) >= least
 
 
 _EXACT = 2**53  # a double represents smaller whole numbers exactly

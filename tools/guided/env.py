@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.poses import Orientation
@@ -91,9 +91,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         observe: Sequence[str] = OBSERVED,
     ):
         super().__init__(env)
-        if int(action_repeat) != action_repeat or action_repeat < 1:
+        if not is_whole(action_repeat, 1):
             raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
-        if int(history) != history or history < 1:
+        if not is_whole(history, 1):
             raise InputError(f"history is a number of outputs, at least 1, not {brief(history)}")
         unknown = [name for name in observe if name not in OBSERVED]
         if unknown or isinstance(observe, str):

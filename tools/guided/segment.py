@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
@@ -134,7 +134,7 @@ class Segment:
 
     def __post_init__(self) -> None:
         for what, value, least in (("num_steps", self.num_steps, MIN_STEPS), ("dwell", self.dwell, 0)):
-            if value is not None and (int(value) != value or value < least):
+            if value is not None and not is_whole(value, least):
                 raise InputError(f"{what} of a segment is a whole number of at least {least}, not {brief(value)}")
         if self.discrete is not None and self.extra is not None:
             raise InputError("a segment has extra or discrete, not both")

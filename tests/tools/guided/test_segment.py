@@ -47,7 +47,15 @@ def test_discrete_output_is_the_most_frequent_at_each_phase():
         Segment(recordings(), discrete=grips, extra=1.0)
 
 
-@pytest.mark.parametrize(("keywords", "message"), [({"num_steps": 11}, "at least 12"), ({"dwell": -1}, "at least 0")])
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"num_steps": 11}, "at least 12"),
+        ({"num_steps": np.nan}, "at least 12, not nan"),
+        ({"dwell": -1}, "at least 0"),
+        ({"dwell": np.inf}, "at least 0, not inf"),
+    ],
+)
 def test_wrong_number_of_steps_is_refused(keywords, message):
     with pytest.raises(InputError, match=message):
         Segment(recordings(), **keywords)
