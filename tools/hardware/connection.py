@@ -123,8 +123,8 @@ class RobotConnection:
         if self.sim:
             # With a time to live of zero no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-            if self.driver:
-                url = f"127.{os.getpid() // 65536 % 255}.{os.getpid() // 256 % 256}.{os.getpid() % 255 + 1}"
+            if self.driver == FCI:
+                url = _loopback_address(os.getpid())
         options: dict[str, Any] = {"station": station, "robot_url": url, "robot": self.robot, "driver": self.driver}
         return options | ({"robot_timeout": ROBOT_TIMEOUT} if self.sim else {})
 
@@ -170,3 +170,9 @@ class RobotConnection:
         )
         with subprocess_tied_to_parent(code) as process:
             yield process
+
+
+def _loopback_address(pid: int) -> str:
+    """Return an address of this machine, different for each process number that Linux allows."""
+    high, low = divmod(pid, 254)
+    return f"127.{high // 256}.{high % 256}.{low + 1}"

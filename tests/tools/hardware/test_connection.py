@@ -1,6 +1,8 @@
 """The simulated driver imports the modules of the run."""
 
+import os
 from contextlib import contextmanager
+from ipaddress import ip_address
 from pathlib import Path
 
 import gymnasium
@@ -9,7 +11,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.cli.main import main
-from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.connection import SIMULATED, RobotConnection, _loopback_address
 from guiderail.tools.hardware.executor import recordings_folder
 
 MINE = """
@@ -73,3 +75,15 @@ def test_simulated_franka_is_in_lockstep():
 @pytest.mark.parametrize(("run", "folder"), [("runs/peg", "runs/peg/hardware"), ("pretrained:clamp", "clamp/hardware")])
 def test_recordings_are_in_a_folder_of_the_run(run, folder):
     assert recordings_folder(Path(run)) == Path(folder)
+
+
+def test_simulated_driver_has_an_address_of_its_protocol():
+    urls = [RobotConnection(sim=True, driver=name).environment_options("hardware")["robot_url"] for name in SIMULATED]
+    assert [url.partition(":")[0] for url in urls] == ["udpm", _loopback_address(os.getpid())]
+
+
+def test_processes_have_different_addresses():
+    numbers = [*range(1, 2000), 2**22 - 255, 2**22 - 1, 2**22]
+    addresses = {_loopback_address(pid) for pid in numbers}
+    assert len(addresses) == len(numbers)
+    assert all(ip_address(address).is_loopback for address in addresses)
