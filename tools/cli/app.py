@@ -216,7 +216,9 @@ TrustImports = Annotated[
     ),
 ]
 Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
-Baseline = Annotated[str, option("Policy that acts in a TASK: scripted, {baselines}.", "--policy")]
+Baseline = Annotated[
+    str | None, option("Policy that acts in a TASK: scripted, {baselines}.  [default: scripted]", "--policy")
+]
 Baselines = Annotated[
     str | None,
     option(

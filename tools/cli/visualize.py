@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, to_json
 
@@ -21,7 +22,7 @@ def visualize(
     seed: cli.Seed = 1_000_000,
     env: cli.Env = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
-    policy: cli.Baseline = "scripted",
+    policy: cli.Baseline = None,
     task: cli.PolicyTask = None,
     trust_policy: cli.TrustPolicy = False,
     episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
@@ -42,10 +43,12 @@ def visualize(
 
     environment = cli.parse_environment(env, station=station)
     name = cli.find_task(subject, imports)[0]
+    if policy is not None and (task is not None or Path(name).is_dir()):
+        raise InputError("--policy acts in a task: name the task instead of a folder, or leave --policy out")
     if task is not None:
         task = cli.find_task(task)[0]
     elif not Path(name).is_dir() and name in cli.CHOICES["tasks"]():
-        name, task = policy, name
+        name, task = policy or "scripted", name
     episode = EpisodeSpec.of_policy(name, environment, seed, task=task, trust_policy=trust_policy)
     if image is not None:
         check_picture(image)

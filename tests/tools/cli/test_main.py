@@ -134,6 +134,14 @@ def test_command_prints_one_sentence_when_input_is_wrong(arguments, message, cap
     assert list(tmp_path.iterdir()) == []
 
 
+def test_visualize_refuses_a_baseline_for_a_run(capsys, trained):
+    code, _, err = call(capsys, "visualize", trained, "--policy", "zero", "--image", "picture.png")
+    assert (code, err) == (
+        2,
+        "guiderail: --policy acts in a task: name the task instead of a folder, or leave --policy out\n",
+    )
+
+
 @pytest.mark.parametrize("policy", ["none", "uniform_random,scripted", "unifrm_random"])
 def test_evaluate_refuses_unknown_policy_when_on_hardware(policy, capsys, trained):
     hardware = ["--station", "hardware", "--sim"]
