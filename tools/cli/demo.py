@@ -58,7 +58,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()
     avoided = avoids_obstacle_from(rows)
-    violations = (rows[["max_commanded_violation", "max_measured_violation"]].max(axis=1) > TOLERANCE).sum()
+    violations = _count_violations(rows)
     console.print(f"\nResult after {time.perf_counter() - started:.0f} s:")
     for line in (
         f"{rows['success'].sum()} of {len(rows)} training episodes reached the goal, "
@@ -80,6 +80,12 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         console.print(f"  {path}\n      {content}")
     name = _command_name()
     console.print(f"\nNext: {name} evaluate {out}, {name} list, {name} train --help")
+
+
+def _count_violations(rows: pd.DataFrame) -> int:
+    """Return the number of episodes with a command or a pose outside the constraints; NaN counts as outside."""
+    largest = rows[["max_commanded_violation", "max_measured_violation"]].max(axis=1, skipna=False)
+    return int((~(largest <= TOLERANCE)).sum())
 
 
 def _command_name() -> str:

@@ -1,3 +1,5 @@
+import numpy as np
+import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
@@ -37,3 +39,8 @@ def test_demo_replaces_a_demo_that_was_killed_at_its_start(tmp_path):
     RunFolder(tmp_path / "demo").refuse_existing()
     demo._clear(tmp_path / "demo")
     assert not (tmp_path / "demo").exists()
+
+
+def test_episode_violates_the_constraint_if_a_violation_is_nan():
+    columns = {"max_commanded_violation": [-1.0, np.nan, 1.0], "max_measured_violation": [-1.0, -1.0, -1.0]}
+    assert demo._count_violations(pd.DataFrame(columns)) == 2
