@@ -10,6 +10,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail.models.parts.open_edges import close_edges, find_open_edges
 from guiderail.models.parts.solids import measure_distance, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
@@ -27,6 +28,7 @@ class Repair:
     # Number of open edges of the mesh (`find_open_edges`), at least 1 if the surface was changed.
     closed_edges: int = 0
     moved: float = 0.0  # largest distance of a point of the new surface from the old surface [m]
+    left_out: float = 0.0  # largest distance of old faces that bound no volume from the new surface [m]
     cavities: int = 0  # number of filled closed cavities
     inverted: int = 0  # number of bodies whose faces pointed inwards
 
@@ -40,6 +42,8 @@ class Repair:
             changes.append(f"turned {self.inverted} {'body' if self.inverted == 1 else 'bodies'} right side out")
         if self.closed_edges:
             changes.append(f"surface moved by at most {1e3 * self.moved:.4f} mm")
+            if self.left_out > MAX_MOVED:
+                changes.append(f"left out faces without volume up to {1e3 * self.left_out:.2f} mm from it")
         return "; ".join(changes)
 
 
@@ -58,15 +62,18 @@ def close_surface(
     Raises:
         InputError: If the mesh cannot be closed, or only by moving its surface by more than `MAX_MOVED`.
     """
-    open_edges, where = find_open_edges(vertices, triangles)
+    edges = find_open_edges(triangles)
+    open_edges, where = len(edges), vertices[edges].reshape(-1, 3).mean(axis=0) if len(edges) else np.zeros(3)
     solid = to_manifold(vertices, triangles)
     closed = _is_solid(solid)
     if not closed:
         solid = _without_doubled_faces(vertices, triangles)
     if not _is_solid(solid):
+        solid = to_manifold(vertices, close_edges(vertices, triangles))
+    if not _is_solid(solid):
         gaps = f"{name} is not watertight ({open_edges} open edges around {np.round(where, 4).tolist()})"
         solid = _wrap(gaps, vertices, triangles)
-    moved = 0.0
+    moved = left_out = 0.0
     if open_edges or not closed:
         moved = measure_distance(to_arrays(solid), (vertices, triangles))
         if moved > MAX_MOVED:
@@ -75,25 +82,12 @@ def close_surface(
                 f"would close by moving the surface by {1e3 * moved:.2g} mm: close it in the CAD model, and export it "
                 "again"
             )
+        left_out = measure_distance((vertices, triangles), to_arrays(solid))
     bodies, cavities, inverted = _outward_bodies(solid)
     if not bodies:
         raise InputError(f"{name} encloses no volume: export the part as a solid")
     changed = open_edges if open_edges or closed else 1
-    return bodies, Repair(changed, moved, cavities, inverted)
-
-
-def find_open_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of edges that are not used equally often in both directions, and their center (3,) [m]."""
-    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    keys, inverse = np.unique(low * len(vertices) + high, return_inverse=True)
-    signs = np.where(edges[:, 0] < edges[:, 1], 1, -1)
-    uses = np.bincount(inverse, minlength=len(keys))
-    balance = np.bincount(inverse, weights=signs, minlength=len(keys))
-    open_ = (balance != 0) | (uses % 2 != 0)
-    corners = np.column_stack([keys // len(vertices), keys % len(vertices)])[open_]
-    return int(open_.sum()), vertices[corners].reshape(-1, 3).mean(axis=0) if len(corners) else np.zeros(3)
+    return bodies, Repair(changed, moved, left_out, cavities, inverted)
 
 
 def _is_solid(solid: Any) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import struct
 from contextlib import nullcontext
 from pathlib import Path
@@ -104,6 +105,63 @@ def test_load_part_refuses_triangles_of_missing_vertices(index, tmp_path):
     (tmp_path / "part.ply").write_text(header + f"0 0 0\n10 0 0\n0 10 0\n3 0 1 {index}\n")
     with pytest.raises(InputError, match="vertices that it lacks"):
         load_part(tmp_path / "part.ply", "mm")
+
+
+def split_edge(mesh):
+    """Split an edge of one face only: a T-junction."""
+    a, b, c = mesh.faces[0]
+    middle = len(mesh.vertices)
+    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
+    faces = np.vstack([mesh.faces[1:], [[a, middle, c], [middle, b, c]]])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def cap_of_a_bore(mesh):
+    """Drill a blind bore with a doubled and partly reversed cap."""
+    bore = trimesh.creation.cylinder(2.0, 10.0).apply_translation((0.0, 0.0, 9.0))
+    drilled = trimesh.boolean.difference([mesh, bore], engine="manifold")
+    rim = np.flatnonzero((np.abs(drilled.vertices[:, 2] - 10.0) < 1e-9) & (np.abs(drilled.vertices[:, 0]) < 3.0))
+    rim = rim[np.argsort(np.arctan2(*drilled.vertices[rim, 1::-1].T))]
+    fan = np.column_stack([np.full(len(rim) - 2, rim[0]), rim[1:-1], rim[2:]])
+    faces = np.vstack([drilled.faces, fan, fan[: len(fan) // 2, ::-1], fan])
+    return trimesh.Trimesh(drilled.vertices, faces, process=False)
+
+
+def bore_next_to_its_wall(mesh):
+    """Drill a through bore whose wall is drawn 0.05 mm beside the edges of the faces."""
+    bore = trimesh.creation.cylinder(2.0, 40.0)
+    drilled = trimesh.boolean.difference([mesh, bore], engine="manifold")
+    radii = np.linalg.norm(drilled.vertices[drilled.faces][:, :, :2], axis=2).max(axis=1)
+    wall = np.flatnonzero(radii < 2.5)
+    shifted = trimesh.Trimesh(drilled.vertices, drilled.faces[wall], process=False).apply_translation((0.05, 0.0, 0.0))
+    rest = trimesh.Trimesh(drilled.vertices, np.delete(drilled.faces, wall, axis=0), process=False)
+    return trimesh.util.concatenate([rest, shifted])
+
+
+def loose_triangle(mesh):
+    vertices = np.vstack([mesh.vertices, mesh.vertices[mesh.faces[0]].mean(axis=0) + (3.0, 3.0, 3.0)])
+    faces = np.vstack([mesh.faces, [*mesh.faces[0][:2], len(mesh.vertices)]])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "volume", "words"),
+    [
+        (split_edge, 2000.0, "closed 3 edges; surface moved by at most 0.0000 mm"),
+        (cap_of_a_bore, 2000.0 - 24.0 * np.pi, r"closed 33 edges; .* at most 0.0000 mm; left out .* 1.\d+ mm from it"),
+        (bore_next_to_its_wall, 2000.0 - 80.0 * np.pi, r"closed 128 edges; .* at most 0.0[0-4]\d+ mm"),
+        (loose_triangle, 2000.0, r"closed 3 edges; surface moved by at most 0.0000 mm; left out .* from it"),
+    ],
+)
+def test_load_part_closes_flat_faces_exactly(spoil, volume, words, tmp_path, monkeypatch):
+    monkeypatch.setattr(repair, "_wrap", lambda *arguments: pytest.fail("fTetWild is not needed"))
+    spoil(box()).export(tmp_path / "part.obj")
+    part = load_part(tmp_path / "part.obj", "mm")
+    assert re.fullmatch(words, str(part.repair))
+    [body] = part.bodies
+    solid = trimesh.Trimesh(*body, process=False)
+    assert solid.is_watertight
+    assert 1e9 * solid.volume == pytest.approx(volume, rel=0.01)
 
 
 def test_load_part_refuses_a_hole(tmp_path):

@@ -1,0 +1,148 @@
+"""Exact repair of open edges: loose triangles are removed, and flat faces triangulated again. No vertex moves."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from guiderail.models.common.errors import import_extra
+from guiderail.models.objects.sdf import area_vectors
+
+_FLAT = 1e-6  # distance from a plane within which a vertex belongs to a flat face, the rounding of a text file [m]
+_MAX_PLANES = 100  # planes that are tried
+_AREA = 1e-6  # relative difference of areas that counts as rounding
+
+
+def find_open_edges(triangles: np.ndarray) -> np.ndarray:
+    """Return the edges (E, 2) of triangles (T, 3) that are not balanced by opposite edges of other triangles."""
+    edges, balance, uses, _ = _count_edges(triangles)
+    return edges[(balance != 0) | (uses % 2 != 0)]
+
+
+def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the triangles of a mesh (V, 3), (T, 3) after the repair of its open edges; some may remain.
+
+    The edges that the triangles outside a plane leave open enclose the face in the plane, unless there is a gap in
+    another place. A plane that would leave as many open edges as before stays as it is.
+    """
+    triangles = _without_loose_triangles(triangles)
+    left = find_open_edges(triangles)
+    for normal, distance in _planes(vertices, triangles, left):
+        if not len(left):
+            break
+        inside = (np.abs(vertices @ normal - distance) < _FLAT)[triangles].all(axis=1)
+        along = area_vectors(vertices, triangles) @ normal > 0.0
+        # Faces on the other side of the plane may be another face, or a part of this one that is turned over.
+        for chosen in (inside, inside & along):
+            face = _fill(vertices, triangles[~chosen], normal, distance)
+            if face is None:
+                continue
+            changed = np.concatenate([triangles[~chosen], face])
+            now = find_open_edges(changed)
+            if len(now) < len(left):
+                triangles, left = changed, now
+                break
+    return triangles
+
+
+def _count_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges (E, 2), lower vertex first, their balance and number of uses, and the edge of each use (T, 3).
+
+    The balance is the number of uses from the lower to the higher vertex minus that of the opposite ones.
+    """
+    uses = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2).astype(np.int64)
+    size = int(triangles.max(initial=0)) + 1
+    keys, inverse = np.unique(uses.min(axis=1) * size + uses.max(axis=1), return_inverse=True)
+    balance = np.bincount(inverse, weights=np.sign(uses[:, 1] - uses[:, 0]), minlength=len(keys)).astype(int)
+    number = np.bincount(inverse, weights=uses[:, 0] != uses[:, 1], minlength=len(keys)).astype(int)
+    return np.column_stack([keys // size, keys % size]), balance, number, inverse.reshape(-1, 3)
+
+
+def _without_loose_triangles(triangles: np.ndarray) -> np.ndarray:
+    """Return triangles without those whose three edges are open and closed by the removal of the triangle."""
+    while True:
+        _, balance, number, used = _count_edges(triangles)
+        signs = np.sign(np.roll(triangles, -1, axis=1) - triangles)
+        loose = np.flatnonzero(((number[used] % 2 == 1) & (balance[used] == signs)).all(axis=1))
+        taken, removed = set[int](), []
+        for triangle in loose.tolist():  # two of them at one edge would leave it open
+            edges = set(used[triangle].tolist())
+            if not edges & taken:
+                taken |= edges
+                removed.append(triangle)
+        if not removed:
+            return triangles
+        triangles = np.delete(triangles, removed, axis=0)
+
+
+def _planes(vertices: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> list[tuple[np.ndarray, float]]:
+    """Return normals (3,) and distances from the origin [m] of planes of triangles at edges, the largest ones first."""
+    at_edge = np.isin(triangles, edges).sum(axis=1) >= 2
+    near = triangles[at_edge]
+    normals = area_vectors(vertices, near)
+    sizes = np.linalg.norm(normals, axis=1)
+    longest = np.linalg.norm(vertices[near] - vertices[np.roll(near, 1, axis=1)], axis=2).max(axis=1)
+    found: list[tuple[np.ndarray, float]] = []
+    for number in np.argsort(-sizes, kind="stable"):
+        if sizes[number] < 10.0 * _FLAT * longest[number] or len(found) == _MAX_PLANES:
+            continue
+        normal = normals[number] / sizes[number]
+        corners = vertices[near[number]]
+        if not any(n @ normal > 0.0 and (np.abs(corners @ n - d) < _FLAT).all() for n, d in found):
+            found.append((normal, float((corners @ normal).mean())))
+    return found
+
+
+def _fill(vertices: np.ndarray, rest: np.ndarray, normal: np.ndarray, distance: float) -> np.ndarray | None:
+    """Return the triangles (T, 3) with a normal that close the open edges of `rest` in a plane; None if they can't."""
+    edges, balance, _, _ = _count_edges(rest)
+    in_plane = (np.abs(vertices @ normal - distance) < _FLAT)[edges].all(axis=1)
+    edges, balance = edges[in_plane & (balance != 0)], balance[in_plane & (balance != 0)]
+    loops = _loops(np.where(balance[:, None] > 0, edges[:, ::-1], edges)) if (np.abs(balance) == 1).all() else None
+    if not loops:
+        return None
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    axes = np.column_stack([first, np.cross(normal, first)])
+    order = np.concatenate(loops)
+    flat = 1e3 * (vertices[order] - vertices[order[0]]) @ axes
+    polygons = np.split(flat, np.cumsum([len(loop) for loop in loops])[:-1])
+    manifold3d = import_extra("manifold3d")
+    face = np.asarray(manifold3d.triangulate([np.ascontiguousarray(one) for one in polygons])).reshape(-1, 3)
+    enclosed = float(sum(map(_areas, polygons)))
+    if not enclosed > 0.0 or abs(np.abs(_areas(flat[face])).sum() - enclosed) > _AREA * enclosed:
+        return None
+    return order[face]
+
+
+def _areas(polygons: np.ndarray) -> np.ndarray:
+    """Return the areas (...) of counterclockwise polygons (..., V, 2)."""
+    following = np.roll(polygons, -1, axis=-2)
+    return 0.5 * (polygons[..., 0] * following[..., 1] - polygons[..., 1] * following[..., 0]).sum(axis=-1)
+
+
+def _loops(edges: np.ndarray) -> list[list[int]] | None:
+    """Return the vertices of closed loops without repeated vertices from directed edges (E, 2); None if one is open."""
+    following = defaultdict(list)
+    for start, end in edges.tolist():
+        following[start].append(end)
+    loops, position = [], dict[int, int]()
+    for start in list(following):
+        path = [start] if following[start] else []
+        position = {start: 0}
+        while path:
+            if not following[path[-1]]:
+                if len(path) > 1:
+                    return None
+                break
+            vertex = following[path[-1]].pop()
+            if vertex in position:
+                loops.append(path[position[vertex] :])
+                for one in path[position[vertex] + 1 :]:
+                    del position[one]
+                del path[position[vertex] + 1 :]
+            else:
+                position[vertex] = len(path)
+                path.append(vertex)
+    return loops
