@@ -11,40 +11,57 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import import_extra
-from guiderail.models.parts.solids import to_arrays
+from guiderail.models.parts.solids import SurfaceLocator, measure_distance, to_arrays
 
 MAX_PIECES = 300  # the base of two gears with a third between them has 282
+MAX_FINE_PIECES = 800  # of a fine decomposition; few of them touch at a time
+_FINE_SLIVER = 1e-8  # part of the whole volume below which a piece of a fine decomposition is a rounding error
 _SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding error
 _CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its hull
 _FLAT = 1e-2  # angle below which an edge does not count as concave [rad]
+_DEPTH_SAMPLES = 500  # points sampled on the surface of a part and its hull
+_THINNEST = 1e-3  # thickness below which a piece beside a cut is a rounding error [mm]
 _MAX_PLANES = 6  # planes tried at each cut
+_ALMOST_FLAT = 1e-3  # angle below which no cut starts at an edge [rad]
 _SMALLEST_FACE = 2e-4  # smallest area of a face [mm²]; Drake cannot compute the plane of a face of 5e-5
 _DIGITS = 9  # decimal places [m] in an OBJ file; rounding may bend a flat face
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
 
-def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES) -> list[Any] | None:
+def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: float | None = None) -> list[Any] | None:
     """Cut a solid into convex pieces.
 
     Each cut is along the plane of a face at a concave edge; the plane that leaves the smallest concave volume is used.
+
+    Args:
+        solid: Solid of `manifold3d`.
+        max_pieces: Largest number of pieces.
+        depth: Depth below which a concavity is filled [mm], whatever its volume. If it is given, smaller parts are cut
+            off, and parts that the planes of their faces only graze are cut between the faces.
 
     Returns:
         The pieces; None if more than `max_pieces` are necessary, or if hulls fill a concavity that no cut removes.
     """
     total, filled, uncut, pieces = solid.volume(), 0.0, [solid], []
+    sliver = (_SLIVER if depth is None else _FINE_SLIVER) * total
     while uncut:
         for part in uncut.pop().decompose():
-            if part.volume() < _SLIVER * total:
+            # The hull of a thin part would not be thin if the part is bent.
+            if part.volume() < sliver or (depth and 2.0 * part.volume() < _THINNEST * part.surface_area()):
                 continue
             hollow = _hollow(part)
-            cut = None if hollow < _CONVEX * part.volume() + _SLIVER * total else _best_cut(part, total)
+            if depth is None:
+                is_convex = hollow < _CONVEX * part.volume() + sliver
+            else:
+                is_convex = _depth(part) < depth
+            cut = None if is_convex else _best_cut(part, total, sliver, fine=depth is not None)
             if cut is None:
                 pieces.append(_with_large_faces(part.hull()))
                 filled += hollow
             else:
                 uncut += cut
         # Edges that are each too flat to count as concave may together form a bore, which the hulls would fill.
-        if len(pieces) + len(uncut) > max_pieces or filled > 2.0 * _CONVEX * total:
+        if len(pieces) + len(uncut) > max_pieces or (depth is None and filled > 2.0 * _CONVEX * total):
             return None
     return pieces
 
@@ -98,24 +115,35 @@ def _hollow(solid: Any) -> float:
     return float(solid.hull().volume() - solid.volume())
 
 
-def _best_cut(solid: Any, total: float) -> list[Any] | None:
+def _depth(solid: Any) -> float:
+    """Return the largest distance of a solid's vertices, and a sampled one of its surface, from its convex hull [mm]."""
+    surface, hull = to_arrays(solid), to_arrays(solid.hull())
+    inside = float(SurfaceLocator(*hull).find_nearest(surface[0])[1].max())
+    return _SCALE * max(inside, measure_distance(hull, surface, _DEPTH_SAMPLES))
+
+
+def _best_cut(solid: Any, total: float, sliver: float, *, fine: bool) -> list[Any] | None:
+    """Return the parts of more volume than `sliver` [mm³] after the best cut; None if no cut is possible."""
     best, smallest = None, np.inf
     # A cut exactly in the plane of faces suffers from rounding errors, which a slightly shifted cut may avoid.
     shift_size = 1e-5 * total ** (1 / 3)
-    for normal, distance in _planes(solid):
-        for shift in (0.0, shift_size, -shift_size):
-            halves = solid.split_by_plane(normal, distance + shift)
-            parts = [part for half in halves for part in half.decompose() if part.volume() > _SLIVER * total]
-            if len(parts) > 1 and (left := sum(map(_hollow, parts))) < smallest - _SLIVER * total:
-                best, smallest = parts, left
-    return best
-
-
-def _planes(solid: Any) -> list[tuple[np.ndarray, float]]:
-    """Return planes of faces at concave edges, those with the longest edges first."""
     trimesh = import_extra("trimesh")
     vertices, triangles = to_arrays(solid)
     mesh = trimesh.Trimesh(vertices * _SCALE, triangles, process=False)
+    for find in (_planes, _bisectors) if fine else (_planes,):
+        for normal, distance in find(mesh):
+            for shift in (0.0, shift_size, -shift_size):
+                halves = solid.split_by_plane(normal, distance + shift)
+                parts = [part for half in halves for part in half.decompose() if part.volume() > sliver]
+                if len(parts) > 1 and (left := sum(map(_hollow, parts))) < smallest - sliver:
+                    best, smallest = parts, left
+        if best is not None:
+            break
+    return best
+
+
+def _planes(mesh: Any) -> list[tuple[np.ndarray, float]]:
+    """Return planes of faces at concave edges, those with the longest edges first."""
     concave = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _FLAT)
     faces = np.unique(mesh.face_adjacency[concave])
     faces = faces[mesh.area_faces[faces] > 1e-9 * mesh.scale**2]
@@ -131,3 +159,17 @@ def _planes(solid: Any) -> list[tuple[np.ndarray, float]]:
     inside = [(np.abs(ends @ normals[i] - distances[i]) < 1e-4 * mesh.scale).all(axis=1) for i in first]
     order = np.argsort([-(lengths * one).sum() for one in inside], kind="stable")
     return [(normals[first[i]], float(distances[first[i]])) for i in order[:_MAX_PLANES]]
+
+
+def _bisectors(mesh: Any) -> list[tuple[np.ndarray, float]]:
+    """Return planes that halve the angle at concave edges, those with the largest angles and lengths first.
+
+    The plane of a face may only graze the part, but these cut it in two.
+    """
+    concave = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _ALMOST_FLAT)
+    starts, ends = mesh.vertices[mesh.face_adjacency_edges[concave]].transpose(1, 0, 2)
+    normals = np.cross(ends - starts, mesh.face_normals[mesh.face_adjacency[concave]].sum(axis=1))
+    lengths = np.linalg.norm(normals, axis=1)
+    order = np.argsort(-lengths * mesh.face_adjacency_angles[concave], kind="stable")
+    order = order[lengths[order] > 1e-9 * mesh.scale][:_MAX_PLANES]
+    return [(normals[i] / lengths[i], float(starts[i] @ normals[i] / lengths[i])) for i in order]

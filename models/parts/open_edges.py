@@ -127,7 +127,7 @@ def _loops(edges: np.ndarray) -> list[list[int]] | None:
     following = defaultdict(list)
     for start, end in edges.tolist():
         following[start].append(end)
-    loops, position = [], dict[int, int]()
+    loops = []
     for start in list(following):
         path = [start] if following[start] else []
         position = {start: 0}

@@ -12,7 +12,7 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids
-from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
+from guiderail.models.parts.convex_decomposition import MAX_FINE_PIECES, cut_into_convex_pieces
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, measure_deviation, to_arrays, to_manifold
@@ -27,8 +27,11 @@ CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
 _FIRST_FRACTION = 0.7  # fraction of the remaining tolerance at the first attempt; `manifold3d` may exceed its bound
 
-KINDS = ("convex", "tetrahedra")
-"""Kinds of pieces of a compliant part; tetrahedra are tried if no convex pieces let the plug reach its target."""
+KINDS = ("convex", "fine", "tetrahedra")
+"""Kinds of pieces of a compliant part: convex pieces, more and finer ones, and tetrahedra.
+
+Each is tried if the ones before do not let the plug reach its target.
+"""
 
 Arrays = tuple[np.ndarray, np.ndarray]
 
@@ -138,6 +141,7 @@ def make_compliant(
     order = sorted(surfaces, key=lambda name: surfaces[name].num_triangles)
     failure, make, seconds = {
         "convex": ("too intricate for convex pieces", cut_bodies, CUT_SECONDS),
+        "fine": (f"too intricate for {MAX_FINE_PIECES} fine convex pieces", _cut_finely, CUT_SECONDS),
         "tetrahedra": ("no tetrahedra", _mesh_bodies, TETRAHEDRA_SECONDS),
     }[kind]
     for name in order:
@@ -153,13 +157,17 @@ def make_compliant(
         yield name, accepted
 
 
-def cut_bodies(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
+def _cut_finely(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
+    return cut_bodies(surface, tolerance, fine=True)
+
+
+def cut_bodies(surface: ContactSurface, tolerance: float, *, fine: bool = False) -> list[Piece] | None:
     """Return convex pieces of all bodies; None if there are too many pieces or they deviate too much."""
     manifold3d = import_extra("manifold3d")
     pieces: list[Piece] = []
     for number, arrays in enumerate(surface.bodies):
         solid = to_manifold(*arrays)
-        cut = cut_into_convex_pieces(solid)
+        cut = cut_into_convex_pieces(solid, MAX_FINE_PIECES, 1e3 * tolerance) if fine else cut_into_convex_pieces(solid)
         if cut is None:
             return None
         joint = manifold3d.Manifold.batch_boolean(cut, manifold3d.OpType.Add)

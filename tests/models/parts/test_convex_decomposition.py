@@ -6,12 +6,12 @@ import pytest
 from guiderail.models.parts.assembly_check import make_solids
 from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
 from guiderail.models.parts.mesh_file import load_part
-from guiderail.models.parts.solids import to_arrays
+from guiderail.models.parts.solids import SurfaceLocator, to_arrays
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
-from manifold3d import Manifold
+from manifold3d import Manifold, OpType
 
 from oracles.parts import PARTS
 
@@ -42,3 +42,16 @@ def test_cut_returns_none_when_a_faceted_bore_would_be_filled():
     """The edges of the bore are too flat to count as concave."""
     bore = Manifold.cylinder(22.0, 5.0, 5.0, 720).translate((0.0, 0.0, -1.0))
     assert cut_into_convex_pieces(Manifold.cube((30.0, 30.0, 20.0)) - bore.translate((15.0, 15.0, 0.0))) is None
+
+
+def test_fine_pieces_of_a_smooth_bore_deviate_by_at_most_the_depth():
+    bore = Manifold.cylinder(22.0, 5.0, 5.0, 720).translate((15.0, 15.0, -1.0))
+    solid = Manifold.cube((30.0, 30.0, 20.0)) - bore
+    pieces = cut_into_convex_pieces(solid, max_pieces=200, depth=0.02)
+    joint = Manifold.batch_boolean(pieces, OpType.Add)
+    assert joint.volume() == pytest.approx(solid.volume(), rel=1e-3)
+    filled = to_arrays(joint - solid)[0]
+    assert 1e3 * SurfaceLocator(*to_arrays(solid)).find_nearest(filled)[1].max() < 0.02
+    # A thin part has all its vertices near its hull.
+    plate = Manifold.cube((30.0, 30.0, 0.01)) - Manifold.cube((20.0, 20.0, 1.0)).translate((10.0, 10.0, 0.0))
+    assert len(cut_into_convex_pieces(plate, depth=0.02)) > 1
