@@ -50,10 +50,7 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
             if part.volume() < sliver or (depth and 2.0 * part.volume() < _THINNEST * part.surface_area()):
                 continue
             hollow = _hollow(part)
-            if depth is None:
-                is_convex = hollow < _CONVEX * part.volume() + sliver
-            else:
-                is_convex = _depth(part) < depth
+            is_convex = hollow < _CONVEX * part.volume() + sliver if depth is None else _depth(part) < depth
             cut = None if is_convex else _best_cut(part, total, sliver, fine=depth is not None)
             if cut is None:
                 pieces.append(_with_large_faces(part.hull()))
@@ -116,7 +113,7 @@ def _hollow(solid: Any) -> float:
 
 
 def _depth(solid: Any) -> float:
-    """Return the largest distance of a solid's vertices, and a sampled one of its surface, from its convex hull [mm]."""
+    """Return the largest distance of a solid's vertices from its convex hull, and of hull samples from it [mm]."""
     surface, hull = to_arrays(solid), to_arrays(solid.hull())
     inside = float(SurfaceLocator(*hull).find_nearest(surface[0])[1].max())
     return _SCALE * max(inside, measure_distance(hull, surface, _DEPTH_SAMPLES))
