@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.stations.station import PLANT_PERIOD
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.common.transforms import MM
 from guiderail.models.parts.drake_check import Piece, piece_text
@@ -139,8 +139,11 @@ def choose_contact(
             if refusal:
                 report(f"{name}: Drake refuses its contact geometry ({refusal})")
             else:
-                choices += _adapt_settings(folder, contact, make_file, allowed, log)
-                if all(max(rank(choice, allowed) for choice in choices)[:3]):
+                try:
+                    choices += _adapt_settings(folder, contact, make_file, allowed, log)
+                except RuntimeError as error:  # Drake fails at small faces, such as 1e-10 m² of a rigid surface
+                    report(f"{name}: Drake can't simulate its contact geometry ({brief(str(error))})")
+                if choices and all(max(rank(choice, allowed) for choice in choices)[:3]):
                     break
             start = cpu_time()
         if any(choice.aligned.success for choice in choices):
