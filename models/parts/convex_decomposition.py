@@ -20,7 +20,7 @@ _SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding err
 _CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its hull
 _FLAT = 1e-2  # angle below which an edge does not count as concave [rad]
 _DEPTH_SAMPLES = 500  # points sampled on the surface of a part and its hull
-_THINNEST = 1e-3  # thickness below which a piece beside a cut is a rounding error [mm]
+THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
 _MAX_PLANES = 6  # planes tried at each cut
 _ALMOST_FLAT = 1e-3  # angle below which no cut starts at an edge [rad]
 _SMALLEST_FACE = 2e-4  # smallest area of a face [mm²]; Drake cannot compute the plane of a face of 5e-5
@@ -47,7 +47,7 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
     while uncut:
         for part in uncut.pop().decompose():
             # The hull of a thin part would not be thin if the part is bent.
-            if part.volume() < sliver or (depth and 2.0 * part.volume() < _THINNEST * part.surface_area()):
+            if part.volume() < sliver or (depth and 2.0 * part.volume() < THINNEST * part.surface_area()):
                 continue
             hollow = _hollow(part)
             is_convex = hollow < _CONVEX * part.volume() + sliver if depth is None else _depth(part) < depth

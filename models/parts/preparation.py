@@ -12,16 +12,22 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids
-from guiderail.models.parts.convex_decomposition import MAX_FINE_PIECES, cut_into_convex_pieces
+from guiderail.models.parts.convex_decomposition import MAX_FINE_PIECES, THINNEST, cut_into_convex_pieces
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
-from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, measure_deviation, to_arrays, to_manifold
+from guiderail.models.parts.solids import (
+    SurfaceLocator,
+    join_surfaces,
+    measure_deviation,
+    measure_distance,
+    to_arrays,
+    to_manifold,
+)
 from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
 NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at if no walls face each other [m]
 MARGIN = 4e-3  # distance from the nominal motion within which parts may touch [m]
-_THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
 MIN_YAW = 0.1  # default rotation of the plug about its axis in a search, by which the margin is widened [rad]
 CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
@@ -129,8 +135,10 @@ def _reduce(solid: Any, tolerance: float) -> tuple[Any, float]:
 
 def make_compliant(
     kind: str, surfaces: dict[str, ContactSurface], tolerance: float, log: Callable[[str], None]
-) -> Iterator[tuple[str, list[Piece]]]:
-    """Yield the compliant geometries to try: name of the part and its pieces, the part with fewer triangles first.
+) -> Iterator[tuple[str, list[Piece], float]]:
+    """Yield the compliant geometries to try, the part with fewer triangles first.
+
+    A geometry is the name of the part, its pieces, and their largest measured distance from its surface [m].
 
     Args:
         kind: One of `KINDS`.
@@ -146,49 +154,56 @@ def make_compliant(
     }[kind]
     for name in order:
         try:
-            pieces = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
+            made = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
         except IsolatedError as error:
             log(f"{name}: {failure} ({error})")
             continue
-        accepted = None if pieces is None else accepted_pieces(pieces)
-        if accepted is None:
-            log(f"{name}: {failure if pieces is None else 'Drake refuses a piece'}")
+        accepted = None if made is None else accepted_pieces(made[0])
+        if made is None or accepted is None:
+            log(f"{name}: {failure if made is None else 'Drake refuses a piece'}")
             continue
-        yield name, accepted
+        yield name, accepted, made[1]
 
 
-def _cut_finely(surface: ContactSurface, tolerance: float) -> list[Piece] | None:
+def _cut_finely(surface: ContactSurface, tolerance: float) -> tuple[list[Piece], float] | None:
     return cut_bodies(surface, tolerance, fine=True)
 
 
-def cut_bodies(surface: ContactSurface, tolerance: float, *, fine: bool = False) -> list[Piece] | None:
-    """Return convex pieces of all bodies; None if there are too many pieces or they deviate too much."""
+def cut_bodies(surface: ContactSurface, tolerance: float, *, fine: bool = False) -> tuple[list[Piece], float] | None:
+    """Return convex pieces of all bodies and the measured distance of what they add from the surface [m].
+
+    The result is None if there are too many pieces or they deviate too much.
+    """
     manifold3d = import_extra("manifold3d")
     pieces: list[Piece] = []
+    deviation = 0.0
     for number, arrays in enumerate(surface.bodies):
         solid = to_manifold(*arrays)
         cut = cut_into_convex_pieces(solid, MAX_FINE_PIECES, 1e3 * tolerance) if fine else cut_into_convex_pieces(solid)
         if cut is None:
             return None
         joint = manifold3d.Manifold.batch_boolean(cut, manifold3d.OpType.Add)
-        added = to_arrays(joint - solid)[0]  # the difference `solid - joint` would contain the seams between pieces
-        if len(added) and float(SurfaceLocator(*arrays).find_nearest(added)[1].max()) > 2.0 * tolerance:
-            return None
+        added = to_arrays(joint - solid)  # the difference `solid - joint` would contain the seams between pieces
+        if len(added[0]):
+            if float(SurfaceLocator(*arrays).find_nearest(added[0])[1].max()) > 2.0 * tolerance:
+                return None
+            deviation = max(deviation, measure_distance(added, arrays))
         pieces += [
-            Piece(number, ".obj", *to_arrays(one)) for one in cut if 2.0 * one.volume() > _THINNEST * one.surface_area()
+            Piece(number, ".obj", *to_arrays(one)) for one in cut if 2.0 * one.volume() > THINNEST * one.surface_area()
         ]
-    return pieces
+    return pieces, deviation
 
 
-def _mesh_bodies(surface: ContactSurface, tolerance: float) -> list[Piece]:
-    """Return tetrahedra of each body."""
-    pieces = []
+def _mesh_bodies(surface: ContactSurface, tolerance: float) -> tuple[list[Piece], float]:
+    """Return tetrahedra of each body, and the measured deviation of their boundaries [m]."""
+    pieces, deviation = [], 0.0
     for number, arrays in enumerate(surface.bodies):
         points, cells = tetrahedralize(*arrays, 2.0 * tolerance)
-        if measure_deviation(boundary_of(points, cells), arrays) > 4.0 * tolerance:
+        deviation = max(deviation, measure_deviation(boundary_of(points, cells), arrays))
+        if deviation > 4.0 * tolerance:
             raise ValueError("their boundary deviates from the part")
         pieces.append(Piece(number, ".vtk", *add_interior_points(points, cells)))
-    return pieces
+    return pieces, deviation
 
 
 _SLABS = 8  # slabs along z in which a part is cropped

@@ -38,6 +38,7 @@ class Contact:
 
     compliant: str  # name of the compliant part, "plug" or "socket"
     pieces: tuple[Piece, ...]  # pieces of the compliant part
+    deviation: float = 0.0  # largest measured distance of the pieces from the part's surface [m]
     snapping: frozenset[int] = frozenset()  # indices of the compliant part's bodies that snap
     modulus: float = MODULUS  # modulus of the bodies that do not snap [Pa]
     snap_modulus: float = MODULUS  # modulus of the snapping bodies [Pa]
@@ -129,10 +130,10 @@ def choose_contact(
 
     seconds, start = 0.0, cpu_time()
     for kind in KINDS:
-        for name, pieces in make_compliant(kind, usable, tolerance, report):
+        for name, pieces, deviation in make_compliant(kind, usable, tolerance, report):
             number = len(surfaces[name].bodies)
             snapped = frozenset(range(number - snapping, number)) if name == "plug" else frozenset()
-            contact = Contact(name, tuple(pieces), snapped)
+            contact = Contact(name, tuple(pieces), deviation, snapped)
             _write_pieces(folder, contact, surfaces)
             refusal = _refusal_of_drake(folder, make_file(contact, PUSHES[0]))
             seconds += cpu_time() - start

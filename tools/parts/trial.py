@@ -294,11 +294,11 @@ def add_convex_pieces(
         for name, model in (("plug", file.plug), ("socket", file.socket)):
             names = [piece.file for piece in model.pieces if piece.modulus is not None and piece.file.endswith(".obj")]
             if len(names) < len(model.pieces):
-                pieces = run_isolated(cut_bodies, surfaces[name], tolerance, cpu_seconds=CUT_SECONDS)
-                if pieces is None:
+                cut = run_isolated(cut_bodies, surfaces[name], tolerance, cpu_seconds=CUT_SECONDS)
+                if cut is None:
                     raise IsolatedError(f"the {name} is too intricate for convex pieces")
-                names = [f"{name}_convex_{number}.obj" for number in range(len(pieces))]
-                for new, piece in zip(names, pieces, strict=True):
+                names = [f"{name}_convex_{number}.obj" for number in range(len(cut[0]))]
+                for new, piece in zip(names, cut[0], strict=True):
                     written.append(folder / new)
                     written[-1].write_text(piece_text(piece), encoding="utf-8")
             changes[name] = model.model_copy(update={"convex": tuple(names)})

@@ -7,14 +7,16 @@ from guiderail.models.parts.assembly_check import make_solids, measure_side_clea
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import load_part
 from guiderail.models.parts.preparation import (
+    ContactSurface,
     choose_tolerance,
     crop_to_contact,
+    cut_bodies,
     decimate,
     make_compliant,
     prepare_surfaces,
     simplify,
 )
-from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, to_arrays
+from guiderail.models.parts.solids import SurfaceLocator, measure_deviation, to_arrays, to_manifold
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -69,7 +71,7 @@ def test_prepared_surfaces_report_their_deviation(name, tmp_path):
     assert surfaces[0].snapping == len(snapping)
     for part, surface in zip(parts, surfaces, strict=True):
         assert surface.volume == pytest.approx(1e-9 * sum(one.volume() for one in make_solids(part)), rel=1e-3)
-    for _, pieces in make_compliant("convex", {"plug": surfaces[0]}, tolerance, lambda line: None):
+    for _, pieces, _ in make_compliant("convex", {"plug": surfaces[0]}, tolerance, lambda line: None):
         assert {piece.body for piece in pieces} == set(range(len(surfaces[0].bodies)))
 
 
@@ -81,3 +83,18 @@ def test_pieces_that_abort_drake_are_left_out_or_refused():
     assert accepted is not None
     assert accepted[0] is good
     assert accepted_pieces([Piece(0, ".vtk", cube, np.array([[0, 1, 2, 2]]))]) is None
+
+
+def test_pieces_report_what_they_fill():
+    ring = manifold3d.CrossSection.circle(1.0, 16).translate((4.0, 0.0)).revolve(24)
+    surface, tolerance = ContactSurface((to_arrays(ring),), 0, to_arrays(ring), 0.0, 1.0), 1e-4
+    made = cut_bodies(surface, tolerance, fine=True)
+    assert made is not None
+    pieces, deviation = made
+    filled = manifold3d.Manifold.batch_boolean(
+        [to_manifold(piece.points, piece.cells) for piece in pieces], manifold3d.OpType.Add
+    )
+    assert filled.volume() > ring.volume()
+    assert 0.0 < deviation <= 2.0 * tolerance
+    box = manifold3d.Manifold.cube((1.0, 2.0, 3.0))
+    assert cut_bodies(ContactSurface((to_arrays(box),), 0, to_arrays(box), 0.0, 1.0), tolerance)[1] == 0.0
