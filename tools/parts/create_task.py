@@ -305,7 +305,7 @@ def _measure(
     deviation = prepared["deviation_mm"] + round(1e3 * contact.deviation, 4)
     if contact.deviation:
         total = _describe_deviation(1e-3 * deviation, prepared["clearance_mm"])
-        log(f"{contact.compliant}: with the deviation of its pieces, {total}")
+        log(f"{contact.compliant}: with its pieces, {total}")
     penetration, clearance = 1e3 * max(trial.penetration for trial in trials), prepared["clearance_mm"]
     if clearance is not None and penetration > 0.5 * clearance:
         log(f"penetration of {penetration:.3f} mm is more than half the clearance ({0.5 * clearance:.3f} mm)")
