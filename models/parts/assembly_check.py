@@ -11,6 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.sdf import area_vectors
+from guiderail.models.parts.demonstrator import TOUCH
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, sample_surface, to_arrays, to_manifold
 
@@ -22,17 +23,20 @@ _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a roun
 
 @dataclass(frozen=True)
 class InsertionMotion:
-    """Motion of a plug to its target along z, with a turn about z at the end."""
+    """Motion of a plug to its target along z, with a turn about z at the end, during which a screw also advances."""
 
     travel: float  # height of the start above the target [m]
     rim: float  # height at which the plug's lowest point is level with the socket's highest [m]
     turn: float = 0.0  # angle of the turn, counter-clockwise as seen from above [rad]
+    advance: float = 0.0  # height lost during the turn [m]
 
     def path(self, steps: int = 24) -> list[tuple[float, float]]:
         """Return heights [m] and angles [rad] from the rim to the target."""
-        down = [(float(z), -self.turn) for z in np.linspace(self.rim, 0.0, steps)]
-        turning = np.linspace(-self.turn, 0.0, steps)[1:] if self.turn else np.empty(0)
-        return down + [(0.0, float(angle)) for angle in turning]
+        down = [(float(z), -self.turn) for z in np.linspace(self.rim, self.advance, steps)]
+        if not self.turn:
+            return down
+        turning = zip(np.linspace(self.advance, 0.0, steps)[1:], np.linspace(-self.turn, 0.0, steps)[1:], strict=True)
+        return down + [(float(z), float(angle)) for z, angle in turning]
 
 
 def make_solids(part: Part) -> list[Any]:
@@ -80,11 +84,13 @@ def compute_center_of_mass(part: Part) -> np.ndarray:
     return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()
 
 
-def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> InsertionMotion:
-    """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] at the end.
+def plan_motion(
+    plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, advance: float = 0.0
+) -> InsertionMotion:
+    """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] and `advance` [m] at the end.
 
     Raises:
-        InputError: If the plug at its target does not reach into the socket.
+        InputError: If the plug at its target does not reach into the socket, or not beyond the advance.
     """
     rim = float(socket.bounds[1, 2] - plug.bounds[0, 2])
     if rim < 5e-4:
@@ -92,7 +98,12 @@ def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> I
             f"the plug ends {max(-rim, 0.0) * 1e3:.1f} mm above the socket at the target and is not inserted: draw "
             "them assembled, place the plug with --plug-pose, or give the direction in which it comes out with --axis"
         )
-    return InsertionMotion(travel=rim + clear, rim=rim, turn=turn)
+    if advance and advance > rim - TOUCH:
+        raise InputError(
+            f"the plug advances by {1e3 * advance:.3g} mm during --turn and must enter {1e3 * TOUCH:g} mm more than that, "
+            f"but enters only {1e3 * rim:.3g} mm: give a smaller --turn or --pitch"
+        )
+    return InsertionMotion(travel=rim + clear, rim=rim, turn=turn, advance=advance)
 
 
 def measure_side_clearance(plug: Part, socket: Part) -> float:

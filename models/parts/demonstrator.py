@@ -26,7 +26,9 @@ _CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # correlation times of the dev
 _CENTERING = 0.9  # fraction of the mean of the random curves that is subtracted from each of them
 
 
-def plan_straight_insertion(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
+def plan_straight_insertion(
+    travel: float, rim: float, turn: float, push: float, advance: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) and poses (N, 6) of an insertion: down, slowly past the rim, a push, a turn, and to the target.
 
     Args:
@@ -34,14 +36,15 @@ def plan_straight_insertion(travel: float, rim: float, turn: float, push: float)
         rim: Height of a plug that stands on the rim [m].
         turn: Angle of the turn at the bottom [rad].
         push: Distance of the command below the target [m].
+        advance: Height lost during the turn [m].
     """
     low = rim - TOUCH
     points = [
         (PAUSE, travel, -turn),
         ((travel - rim - TOUCH) / INSERTION_SPEED, rim + TOUCH, -turn),
         (2.0 * TOUCH / TOUCH_SPEED, low, -turn),
-        ((low + push) / INSERTION_SPEED, -push, -turn),
-        (PAUSE, -push, -turn),
+        ((low + push - advance) / INSERTION_SPEED, advance - push, -turn),
+        (PAUSE, advance - push, -turn),
     ]
     if turn:
         points += [(abs(turn) / TURN_SPEED + PAUSE, -push, 0.0)]
@@ -49,7 +52,9 @@ def plan_straight_insertion(travel: float, rim: float, turn: float, push: float)
     return _poses([(0.0, travel, -turn), *points])
 
 
-def plan_search(travel: float, rim: float, turn: float, push: float, press: float) -> tuple[np.ndarray, np.ndarray]:
+def plan_search(
+    travel: float, rim: float, turn: float, push: float, press: float, advance: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) and poses (N, 6) of a demonstration: to the rim, a search there, the insertion and a turn.
 
     Args:
@@ -58,6 +63,7 @@ def plan_search(travel: float, rim: float, turn: float, push: float, press: floa
         turn: Angle of the turn at the bottom [rad].
         push: Distance of the command below the target [m].
         press: Distance of the command below the rim in the search [m].
+        advance: Height lost during the turn [m].
     """
     down = (travel - rim + press) / DESCENT_SPEED + 0.3
     points = [
@@ -65,8 +71,8 @@ def plan_search(travel: float, rim: float, turn: float, push: float, press: floa
         (0.2, travel, -turn),
         (down, rim - press, -turn),
         (SEARCH, rim - press - 0.5 * MM, -turn),
-        ((rim - press + push) / INSERTION_SPEED + 0.3, -push, -turn),
-        (PAUSE, -push, -turn),
+        ((rim - press + push - advance) / INSERTION_SPEED + 0.3, advance - push, -turn),
+        (PAUSE, advance - push, -turn),
     ]
     if turn:
         points += [(abs(turn) / TURN_SPEED + PAUSE, -push, 0.0)]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from manifold3d import CrossSection, Manifold
+from manifold3d import CrossSection, Manifold, Mesh
 
 SIDES = 24
 CHAMFER = 0.5  # chamfer of a plug's tip and a socket's mouth [mm]
@@ -162,6 +162,27 @@ def dovetail(clearance: float = 0.15) -> Part:
         [_prism(slot, -chamfer, -chamfer + 0.01), _prism(_grown(tongue, clearance + chamfer), 0.0, 0.01)]
     )
     return Part([plug], [block], clearance)
+
+
+def screw(clearance: float = 0.3, pitch: float = 8.0) -> Part:
+    """A shaft with a quarter of a turn of a right-handed thread, which enters its groove in the last half turn."""
+
+    def ridge(start: float, end: float, grown: float) -> Manifold:
+        angles = np.deg2rad(np.linspace(start, end, round((end - start) / 15.0) + 1))[:, None]
+        r = np.array([4.0, 7.0 + grown, 7.0 + grown, 4.0])
+        z = np.array([-1.2 - grown, -0.5 - grown, 0.5 + grown, 1.2 + grown]) + pitch * angles / (2.0 * np.pi)
+        vertices = np.stack([r * np.cos(angles), r * np.sin(angles), z], axis=2).reshape(-1, 3)
+        a = 4 * np.arange(len(angles) - 1)[:, None] + np.arange(4)
+        b = 4 * (a // 4) + (a + 1) % 4
+        sides = np.stack([a, a + 4, b, b, a + 4, b + 4], axis=2).reshape(-1, 3)
+        last = len(vertices) - 4
+        ends = [[0, 1, 2], [0, 2, 3], [last, last + 2, last + 1], [last, last + 3, last + 2]]
+        return Manifold(Mesh(vertices.astype(np.float32), np.concatenate([sides, ends]).astype(np.uint32)))
+
+    plug = _shaft(_disc(5.0), -14.0, 8.0, 0.2) + ridge(0.0, 90.0, 0.0).translate((0.0, 0.0, -4.0))
+    socket = _block(30.0, -16.0) - _hole(_disc(5.0), clearance, -14.0)
+    socket -= ridge(-15.0, 360.0, clearance).translate((0.0, 0.0, -4.0))
+    return Part([plug], [socket], clearance, ["--turn", "-180", "--pitch", f"{pitch:g}"])
 
 
 PARTS: dict[str, Callable[[], Part]] = {

@@ -127,6 +127,9 @@ def create_task(
     turn: Annotated[
         float, option("Rotation of the plug at the bottom [degrees]; its mesh shows it after the rotation.")
     ] = 0.0,
+    pitch: Annotated[
+        float, option("Advance of a screw per full turn during --turn [mm], positive if it is right-handed.")
+    ] = 0.0,
     search_turn: Annotated[
         float, option("Largest unknown turn of the socket [degrees]; actions then turn the plug, too.")
     ] = 0.0,
@@ -158,6 +161,7 @@ def create_task(
         axis=axis,
         center=None if center is None else cli.parse_floats(center, 3, "--center"),
         turn=turn,
+        pitch=1e-3 * pitch,
         search_turn=search_turn,
         shrink=1e-3 * shrink,
         force_limit=force_limit,

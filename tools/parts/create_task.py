@@ -43,6 +43,7 @@ DENSITY = 2700.0  # assumed density of the parts, that of aluminum [kg/m³]; a g
 CLEAR = 3.0 * MM  # height of the start above the rim
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
+MAX_PITCH = 0.1  # largest advance per turn, either way [m]
 MAX_SEARCH_TURN = 10.0  # largest unknown turn of the socket [degrees]
 COMMANDED_TURN = 1.5  # bound of the commanded turn, as a multiple of the unknown turn of the socket
 MAX_FORCE = 1e4  # largest force limit [N]
@@ -114,6 +115,7 @@ def create_task(
     axis: str = "+z",
     center: Sequence[float] | None = None,
     turn: float = 0.0,
+    pitch: float = 0.0,
     search_turn: float = 0.0,
     shrink: float = 0.0,
     force_limit: float = COLLISION_FORCE,
@@ -135,6 +137,7 @@ def create_task(
         out: Folder; it must not exist.
         turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; the mesh files
             show the plug after this rotation.
+        pitch: Advance of a screw per full turn during `turn` [m], positive if it is right-handed.
         search_turn: Largest unknown turn of the socket [degrees]; if positive, actions also turn the plug, for example
             to find the teeth of gears.
         shrink: Distance by which the plug's surface is moved inwards [m].
@@ -150,7 +153,7 @@ def create_task(
         InputError: If the parts cannot be used; no folder is left then.
     """
     check_new(out, "folder with --out, or remove it")
-    _check_arguments(plug_pose, turn, search_turn, shrink, force_limit, friction, scenario, hard_episodes)
+    _check_arguments(plug_pose, turn, pitch, search_turn, shrink, force_limit, friction, scenario, hard_episodes)
     start = cpu_time()
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     for part in parts:
@@ -160,7 +163,7 @@ def create_task(
         parts = shrink_part(parts[0], shrink), parts[1]
         log(f"{plug.name}: its surface is moved inwards by {1e3 * shrink:g} mm (--shrink)")
     check_target(*parts)
-    path = plan_motion(*parts, turn * DEGREE, CLEAR)
+    path = plan_motion(*parts, turn * DEGREE, CLEAR, advance=abs(pitch * turn) / 360.0)
     clearance = measure_side_clearance(*parts)
     log(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     log(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
@@ -231,6 +234,7 @@ def _describe_deviation(deviation: float, clearance_mm: float | None) -> str:
 def _check_arguments(
     plug_pose: Sequence[float],
     turn: float,
+    pitch: float,
     search_turn: float,
     shrink: float,
     force_limit: float,
@@ -243,6 +247,15 @@ def _check_arguments(
         raise InputError(f"--plug-pose is finite, not {list(plug_pose)}")
     if not abs(turn) <= MAX_TURN:
         raise InputError(f"--turn is at most {MAX_TURN:g} degrees either way, not {turn:g}")
+    if not abs(pitch) <= MAX_PITCH:
+        raise InputError(f"--pitch is at most {1e3 * MAX_PITCH:g} mm either way, not {1e3 * pitch:g}")
+    if pitch and not turn:
+        raise InputError("--pitch is the advance of a screw per full turn: give --turn, too")
+    if pitch * turn > 0.0:
+        raise InputError(
+            "a right-handed screw (--pitch above 0) enters with --turn below 0, clockwise seen from outside, and a "
+            f"left-handed one the other way round, not --pitch {1e3 * pitch:g} with --turn {turn:g}"
+        )
     if not 0.0 <= search_turn <= MAX_SEARCH_TURN:
         raise InputError(f"--search-turn is from 0 to {MAX_SEARCH_TURN:g} degrees, not {search_turn:g}")
     if not 0.0 < force_limit <= MAX_FORCE:
@@ -400,6 +413,7 @@ def _task_file(
                 "travel": path.travel,
                 "rim": path.rim,
                 "turn": float(path.turn / DEGREE),
+                "advance": path.advance,
                 "search_turn": values["search_turn"],
                 "push": push,
             },

@@ -21,7 +21,7 @@ from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.common.yaml import load_yaml
-from guiderail.models.parts.demonstrator import plan_search, plan_straight_insertion
+from guiderail.models.parts.demonstrator import TOUCH, plan_search, plan_straight_insertion
 from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
@@ -87,6 +87,7 @@ class MotionNumbers(Options):
     travel: Number = Field(gt=0, le=0.5, description="height of the start above the target [m]")
     rim: Number = Field(gt=0, le=0.5, description="height at which the plug stands on the rim [m]")
     turn: Number = Field(0.0, ge=-180, le=180, description="turn about z at the bottom [degrees]")
+    advance: Number = Field(0.0, ge=0, le=0.5, description="height lost during the turn, as by a screw [m]")
     search_turn: Number = Field(
         0.0, ge=0, le=10, description="largest unknown turn of the socket, which a search must find [degrees]"
     )
@@ -97,13 +98,20 @@ class MotionNumbers(Options):
         2.5 * MM, ge=0, le=10 * MM, description="depth of the command below the rim during a search [m]"
     )
 
+    @field_validator("advance")
+    @classmethod
+    def _is_within_the_socket(cls, value: float, info: ValidationInfo) -> float:
+        if value and value > info.data.get("rim", np.inf) - TOUCH:
+            raise ValueError(f"the advance is at least {TOUCH:g} m less than rim")
+        return value
+
     def plan_straight_insertion(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times (N,) [s] and poses (N, 6) of a straight insertion."""
-        return plan_straight_insertion(self.travel, self.rim, self.turn * DEGREE, self.push)
+        return plan_straight_insertion(self.travel, self.rim, self.turn * DEGREE, self.push, self.advance)
 
     def plan_search(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times (N,) [s] and poses (N, 6) of a demonstration with a search on the rim."""
-        return plan_search(self.travel, self.rim, self.turn * DEGREE, self.push, self.press)
+        return plan_search(self.travel, self.rim, self.turn * DEGREE, self.push, self.press, self.advance)
 
 
 class Tolerance(Options):
