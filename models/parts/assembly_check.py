@@ -16,6 +16,7 @@ from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, sample_surface, to_arrays, to_manifold
 
 MAX_WALL_SLOPE = 0.5  # largest component of a wall's normal along the axis
+MAX_FLANK_SLOPE = 0.98  # the same for the flank of a thread
 MAX_RESTING_OVERLAP = 2e-6  # largest overlap that counts as rounding of faces in contact [m]
 _SAMPLES = 12000  # number of points sampled on the walls of a part
 _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a rounding error [m²]
@@ -29,6 +30,11 @@ class InsertionMotion:
     rim: float  # height at which the plug's lowest point is level with the socket's highest [m]
     turn: float = 0.0  # angle of the turn, counter-clockwise as seen from above [rad]
     advance: float = 0.0  # height lost during the turn [m]
+
+    @property
+    def pitch(self) -> float:
+        """Height lost per full turn [m]; only for a motion with a turn."""
+        return self.advance * 2.0 * np.pi / abs(self.turn)
 
     def path(self, steps: int = 24) -> list[tuple[float, float]]:
         """Return heights [m] and angles [rad] from the rim to the target."""
@@ -84,9 +90,7 @@ def compute_center_of_mass(part: Part) -> np.ndarray:
     return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()
 
 
-def plan_motion(
-    plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, advance: float = 0.0
-) -> InsertionMotion:
+def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, advance: float = 0.0) -> InsertionMotion:
     """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] and `advance` [m] at the end.
 
     Raises:
@@ -106,9 +110,12 @@ def plan_motion(
     return InsertionMotion(travel=rim + clear, rim=rim, turn=turn, advance=advance)
 
 
-def measure_side_clearance(plug: Part, socket: Part) -> float:
-    """Return the smallest distance [m] between facing walls of the parts at the target; infinite if there are none."""
-    walls = [_walls(part) for part in (plug, socket)]
+def measure_side_clearance(plug: Part, socket: Part, max_slope: float = MAX_WALL_SLOPE) -> float:
+    """Return the smallest distance [m] between facing walls of the parts at the target; infinite if there are none.
+
+    `max_slope` is the largest component of a wall's normal along the axis.
+    """
+    walls = [_walls(part, max_slope) for part in (plug, socket)]
     least = np.inf
     for (vertices, triangles), other in (walls, walls[::-1]):
         if not len(triangles) or not len(other[1]):
@@ -124,11 +131,11 @@ def measure_side_clearance(plug: Part, socket: Part) -> float:
     return least
 
 
-def _walls(part: Part) -> tuple[np.ndarray, np.ndarray]:
+def _walls(part: Part, max_slope: float) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and triangles (T, 3) of the walls of a part, its faces along the axis."""
     vertices, triangles = join_surfaces(part.bodies)
     is_large = np.linalg.norm(area_vectors(vertices, triangles), axis=1) > _SLIVER
-    is_wall = np.abs(_normals(vertices, triangles)[:, 2]) < MAX_WALL_SLOPE
+    is_wall = np.abs(_normals(vertices, triangles)[:, 2]) < max_slope
     return vertices, triangles[is_large & is_wall]
 
 

@@ -23,6 +23,7 @@ _DEPTH_SAMPLES = 500  # points sampled on the surface of a part and its hull
 THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
 _MAX_PLANES = 6  # planes tried at each cut
 _ALMOST_FLAT = 1e-3  # angle below which no cut starts at an edge [rad]
+_NUM_RADII = 40  # radii at which a sector may be cut
 _SMALLEST_FACE = 2e-4  # smallest area of a face [mm²]; Drake cannot compute the plane of a face of 5e-5
 _DIGITS = 9  # decimal places [m] in an OBJ file; rounding may bend a flat face
 _SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
@@ -60,6 +61,30 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
         # Edges that are each too flat to count as concave may together form a bore, which the hulls would fill.
         if len(pieces) + len(uncut) > max_pieces or (depth is None and filled > 2.0 * _CONVEX * total):
             return None
+    return pieces
+
+
+def cut_into_sectors(solid: Any, number: int, max_pieces: int = MAX_PIECES) -> list[Any] | None:
+    """Cut a solid by planes through the z axis into `number` sectors, at least 3, and each at a radius into hulls.
+
+    The radius is that with the smallest concave volume, the root of a thread. The faces of a thread are curved, and no
+    few planes of faces make it convex. Returns None if more than `max_pieces` are necessary. The hulls fill concavities.
+    """
+    pieces: list[Any] = []
+    for angle in 2.0 * np.pi / number * np.arange(number):
+        middle, end = angle + np.pi / number, angle + 2.0 * np.pi / number
+        half = solid.trim_by_plane((-np.sin(angle), np.cos(angle), 0.0), 0.0)
+        for part in half.trim_by_plane((np.sin(end), -np.cos(end), 0.0), 0.0).decompose():
+            outward = np.array([np.cos(middle), np.sin(middle), 0.0])
+            distances = to_arrays(part)[0] @ outward * _SCALE
+            cuts = [
+                [one for half in part.split_by_plane(outward, distance) for one in half.decompose()]
+                for distance in np.linspace(distances.min(), distances.max(), _NUM_RADII + 2)[1:-1]
+            ]
+            best = min(cuts, key=lambda cut: sum(map(_hollow, cut)))
+            pieces += [_with_large_faces(one.hull()) for one in best if one.volume() > _SLIVER * part.volume()]
+            if len(pieces) > max_pieces:
+                return None
     return pieces
 
 

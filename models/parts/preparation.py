@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,12 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.assembly_check import InsertionMotion, make_solids
-from guiderail.models.parts.convex_decomposition import MAX_FINE_PIECES, THINNEST, cut_into_convex_pieces
+from guiderail.models.parts.convex_decomposition import (
+    MAX_FINE_PIECES,
+    THINNEST,
+    cut_into_convex_pieces,
+    cut_into_sectors,
+)
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import (
@@ -33,8 +40,8 @@ CUT_SECONDS, TETRAHEDRA_SECONDS = 15, 25  # limits of CPU time [s]
 DECIMATION_FRACTION = 0.2  # fraction of the tolerance that `decimate` may use
 _FIRST_FRACTION = 0.7  # fraction of the remaining tolerance at the first attempt; `manifold3d` may exceed its bound
 
-KINDS = ("convex", "fine", "tetrahedra")
-"""Kinds of pieces of a compliant part: convex pieces, more and finer ones, and tetrahedra.
+KINDS = ("convex", "sectors", "fine", "tetrahedra")
+"""Kinds of pieces of a compliant part: convex pieces, sectors of a screw, more and finer convex pieces, and tetrahedra.
 
 Each is tried if the ones before do not let the plug reach its target.
 """
@@ -51,6 +58,7 @@ class ContactSurface:
     visual: Arrays  # vertices and triangles of the whole part, decimated but not cropped
     deviation: float  # largest measured distance from the drawing in the regions that can touch [m]
     volume: float  # volume of the part [m³]
+    sectors: int = 0  # number of sectors about z in which the curves of a screw are straight; 0 for other parts
 
     @property
     def num_triangles(self) -> int:
@@ -106,6 +114,10 @@ def prepare_surfaces(
         solid = whole
         if not snapping:  # a deflected body may touch where a rigid one would not
             cropped = crop_to_contact(whole, other, margin, motion.turn, is_plug=part is plug)
+            if motion.advance:  # the thread stops a plug at most one turn below its target
+                low, high = -motion.pitch, motion.rim + motion.pitch
+                plane = ((0.0, 0.0, -1.0), -1e3 * high) if part is plug else ((0.0, 0.0, 1.0), 1e3 * low)
+                cropped = cropped.trim_by_plane(*plane)
             # Cropping adds edges, too: the solid with fewer triangles is used.
             solid = min(whole, cropped, key=lambda one: count_simplified(one, _FIRST_FRACTION * remaining))
         bodies = [_reduce(one, remaining) for one in solid.decompose()] + [simplify(one, remaining) for one in extra]
@@ -116,9 +128,19 @@ def prepare_surfaces(
                 visual=join_surfaces([to_arrays(one) for one in (whole, *extra)]),
                 deviation=moved + 1e-3 * max(deviation for _, deviation in bodies),
                 volume=1e-9 * sum(one.volume() for one in (whole, *extra)),
+                sectors=_count_sectors(plug, socket, motion, tolerance) if motion.advance else 0,
             )
         )
     return surfaces[0], surfaces[1]
+
+
+def _count_sectors(plug: Part, socket: Part, motion: InsertionMotion, tolerance: float) -> int:
+    """Return the number of sectors whose chords deviate from the thread's circle by the tolerance [m]."""
+    radii = []
+    for part in (plug, socket):
+        corners = part.corners[(part.corners[:, 2] >= 0.0) & (part.corners[:, 2] <= motion.rim)]
+        radii.append(float(np.hypot(*corners[:, :2].T).max()))
+    return math.ceil(math.pi / math.acos(1.0 - min(tolerance / min(radii), 0.5)))
 
 
 def _unite(solids: Sequence[Any]) -> Any:
@@ -147,11 +169,18 @@ def make_compliant(
         log: Function called with a sentence on each part that does not decompose or that Drake refuses.
     """
     order = sorted(surfaces, key=lambda name: surfaces[name].num_triangles)
-    failure, make, seconds = {
-        "convex": ("too intricate for convex pieces", cut_bodies, CUT_SECONDS),
-        "fine": (f"too intricate for {MAX_FINE_PIECES} fine convex pieces", _cut_finely, CUT_SECONDS),
-        "tetrahedra": ("no tetrahedra", _mesh_bodies, TETRAHEDRA_SECONDS),
+    if kind == "sectors":
+        order = [name for name in order if surfaces[name].sectors]
+    failure = {
+        "convex": "too intricate for convex pieces",
+        "sectors": "its sectors are not convex",
+        "fine": f"too intricate for {MAX_FINE_PIECES} fine convex pieces",
+        "tetrahedra": "no tetrahedra",
     }[kind]
+    make: Callable[..., Any] = partial(cut_bodies, kind=kind)
+    seconds = CUT_SECONDS
+    if kind == "tetrahedra":
+        make, seconds = _mesh_bodies, TETRAHEDRA_SECONDS
     for name in order:
         try:
             made = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
@@ -165,21 +194,22 @@ def make_compliant(
         yield name, accepted, made[1]
 
 
-def _cut_finely(surface: ContactSurface, tolerance: float) -> tuple[list[Piece], float] | None:
-    return cut_bodies(surface, tolerance, fine=True)
-
-
-def cut_bodies(surface: ContactSurface, tolerance: float, *, fine: bool = False) -> tuple[list[Piece], float] | None:
+def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") -> tuple[list[Piece], float] | None:
     """Return convex pieces of all bodies and the measured distance of what they add from the surface [m].
 
-    The result is None if there are too many pieces or they deviate too much.
+    The result is None if there are too many pieces or they deviate too much. `kind` is one of `KINDS`, not tetrahedra.
     """
     manifold3d = import_extra("manifold3d")
+    cutters: dict[str, Callable[[Any], list[Any] | None]] = {
+        "convex": cut_into_convex_pieces,
+        "sectors": partial(cut_into_sectors, number=surface.sectors),
+        "fine": partial(cut_into_convex_pieces, max_pieces=MAX_FINE_PIECES, depth=1e3 * tolerance),
+    }
     pieces: list[Piece] = []
     deviation = 0.0
     for number, arrays in enumerate(surface.bodies):
         solid = to_manifold(*arrays)
-        cut = cut_into_convex_pieces(solid, MAX_FINE_PIECES, 1e3 * tolerance) if fine else cut_into_convex_pieces(solid)
+        cut = cutters[kind](solid)
         if cut is None:
             return None
         joint = manifold3d.Manifold.batch_boolean(cut, manifold3d.OpType.Add)

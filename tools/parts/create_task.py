@@ -18,8 +18,10 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.parts.assembly_check import (
+    MAX_FLANK_SLOPE,
     MAX_RESTING_OVERLAP,
     MAX_SHRINK,
+    MAX_WALL_SLOPE,
     InsertionMotion,
     check_target,
     compute_center_of_mass,
@@ -164,7 +166,7 @@ def create_task(
         log(f"{plug.name}: its surface is moved inwards by {1e3 * shrink:g} mm (--shrink)")
     check_target(*parts)
     path = plan_motion(*parts, turn * DEGREE, CLEAR, advance=abs(pitch * turn) / 360.0)
-    clearance = measure_side_clearance(*parts)
+    clearance = measure_side_clearance(*parts, MAX_FLANK_SLOPE if pitch else MAX_WALL_SLOPE)
     log(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     log(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
     tolerance = choose_tolerance(clearance)

@@ -185,7 +185,8 @@ class ScriptedSearch:
         """Construct the policy; `duration` returns the duration of the reference trajectory [s] at each observation."""
         self._file, self._duration = file, duration
         self._times, poses = file.motion.plan_search()
-        self._heights = poses[:, 2]
+        # A thread stops the plug above a command that pushes it.
+        self._heights = poses[:, 2] + (file.motion.push if file.motion.advance else 0.0)
         self._time, self._size, self._direction = np.inf, 3 if file.motion.search_turn else 2, 1.0
         self._action = np.zeros(self._size)
 

@@ -88,7 +88,7 @@ def test_pieces_that_abort_drake_are_left_out_or_refused():
 def test_pieces_report_what_they_fill():
     ring = manifold3d.CrossSection.circle(1.0, 16).translate((4.0, 0.0)).revolve(24)
     surface, tolerance = ContactSurface((to_arrays(ring),), 0, to_arrays(ring), 0.0, 1.0), 1e-4
-    made = cut_bodies(surface, tolerance, fine=True)
+    made = cut_bodies(surface, tolerance, "fine")
     assert made is not None
     pieces, deviation = made
     filled = manifold3d.Manifold.batch_boolean(
