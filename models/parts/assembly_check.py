@@ -104,8 +104,8 @@ def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, a
         )
     if advance and advance > rim - TOUCH:
         raise InputError(
-            f"the plug advances by {1e3 * advance:.3g} mm during --turn and must enter {1e3 * TOUCH:g} mm more than that, "
-            f"but enters only {1e3 * rim:.3g} mm: give a smaller --turn or --pitch"
+            f"the plug advances by {1e3 * advance:.3g} mm during --turn, but enters only {1e3 * rim:.3g} mm: it must "
+            f"enter {1e3 * TOUCH:g} mm more than it advances; give a smaller --turn or --pitch"
         )
     return InsertionMotion(travel=rim + clear, rim=rim, turn=turn, advance=advance)
 

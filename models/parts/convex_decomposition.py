@@ -67,8 +67,8 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
 def cut_into_sectors(solid: Any, number: int, max_pieces: int = MAX_PIECES) -> list[Any] | None:
     """Cut a solid by planes through the z axis into `number` sectors, at least 3, and each at a radius into hulls.
 
-    The radius is that with the smallest concave volume, the root of a thread. The faces of a thread are curved, and no
-    few planes of faces make it convex. Returns None if more than `max_pieces` are necessary. The hulls fill concavities.
+    The radius is that with the smallest concave volume, the root of a thread: the faces of a thread are curved, so that
+    cuts along them would be too many. The hulls fill concavities. Returns None if more than `max_pieces` are necessary.
     """
     pieces: list[Any] = []
     for angle in 2.0 * np.pi / number * np.arange(number):

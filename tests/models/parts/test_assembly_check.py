@@ -17,7 +17,7 @@ from guiderail.models.parts.mesh_file import Part, load_part
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
-from oracles.parts import PARTS
+from oracles.parts import PARTS, screw
 
 
 def load(name, folder):
@@ -45,6 +45,19 @@ def test_find_obstructions_finds_snaps_and_passes_turns(tmp_path):
         find_obstructions(plug, socket, plan_motion(plug, socket, np.deg2rad(turn)))[0] for turn in (40, 0)
     )
     assert turning[0] < 2e-6 < straight[0]
+
+
+def test_a_screw_passes_only_with_its_own_pitch_and_hand(tmp_path):
+    plug, socket = (load_part(path, "mm") for path in screw(pitch=8.0).write(tmp_path))
+    motion = plan_motion(plug, socket, -np.pi, advance=4e-3)
+    assert motion.pitch == pytest.approx(8e-3)
+    assert motion.path()[-1] == (0.0, 0.0)
+    assert (4e-3, -motion.turn) in motion.path()
+    assert find_obstructions(plug, socket, motion)[0][0] < 2e-6
+    for turn, advance in ((-np.pi, 0.0), (-np.pi, 3e-3), (np.pi, 4e-3)):
+        assert find_obstructions(plug, socket, plan_motion(plug, socket, turn, advance=advance))[0][0] > 1e-5
+    with pytest.raises(InputError, match="enters only 14 mm"):
+        plan_motion(plug, socket, -np.pi, advance=13.6e-3)
 
 
 def test_make_solids_refuses_faces_that_cross():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.parts.assembly_check import make_solids
-from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces
+from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces, cut_into_sectors
 from guiderail.models.parts.mesh_file import load_part
 from guiderail.models.parts.solids import SurfaceLocator, to_arrays
 
@@ -13,7 +13,7 @@ pytest.importorskip("manifold3d")
 
 from manifold3d import Manifold, OpType
 
-from oracles.parts import PARTS
+from oracles.parts import PARTS, screw
 
 
 def load_plug(name, folder):
@@ -36,6 +36,18 @@ def test_cut_returns_convex_pieces_that_make_up_the_plug(name, tmp_path):
 
 def test_cut_returns_none_when_pieces_exceed_the_limit(tmp_path):
     assert cut_into_convex_pieces(make_solids(load_plug("bayonet", tmp_path))[0], max_pieces=3) is None
+
+
+def test_sectors_of_a_screw_are_convex_and_close_to_its_surface(tmp_path):
+    plug, _ = (load_part(path, "mm") for path in screw().write(tmp_path))
+    [solid] = make_solids(plug)
+    pieces = cut_into_sectors(solid, 48)
+    assert max(piece.hull().volume() - piece.volume() for piece in pieces) < 1e-9 * solid.volume()
+    joint = Manifold.batch_boolean(pieces, OpType.Add)
+    assert (solid - joint).volume() < 1e-4 * solid.volume()
+    added = to_arrays(joint - solid)[0]
+    assert SurfaceLocator(*to_arrays(solid)).find_nearest(added)[1].max() < 0.06e-3  # the largest is at the shaft
+    assert cut_into_sectors(solid, 48, max_pieces=40) is None
 
 
 def test_cut_returns_none_when_a_faceted_bore_would_be_filled():

@@ -6,6 +6,7 @@ from guiderail.models.parts.demonstrator import (
     SPREAD,
     demonstrator_motions,
     plan_search,
+    plan_straight_insertion,
     socket_offsets,
     socket_turns,
 )
@@ -27,6 +28,18 @@ def test_the_variance_is_that_of_the_sockets_from_the_rim_down_to_the_target():
     assert deviations.min() > 0.5 * SPREAD / np.sqrt(2.0)  # an action reaches far at every time
     assert deviations.max() < 1.6 * SPREAD / np.sqrt(2.0)
     np.testing.assert_allclose(socket_offsets().mean(axis=0), 0.0, atol=1e-12)
+
+
+def test_a_screw_advances_while_it_turns():
+    """Otherwise the command goes straight down, and without an advance it only turns at the bottom."""
+    turn, push, advance = -np.pi, 4.0 * MM, 1.0 * MM
+    for plan, press in ((plan_straight_insertion, ()), (plan_search, (PRESS,))):
+        _, poses = plan(30.0 * MM, RIM, turn, push, *press, advance)
+        first = np.flatnonzero(poses[:, 3] == -turn)[-1]
+        np.testing.assert_allclose(poses[first : first + 2, 2], [advance - push, -push])
+        np.testing.assert_allclose(poses[first + 1 :, 3], 0.0)
+        plain = plan(30.0 * MM, RIM, turn, push, *press)[1]
+        assert np.isclose(plain[:, 2], -push).sum() > np.isclose(poses[:, 2], -push).sum()
 
 
 def test_motions_depend_on_the_seed_alone():

@@ -21,7 +21,7 @@ from guiderail.tools.parts.create_task import ask_unit, create_task
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
-from oracles.parts import PARTS
+from oracles.parts import PARTS, screw
 
 
 def call(*arguments, code=0):
@@ -322,6 +322,21 @@ def test_scripted_search_turns_a_blocked_plug_to_and_fro(turning):
     np.testing.assert_array_equal(search(observation), np.zeros(3))  # another episode
 
 
+def test_screw_is_inserted_by_its_turn(tmp_path, capsys):
+    from guiderail.diagrams.tasks.part.file import MotionNumbers, read_task_file
+
+    part = screw()
+    arguments = [*part.write(tmp_path), "--unit", "mm", "--hard-episodes", "0", "--out", tmp_path / "screw"]
+    call("create-task", *arguments, *part.options)
+    assert "10 of 10" in capsys.readouterr().out
+    file = read_task_file(tmp_path / "screw")
+    assert (file.motion.turn, file.motion.advance) == (pytest.approx(-180.0), pytest.approx(4e-3))
+    assert file.measured["inserted"]
+    assert file.measured["penetration_mm"] < 0.5 * file.measured["clearance_mm"]
+    with pytest.raises(ValueError, match="the advance is at least"):
+        MotionNumbers.model_validate({"travel": 0.02, "rim": 0.004, "turn": -180.0, "advance": 0.004})
+
+
 def test_unknown_turn_beyond_the_range_is_refused(tmp_path):
     for turn in (-1.0, 10.1, np.nan):
         with pytest.raises(InputError, match="--search-turn is from 0 to 10 degrees"):
@@ -407,6 +422,10 @@ def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
         (("--unit", "mm", "--center", "1e9,0,0"), "is not near the plug"),
         (("--unit", "mm", "--turn", "361"), "--turn is at most 360"),
         (("--unit", "mm", "--turn", "nan"), "--turn is at most 360"),
+        (("--unit", "mm", "--pitch", "2"), "give --turn, too"),
+        (("--unit", "mm", "--pitch", "nan", "--turn", "40"), "--pitch is at most 100 mm either way, not nan"),
+        (("--unit", "mm", "--pitch", "2", "--turn", "40"), "a right-handed screw (--pitch above 0) enters with --turn"),
+        (("--unit", "mm", "--pitch", "-99", "--turn", "60"), "give a smaller --turn or --pitch"),
         (("--unit", "mm", "--force-limit", "0"), "--force-limit is positive"),
         (("--unit", "mm", "--force-limit", "10001"), "--force-limit is positive"),
         (("--unit", "mm", "--out", tmp_path / ("n" * 300)), "check it"),
