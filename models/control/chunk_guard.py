@@ -51,7 +51,8 @@ class ChunkGuard:
         velocity: Velocity limits v (O,) [unit/s], positive.
         jerk: Jerk limits j (O,) [unit/s³], positive.
         period: T, control period [s], positive.
-        start: Output (O,) at rest inside the constraints, from which the motion starts; see `reset`.
+        start: Output (O,) at rest inside the constraints, from which the motion starts; see `reset` and
+            `reset_near`.
         mode: "projection" or "slowdown".
         tolerance: Distance from the path (O,) that a slowdown accepts [unit], positive; a tenth of v T by default.
 
@@ -100,6 +101,29 @@ class ChunkGuard:
         if start.shape != (outputs,) or not self.constraints.violation(start) <= TOLERANCE:
             raise InputError(f"a guard starts from {outputs} numbers inside the constraints, not {brief(start)}")
         self._past, self._plan = np.tile(start, (3, 1)), start[None]
+
+    def reset_near(self, measured: np.ndarray) -> None:
+        """Start again at rest at a measured output (O,), inside the constraints or one step outside of them.
+
+        The first command leads inside within the limits of velocity and jerk.
+
+        Raises:
+            InputError: If it has the wrong shape or is not finite, or one step within the limits does not lead inside.
+        """
+        measured, outputs = as_numbers(measured, "the measured start"), self.constraints.num_outputs
+        if measured.shape != (outputs,) or not np.isfinite(measured).all():
+            raise InputError(f"a measured start is {outputs} finite numbers, not {brief(measured)}")
+        inside = self.constraints.nearest(measured)
+        # A step d from rest to rest has the third differences d, -2 d and d.
+        reach, distance = np.minimum(self._step, 0.5 * self._jerk), np.abs(measured - inside)
+        if not (distance <= reach).all():
+            number = int(np.argmax(distance / reach))
+            raise InputError(
+                f"number {number} of the measured start is {distance[number]:.4g} outside of the bounds, and one step "
+                f"within the limits leads at most {reach[number]:.4g} inside: move the robot, or widen the bounds"
+            )
+        self.reset(inside)
+        self._past = np.tile(measured, (3, 1))
 
     def guard(self, chunk: np.ndarray, num_executed: int | None = None) -> GuardedChunk:
         """Return the chunk within the limits, and record its first `num_executed` steps as executed.

@@ -76,9 +76,28 @@ def test_actions_by_name_start_at_the_observed_position(guard):
     assert 0.1 < first["a.pos"] < 0.12
     step.reset()
     assert send(step, observed, observed) == pytest.approx(observed, abs=1e-4)
-    step.reset()
+
+
+@pytest.mark.parametrize("mode", ["projection", "slowdown"])
+@pytest.mark.parametrize("wanted", [-0.3, 0.0, 0.3])
+def test_first_commands_are_within_the_limits_when_the_start_is_outside(guard, mode, wanted):
+    step = make(guard, start=None, mode=mode)
+    for beyond in (1e-4, 0.001, 0.0024):
+        step.reset()
+        observed = {"a.pos": BOUND + beyond, "b.pos": 2.0}
+        sent = [send(step, {"a.pos": wanted, "b.pos": 2.0 + wanted}, observed) for _ in range(10)]
+        motion = np.array([[observed["a.pos"], 2.0]] * 3 + [list(one.values()) for one in sent])
+        assert np.abs(np.diff(motion, axis=0)).max() <= VELOCITY * PERIOD * (1 + 1e-9)
+        assert np.abs(np.diff(motion, n=3, axis=0)).max() <= JERK * PERIOD**3 * (1 + 1e-9)
+        assert motion[3:, 0].max() <= BOUND + 1e-9
+
+
+def test_start_is_refused_when_one_step_does_not_lead_inside(guard):
     outside = dict.fromkeys(NAMES, 0.3)
-    assert send(step, outside, outside)["a.pos"] <= BOUND
+    with pytest.raises(ValueError, match=r"number 0 of .* start is 0\.1 outside of the bounds.*move the robot"):
+        send(make(guard, start=None), outside, outside)
+    with pytest.raises(ValueError, match="finite"):
+        send(make(guard, start=None), outside, dict.fromkeys(NAMES, float("nan")))
 
 
 @pytest.mark.parametrize(

@@ -34,8 +34,8 @@ class ChunkGuardProcessorStep(ProcessorStep):
         jerk: Jerk limits [unit/s³].
         period: Control period [s], one over `--fps`.
         mode: "projection" or "slowdown".
-        start: Position at which an episode starts at rest; by default the position within the bounds that is nearest to
-            the observation in the first transition.
+        start: Position at which an episode starts at rest; by default the observation in the first transition. Then it
+            may be outside of the bounds as far as one step within the limits leads inside.
         names: Names of the numbers, for actions and observations by name.
     """
 
@@ -72,7 +72,7 @@ class ChunkGuardProcessorStep(ProcessorStep):
 
         Raises:
             ValueError: If the action has the wrong shape or names or is not finite, the start is unknown, or `start` is
-                outside of the bounds.
+                outside of the bounds, or the observation is farther outside than one step within the limits.
         """
         action = transition.get(TransitionKey.ACTION)
         by_name = isinstance(action, dict)
@@ -80,7 +80,7 @@ class ChunkGuardProcessorStep(ProcessorStep):
             raise ValueError(f"the guard would drop the numbers {unknown} of an action: give limits and names for them")
         values = self._of_names(action) if by_name else np.asarray(torch.as_tensor(action).detach().cpu(), dtype=float)
         if not self._is_started:
-            self._guard.reset(self._find_start(transition.get(TransitionKey.OBSERVATION)))
+            self._start_at(transition.get(TransitionKey.OBSERVATION))
             self._is_started = True
         size = len(self.velocity)
         is_alone = values.ndim == 1 or (values.ndim in (2, 3) and len(values) == 1)
@@ -107,12 +107,13 @@ class ChunkGuardProcessorStep(ProcessorStep):
             raise ValueError(f"the guard needs the numbers {missing or 'of an action by name: give names'}")
         return np.array([float(numbers[name]) for name in self.names])
 
-    def _find_start(self, observation: Any) -> np.ndarray:
+    def _start_at(self, observation: Any) -> None:
         if self.start is not None:
-            return np.array(self.start, float)
-        if not isinstance(observation, dict):
+            self._guard.reset(np.array(self.start, float))
+        elif isinstance(observation, dict):
+            self._guard.reset_near(self._of_names(observation))
+        else:
             raise ValueError("the guard needs the position at which the episode starts: give start")
-        return self._guard.constraints.nearest(self._of_names(observation))
 
     def reset(self) -> None:
         """Start an episode: the next action continues from the start at rest."""

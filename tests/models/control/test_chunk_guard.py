@@ -77,6 +77,22 @@ def test_guard_is_refused_when_an_argument_is_out_of_range():
     np.testing.assert_array_equal(*outputs)
 
 
+@pytest.mark.parametrize(("velocity", "reach"), [(VELOCITY, 0.5 * JERK * PERIOD**3), (1e-3 * VELOCITY, 2e-6)])
+def test_first_step_from_a_measured_start_is_within_the_limits(velocity, reach):
+    guard = ChunkGuard(LinearConstraints.box(-BOUND, BOUND), velocity, JERK, period=PERIOD, start=np.zeros(2))
+    start = BOUND + [np.min(reach) * (1 - 1e-9), 0.0]
+    guard.reset_near(start)
+    outputs = guard.guard(np.tile([0.2, -0.2], (STEPS, 1))).outputs
+    motion = np.concatenate([np.tile(start, (3, 1)), outputs])
+    assert (np.abs(np.diff(motion, axis=0)) <= velocity * PERIOD).all()
+    assert (np.abs(np.diff(motion, n=3, axis=0)) <= JERK * PERIOD**3 * (1 + 1e-9)).all()
+    assert (np.abs(outputs) <= BOUND + 1e-9).all()
+    guard.reset_near(start)
+    for wrong in (BOUND + [1.01 * np.min(reach), 0.0], np.full(2, np.nan), np.zeros(3)):
+        with pytest.raises(InputError, match="measured start"):
+            guard.reset_near(wrong)
+
+
 def test_constraint_on_two_outputs_holds_and_couples_only_them():
     slanted = LinearConstraints([[-1.0, -1.0, 0.0]], [-0.02])  # x + y <= 0.02
     limits = (np.full(3, 0.2), np.full(3, 100.0))
