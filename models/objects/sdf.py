@@ -9,6 +9,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from guiderail.models.common.errors import InputError
+
 
 def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
     """Return points (N, 3) from cylindrical coordinates about z."""
@@ -52,11 +54,18 @@ class TriangleMesh:
 
     @staticmethod
     def from_obj(path: Path) -> "TriangleMesh":
-        """Read the vertices and triangles of an OBJ file, such as one with the text of `to_obj`."""
+        """Read the vertices and triangles of an OBJ file, such as one with the text of `to_obj`.
+
+        Raises:
+            InputError: If a face has a number of no vertex, or one that is relative to the last vertex.
+        """
         lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
         vertices = [line[1:4] for line in lines if line[:1] == ["v"]]
         corners = [[corner.split("/")[0] for corner in line[1:]] for line in lines if line[:1] == ["f"]]
-        return TriangleMesh(np.array(vertices, dtype=float), np.array(corners, dtype=int) - 1)
+        triangles = np.array(corners, dtype=int)
+        if ((triangles < 1) | (triangles > len(vertices))).any():
+            raise InputError(f"a face of {path} has a vertex outside 1 … {len(vertices)}: number them from the first")
+        return TriangleMesh(np.array(vertices, dtype=float), triangles - 1)
 
     def normals(self) -> np.ndarray:
         """Return the unit normals (T, 3) of the triangles."""

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import sdf as bnc_sdf
 from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions
@@ -13,6 +14,7 @@ from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.models.objects.grid_clamp import sdf as grid_clamp_sdf
 from guiderail.models.objects.grid_clamp.geometry import FOLDER as GRID_CLAMP_FOLDER
 from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions
+from guiderail.models.objects.sdf import TriangleMesh
 
 
 def vertices(path):
@@ -67,3 +69,11 @@ def test_generated_clamp_and_table_have_the_given_dimensions():
     assert clearance + dimensions.hole_chamfer + dimensions.peg_chamfer == pytest.approx(0.6 * MM)
     assert "<drake:mu_static>0.3<" in (folder / "grid_table.sdf").read_text()
     assert FRICTION != 0.3
+
+
+@pytest.mark.parametrize("face", ["f -1 -2 -3", "f 0 1 2", "f 1/1 2/2 4/4"])
+def test_mesh_is_refused_when_a_face_has_no_such_vertex(face, tmp_path):
+    path = tmp_path / "part.obj"
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n{face}\n")
+    with pytest.raises(InputError, match=r"part\.obj has a vertex outside 1 … 3"):
+        TriangleMesh.from_obj(path)
