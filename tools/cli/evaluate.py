@@ -67,10 +67,10 @@ def evaluate(
     name = cli.find_task(subject, imports)[0]  # first, because an import may register the station
     if cli.is_hardware(environment.get("station")):
         given = environment.keys() - {"station", "robot", "robot_url", "driver"} or task or baselines or save
-        if given or resample_offsets or seed != SEED:
+        if given or resample_offsets or seed != SEED or signal != "commanded" or processes is not None or trust_policy:
             raise InputError(
                 "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "
-                "--save, --seed and --resample-offsets out"
+                "--save, --signal, --processes, --trust-policy, --seed and --resample-offsets out"
             )
         from guiderail.tools.evaluation.baselines import make_baseline
         from guiderail.tools.hardware.evaluate import evaluate_on_robot

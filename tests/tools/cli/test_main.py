@@ -68,6 +68,10 @@ def trained(bead_run):
         (["evaluate", "new", "--sim"], "give --station hardware too"),
         (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --env"),
         (["evaluate", "new", "--station", "hardware", "--sim", "--seed", "7"], "--seed and --resample-offsets out"),
+        *(
+            (["evaluate", "new", "--station", "hardware", "--sim", *words], f"{words[0]}, ")
+            for words in (["--signal", "measured"], ["--processes", "2"], ["--trust-policy"])
+        ),
         (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
         (["evaluate", "Bead", "--policy", "scripted"], "Bead has no policy 'scripted'"),
         (["evaluate", "Bead"], "Bead is a task: name the policy that acts in it"),
