@@ -81,10 +81,13 @@ class Evaluation(Mapping[str, Any]):
             verdict = "better than" if p < SIGNIFICANT else "not shown to be better than"
             text += f", {verdict} the best baseline, {self._name(baseline)} with {successes} (p = {p:.2g})"
         violation = self.statistics.get("max_commanded_violation")
-        if violation is not None and violation == violation:
-            is_within = violation <= TOLERANCE
-            text += "; every command satisfied the constraints" * is_within
-            text += f"; the largest constraint violation of a command was {violation:.2g} m or rad" * (not is_within)
+        if violation is not None:
+            if violation <= TOLERANCE:
+                text += "; every command satisfied the constraints"
+            elif violation > TOLERANCE:
+                text += f"; the largest constraint violation of a command was {violation:.2g} m or rad"
+            else:
+                text += "; the largest constraint violation of a command is unknown, because it is not a number"
         return text + "."
 
     def __str__(self) -> str:

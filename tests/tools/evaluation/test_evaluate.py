@@ -208,6 +208,12 @@ def test_sentence_names_the_best_baseline():
     assert "was 0.002 m or rad." in sentence
 
 
+def test_sentence_says_that_a_violation_is_not_a_number():
+    statistics = {"success_low": 0.7, "success_high": 1.0, "max_commanded_violation": float("nan")}
+    sentence = Evaluation(statistics, {"policy": won(1, 1)}).sentence
+    assert sentence.endswith("; the largest constraint violation of a command is unknown, because it is not a number.")
+
+
 @pytest.mark.parametrize("other", ["residual", "kgrl", "none"])
 def test_another_guidance_is_refused(other):
     refuse_guidance_change({"guidance": "skgrl"}, {"guidance": "skgrl"})
