@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.deviation import outputs_at, squared_distances
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
@@ -113,8 +114,12 @@ def fit(
         seed: As in `ReferenceTrajectory.from_demonstrations`.
 
     Raises:
-        InputError: If there are fewer than three demonstrations, or they cannot be fitted.
+        InputError: If there are fewer than three demonstrations, they cannot be fitted, or the horizon is no number of
+            steps.
     """
+    if not is_whole(horizon, 0):
+        raise InputError(f"the horizon is a number of steps, not {brief(horizon)}")
+    horizon = int(horizon)
     if demonstrations.num_demonstrations < 3:
         raise InputError(
             f"cross-validation needs at least three demonstrations, and there are {demonstrations.num_demonstrations}: "

@@ -10,7 +10,8 @@ linear, and two numbers that describe a gain follow from it exactly, for the act
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.reference import ReferenceTrajectory
 
@@ -66,7 +67,8 @@ def rms_gains(
         outputs: Indices or mask of the explored outputs, all by default; the others get a gain of zero.
 
     Raises:
-        InputError: As `authority_gains`, or if no gains reach κ in all outputs because of their correlations.
+        InputError: As `authority_gains`, if `action_repeat` is out of range, or if no gains reach κ in all outputs
+            because of their correlations.
     """
     _check_action_scale(action_scale)
     explored = np.flatnonzero(_explored_mask(primitive, outputs))
@@ -136,8 +138,9 @@ def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
 
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
     """Compute the mean square displacement (O, O) of output i by uniform white actions in output j, with gain 1."""
-    if int(action_repeat) != action_repeat or action_repeat < 1:
-        raise InputError(f"action_repeat is a number of control steps, at least 1, not {action_repeat}")
+    if not is_whole(action_repeat, 1):
+        raise InputError(f"action_repeat is a number of control steps, at least 1, not {brief(action_repeat)}")
+    action_repeat = int(action_repeat)
     steps, outputs = primitive.num_steps, primitive.num_outputs
     num_actions = -(-steps // action_repeat)
     pulses = np.repeat(np.eye(num_actions), action_repeat, axis=0)[:steps]

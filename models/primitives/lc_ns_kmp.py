@@ -16,7 +16,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
@@ -84,8 +84,8 @@ class LcNsKmp:
                 raise InputError(f"{name} must be finite and not negative, not {value}")
         if not lambda_ + beta > 0:
             raise InputError("lambda_ + beta must be positive: without any regularization problem 4.5 has no solution")
-        if int(horizon) != horizon or horizon < 0 or int(history) != history or history < 0:
-            raise InputError(f"horizon and history are numbers of steps, not {horizon} and {history}")
+        if not (is_whole(horizon, 0) and is_whole(history, 0)):
+            raise InputError(f"horizon and history are numbers of steps, not {brief(horizon)} and {brief(history)}")
         if history and not (np.isfinite(history_variance) and history_variance > 0):
             raise InputError(f"history_variance must be positive, not {history_variance}")
         constraints = constraints if constraints is not None else LinearConstraints.none(reference.num_outputs)

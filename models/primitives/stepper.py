@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
@@ -165,7 +165,7 @@ class StateProgress:
     def __post_init__(self) -> None:
         if len(self.tolerance) != 2 or not all(0.0 < one < np.inf for one in self.tolerance):
             raise InputError(f"the tolerance of progress is two positive numbers, not {brief(self.tolerance)}")
-        if int(self.max_lag) != self.max_lag or self.max_lag < 0:
+        if not is_whole(self.max_lag, 0):
             raise InputError(f"the largest lag of progress is a number of steps from 0, not {brief(self.max_lag)}")
 
     def next_step(self, step: int, clock: int, command: np.ndarray, pose: np.ndarray) -> int:

@@ -39,7 +39,12 @@ def test_angles_of_a_pose_have_a_tolerance_of_their_own(angle, waits):
 
 @pytest.mark.parametrize(
     ("tolerance", "max_lag", "match"),
-    [((0.0, 0.1), 3, "tolerance"), ((0.1, np.nan), 3, "tolerance"), ((0.1,), 3, "tolerance"), ((1.0, 1.0), -1, "lag")],
+    [
+        ((0.0, 0.1), 3, "tolerance"),
+        ((0.1, np.nan), 3, "tolerance"),
+        ((0.1,), 3, "tolerance"),
+        *(((1.0, 1.0), wrong, "lag") for wrong in (-1, 2.5, np.nan, np.inf)),
+    ],
 )
 def test_rule_raises_when_an_argument_is_out_of_range(tolerance, max_lag, match):
     with pytest.raises(InputError, match=match):

@@ -154,6 +154,9 @@ def test_fit_refuses_too_few_demonstrations():
     t = np.linspace(0, 1, 50)
     with pytest.raises(InputError, match="at least three"):
         fit(Demonstrations(t, [np.sin(t)[:, None], np.cos(t)[:, None]]))
+    for wrong in (-1, 2.5, np.nan, np.inf):
+        with pytest.raises(InputError, match="the horizon is a number of steps"):
+            fit(correlated(count=4, steps=80), horizon=wrong)
     with pytest.raises(InputError, match="at least 12 steps"):
         fit(Demonstrations(t[:5], [t[:5, None], 2 * t[:5, None], 3 * t[:5, None]]))
 

@@ -65,8 +65,10 @@ def test_gains_refuse_invalid_arguments(primitive):
         authority_gains(primitive, action_scale=0)
     with pytest.raises(InputError, match="action_dims"):
         rms_gains(primitive, outputs=[2])
-    with pytest.raises(InputError, match="action_repeat"):
-        rms_gains(primitive, action_repeat=0)
+    for wrong in (0, 1.5, np.nan, np.inf):
+        with pytest.raises(InputError, match="action_repeat"):
+            rms_gains(primitive, action_repeat=wrong)
+    np.testing.assert_array_equal(rms_gains(primitive, action_repeat=2.0), rms_gains(primitive, action_repeat=2))
     deaf = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
     with pytest.raises(InputError, match="beta"):
         authority_gains(deaf)

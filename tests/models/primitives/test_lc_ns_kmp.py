@@ -413,6 +413,7 @@ def test_predict_does_not_leak_memory():
         ({"constraints": LinearConstraints(np.zeros((7, 1, 2)), np.zeros((7, 1)))}, "7 steps"),
         ({"solver": "magic"}, "magic"),
         ({"history": -1}, "numbers of steps"),
+        *(({name: wrong}, "numbers of steps") for name in ("horizon", "history") for wrong in (np.nan, np.inf)),
     ],
 )
 def test_constructor_refuses_invalid_arguments(changes, names):
