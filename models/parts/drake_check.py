@@ -80,6 +80,8 @@ def _rounded(piece: Piece) -> list[Piece]:
 
 def _refused(pieces: Sequence[Piece]) -> set[int]:
     """Return the indices of the pieces that Drake refuses; an abort only ends the child process of the check."""
+    if not pieces:
+        return set()
     try:
         return set(run_isolated(_try_each, pieces, cpu_seconds=_SECONDS))
     except IsolatedError:

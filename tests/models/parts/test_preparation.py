@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from guiderail.models.common.isolation import IsolatedError
 from guiderail.models.parts.assembly_check import make_solids, measure_side_clearance, plan_motion
 from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import load_part
@@ -83,6 +84,16 @@ def test_pieces_that_abort_drake_are_left_out_or_refused():
     assert accepted is not None
     assert accepted[0] is good
     assert accepted_pieces([Piece(0, ".vtk", cube, np.array([[0, 1, 2, 2]]))]) is None
+
+
+def test_no_pieces_are_accepted_without_a_check(monkeypatch):
+    def fail(*_, **__):
+        raise IsolatedError("it was killed")
+
+    monkeypatch.setattr("guiderail.models.parts.drake_check.run_isolated", fail)
+    assert accepted_pieces([]) == []
+    cube, _ = to_arrays(manifold3d.Manifold.cube((10.0, 10.0, 10.0)))
+    assert accepted_pieces([Piece(0, ".vtk", cube, np.array([[0, 1, 2, 4]]))] * 3) is None
 
 
 def test_pieces_report_what_they_fill():
