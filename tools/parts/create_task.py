@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.tasks.options import COLLISION_FORCE
-from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import DEGREE, MM
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.parts.assembly_check import (
     MAX_FLANK_SLOPE,
@@ -245,8 +246,9 @@ def _check_arguments(
     hard_episodes: int,
 ) -> None:
     """Raise InputError for arguments that would otherwise be refused only after minutes."""
-    if not np.isfinite(plug_pose).all():
-        raise InputError(f"--plug-pose is finite, not {list(plug_pose)}")
+    pose = as_numbers(plug_pose, "--plug-pose")
+    if pose.shape != (POSE_SIZE,) or not np.isfinite(pose).all():
+        raise InputError(f"--plug-pose is {POSE_SIZE} finite numbers, not {brief(plug_pose)}")
     if not abs(turn) <= MAX_TURN:
         raise InputError(f"--turn is at most {MAX_TURN:g} degrees either way, not {turn:g}")
     if not abs(pitch) <= MAX_PITCH:

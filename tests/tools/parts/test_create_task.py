@@ -343,6 +343,12 @@ def test_unknown_turn_beyond_the_range_is_refused(tmp_path):
             create_task(tmp_path / "a.stl", tmp_path / "b.stl", tmp_path / "peg", unit="mm", search_turn=turn)
 
 
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 1.0), (0.0,) * 7, (np.nan,) * 6, ()])
+def test_plug_pose_is_refused_when_it_is_not_six_numbers(pose, tmp_path):
+    with pytest.raises(InputError, match="--plug-pose is 6 finite numbers"):
+        create_task(tmp_path / "a.stl", tmp_path / "b.stl", tmp_path / "peg", unit="mm", plug_pose=pose)
+
+
 def test_options_of_a_created_task_are_listed(folder, capsys):
     call("list", folder)
     assert "offset_range" in capsys.readouterr().out
