@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from html import escape
 from itertools import cycle
 from typing import Any
 
@@ -99,4 +100,4 @@ def _svg(figure: Any, description: str) -> str:
     figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     text = content.getvalue()
     text = text[text.index("<svg") :]
-    return text.replace("<svg ", f'<svg role="img" aria-label="{description}" ', 1)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)

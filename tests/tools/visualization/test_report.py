@@ -4,6 +4,7 @@ import shlex
 import shutil
 from dataclasses import replace
 from functools import partial
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,8 @@ from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.curves import plot_run
 from guiderail.tools.visualization.report import write_report
 from guiderail.tools.visualization.report_data import command, gather
+from guiderail.tools.visualization.report_figures import _svg
+from guiderail.tools.visualization.style import new_figure
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
 
@@ -152,6 +155,12 @@ def test_report_leaves_out_the_figure_of_a_missing_column(studied, tmp_path):
         plot_run(run)
     table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # a column of words, as a robot's run has
     assert plot_run(run).is_file()
+
+
+def test_description_of_a_figure_is_escaped():
+    figure, _ = new_figure(1, 1, (1.0, 1.0))
+    element = ElementTree.fromstring(_svg(figure, 'success of "my" <task> & more'))
+    assert element.attrib["aria-label"] == 'success of "my" <task> & more'
 
 
 def test_safety_is_counted_in_control_steps_with_a_step_log(tmp_path):
