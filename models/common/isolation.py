@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import resource
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ _WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # limit of wall time: multiple of the lim
 
 
 class IsolatedError(Exception):
-    """Exception, abort or exceeded time limit of an isolated function; the message gives the reason."""
+    """Exception, abort, kill or exceeded limit of an isolated function; the message gives the reason."""
 
 
 def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int, max_bytes: int | None = None) -> Any:
@@ -26,11 +27,12 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
         max_bytes: Limit of the memory that the function allocates [bytes]; default: none.
 
     Raises:
-        IsolatedError: If the function raised, or its process aborted or exceeded a limit.
+        IsolatedError: If the function raised, or its process aborted, was killed or exceeded a limit.
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_child, args=(sender, function, arguments, cpu_seconds, max_bytes))
+    seconds_before = _children_seconds()
     process.start()
     sender.close()
     try:
@@ -39,8 +41,13 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
         is_result, value = receiver.recv()
     except EOFError:
         process.join()
-        if process.exitcode in (-24, -9):  # SIGXCPU, SIGKILL
+        # A library may ignore SIGXCPU; the kernel then sends SIGKILL, as it does if the machine's memory is exhausted.
+        is_killed = process.exitcode == -signal.SIGKILL
+        is_late = is_killed and _children_seconds() - seconds_before > cpu_seconds
+        if process.exitcode == -signal.SIGXCPU or is_late:
             raise IsolatedError(f"it took more than {cpu_seconds} s of CPU time") from None
+        if is_killed:
+            raise IsolatedError("its process was killed, maybe for lack of memory") from None
         raise IsolatedError(f"the library aborted (exit status {process.exitcode})") from None
     finally:
         process.kill()
@@ -49,6 +56,12 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     if not is_result:
         raise IsolatedError(value)
     return value
+
+
+def _children_seconds() -> float:
+    """Return the CPU time of all finished child processes [s]."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _child(

@@ -1,6 +1,7 @@
 """An isolated function returns its result, or an error with the reason."""
 
 import os
+import signal
 
 import pytest
 
@@ -16,13 +17,28 @@ def spin():
         pass
 
 
+def spin_on():
+    signal.signal(signal.SIGXCPU, signal.SIG_IGN)
+    spin()
+
+
+def kill():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def test_run_isolated_returns_the_result():
     assert run_isolated(lambda a, b: a + b, [1], [2], cpu_seconds=5) == [1, 2]
 
 
 @pytest.mark.parametrize(
     ("function", "words"),
-    [(fail, "ValueError: no volume"), (os.abort, "aborted"), (spin, "more than 1 s of CPU time")],
+    [
+        (fail, "ValueError: no volume"),
+        (os.abort, "aborted"),
+        (spin, "more than 1 s of CPU time"),
+        (spin_on, "more than 1 s of CPU time"),
+        (kill, "was killed, maybe for lack of memory"),
+    ],
 )
 def test_run_isolated_gives_the_reason_when_a_function_fails(function, words):
     with pytest.raises(IsolatedError, match=words):
