@@ -106,16 +106,18 @@ def run_training(
         if not resume:
             folder.refuse_existing()
         is_new_folder = not folder.path.exists()
-        stack.callback(lambda: learner.close())
-        stack.callback(learning_log.close)
+        closed_first = stack.enter_context(ExitStack())
+        closed_first.callback(lambda: learner.close())
+        closed_first.callback(learning_log.close)
         callbacks = None
         if sb3_callbacks is not None:
             from guiderail.tools.learning.sb3_callbacks import Sb3Callbacks
 
             if config.learner.pipelined or config.learner.num_envs:
                 raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
-            callbacks = stack.enter_context(closing(Sb3Callbacks(sb3_callbacks, learner)))
+            callbacks = closed_first.enter_context(closing(Sb3Callbacks(sb3_callbacks, learner)))
         stack.enter_context(folder.locked())
+        stack.enter_context(closed_first.pop_all())  # the lock is released last, as all of these write into the folder
         if config.learner.pipelined:
             from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 

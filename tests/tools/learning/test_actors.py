@@ -9,7 +9,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.actors import ParallelLearner
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import LOCK, RunFolder
 from guiderail.tools.learning.trainer import run_training
 from oracles.same_runs import differences
 
@@ -48,6 +48,20 @@ def test_run_with_actors_resumes_bit_for_bit(num_envs, parallel_config, tmp_path
         run_training(stopped, config, report=stop)
     run_training(stopped, config, resume=True)
     assert differences(whole.path, stopped.path) == []
+
+
+def test_lock_is_released_after_the_actors_end(parallel_config, tmp_path, monkeypatch):
+    folder, close, were_locked = RunFolder(tmp_path / "run"), ParallelLearner.close, []
+
+    def close_and_look(self):
+        close(self)
+        were_locked.append((folder.path / LOCK).exists())
+
+    monkeypatch.setattr(ParallelLearner, "close", close_and_look)
+    with pytest.raises(Stop):
+        run_training(folder, parallel_config(2), report=stop)
+    assert were_locked == [True]
+    assert not (folder.path / LOCK).exists()
 
 
 def test_actors_act_with_weights_of_a_fixed_age(parallel_config, tmp_path):
