@@ -34,6 +34,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     Raises:
         InputError: If the folder is not such a dataset, or several features could be imported.
     """
+    import pyarrow as arrow
     import pyarrow.parquet as parquet
 
     try:
@@ -59,7 +60,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
         frames, episodes = (
             np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (arrow.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder} holds data that its {INFO} does not describe: {brief(str(error))}") from error
     names = _names(features[chosen], values.shape[1])
     assumptions += [

@@ -3,6 +3,8 @@
 import json
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 
 from guiderail.models.common.errors import InputError
@@ -38,6 +40,15 @@ def test_invalid_description_is_refused(changed, words, dataset):
 def test_dataset_with_too_many_rows_is_refused(dataset, monkeypatch):
     monkeypatch.setattr("guiderail.tools.datasets.formats.lerobot.MAX_LINES", len(CLOCK) - 1)
     with pytest.raises(InputError, match=f"more than {len(CLOCK) - 1} rows"):
+        read_lerobot(dataset, "action")
+
+
+def test_data_that_pyarrow_cannot_read_is_refused(dataset, monkeypatch):
+    def fail(*_, **__):
+        raise pyarrow.ArrowNotImplementedError("Support for codec 'lzo' not built")
+
+    monkeypatch.setattr(pyarrow.parquet, "read_table", fail)
+    with pytest.raises(InputError, match=r"holds data that its .*info\.json does not describe: .*lzo"):
         read_lerobot(dataset, "action")
 
 
