@@ -139,6 +139,8 @@ def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
     Messages of other joints are refused instead of skipped, because any device may have sent the first message.
     """
     expected = list(messages[0].name)
+    if len(set(expected)) < len(expected):
+        raise InputError(f"message 0 {where} is of {', '.join(expected)}, and one name is there twice: rename a joint")
     rows = []
     for number, message in enumerate(messages):
         names = list(message.name)

@@ -76,6 +76,12 @@ def test_messages_of_other_joints_are_refused(other, words, tmp_path):
         read_bags(bag, None, None)
 
 
+def test_joints_of_one_name_are_refused(tmp_path):
+    bag = write(tmp_path / "bag", JOINTS, joints, [("aba", (1, 2, 3))] * 2)
+    with pytest.raises(InputError, match=r"message 0 on /it of .* is of a, b, a, and one name is there twice"):
+        read_bags(bag, None, None)
+
+
 @pytest.mark.parametrize("wrong", [0.0, 0.5, np.nan])
 def test_bag_quaternion_of_wrong_length_is_refused(wrong, tmp_path):
     bag = write(tmp_path / "bag", POSE, pose, [1.0, wrong, 1.0])
