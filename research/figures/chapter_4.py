@@ -97,13 +97,13 @@ def figure_4_2(out: Path) -> dict[str, Any]:
     agreement = float(np.corrcoef(explored, np.sqrt((reference.standard_deviations**2).mean(1)))[0, 1])
     return {
         **save_results(out, "figure_4_2", figure, rows),
-        "max_commanded_violation": max(row["max_commanded_violation"] for row in rows),
+        "max_commanded_violation": float(np.max([row["max_commanded_violation"] for row in rows])),
         "exploration_follows_the_demonstrated_spread": agreement,
     }
 
 
 def _violation(primitive: LcNsKmp, path: np.ndarray) -> float:
-    return max(primitive.constraints.violation(point) for point in path)
+    return float(np.max([primitive.constraints.violation(point) for point in path]))  # NaN if one is NaN
 
 
 def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:

@@ -56,7 +56,7 @@ def add_step(row: Row, info: dict[str, Any]) -> Row:
     row = row or {"success": False, "violation": -np.inf, "force": 0.0, "fallbacks": 0, "decisions": 0}
     return {
         "success": row["success"] or bool(info["is_success"]),
-        "violation": max(row["violation"], float(info["constraint_violation"])),
+        "violation": float(np.maximum(row["violation"], info["constraint_violation"])),  # NaN if one is NaN
         "force": max(row["force"], float(info.get("peak_force", 0.0))),
         "fallbacks": row["fallbacks"] + int(info["fallback"]),
         "decisions": row["decisions"] + 1,
@@ -76,8 +76,8 @@ def summarize(rows: list[Row]) -> dict[str, Any]:
         "episodes": len(rows),
         "successes": sum(row["success"] for row in rows),
         "by_side": [[sum(side), len(side)] for side in sides],
-        "violated_episodes": sum(row["violation"] > TOLERANCE for row in rows),
-        "max_violation": max(row["violation"] for row in rows),
+        "violated_episodes": sum(not row["violation"] <= TOLERANCE for row in rows),  # NaN counts as a violation
+        "max_violation": float(np.max([row["violation"] for row in rows])),
         "fallbacks": sum(row["fallbacks"] for row in rows),
         "median_force": float(np.median([row["force"] for row in rows])),
         "max_force": max(row["force"] for row in rows),

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy import stats
 
 COLUMNS = (
@@ -25,10 +26,11 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
             interval = stats.binomtest(won, episodes).proportion_ci(method="wilson")
             left, right = (side[0] / max(side[1], 1) for side in held_out["by_side"])
             method = result["method"] if name == "learned" else f"{result['method']}: {name}"
+            worst = float(np.max([0.0, *(one["max_violation"] for one in of)]))  # NaN if one is NaN
             values = (
                 result["task"], method, result["seed"], len(result.get("curve", [])), episodes, won / episodes,
                 round(interval.low, 3), round(interval.high, 3), left, right,
-                sum(one["violated_episodes"] for one in of), max(0.0, *(one["max_violation"] for one in of)),
+                sum(one["violated_episodes"] for one in of), worst,
                 round(max(one["max_force"] for one in of), 1), round(result["cpu_s"]),
             )  # fmt: skip
             rows.append(dict(zip(COLUMNS, values, strict=True)))

@@ -152,7 +152,8 @@ class RepeatedAction(gymnasium.Wrapper):
             observation, reward, terminated, truncated, info = self.env.step(action)
             total += reward
             pose = self._pose(self.env, observation)
-            worst = max(worst, min(s.constraints.violation(pose - s.frame(self.env, None).p) for s in self._segments))
+            violations = [s.constraints.violation(pose - s.frame(self.env, None).p) for s in self._segments]
+            worst = float(np.maximum(worst, np.min(violations)))  # NaN if one is NaN
             if terminated or truncated:
                 break
         info = {**info, "constraint_violation": worst, "fallback": 0, "segment": ""}

@@ -1,22 +1,32 @@
 """The figures of the thesis."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.models.policy import FORMAT, Policy
+from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job
 from guiderail.tools.tables import read_table
 from research.figures import FIGURES, find_figure, reproduce
 from research.figures.chapter_3 import METHODS
-from research.figures.chapter_4 import MOVED_ELSEWHERE
+from research.figures.chapter_4 import MOVED_ELSEWHERE, _violation
 from research.figures.thesis import TABLE_3_2, TABLE_4_1, THESIS
 from research.studies import study_path
 
 TABLES = {"table 3.2": TABLE_3_2, "table 4.1": TABLE_4_1}
+
+
+def test_violation_of_a_path_with_nan_is_nan():
+    primitive = SimpleNamespace(constraints=LinearConstraints.box([-1.0, -1.0], [1.0, 1.0]))
+    path = np.zeros((3, 2))
+    assert _violation(primitive, path) == -1.0
+    path[1] = np.nan
+    assert np.isnan(_violation(primitive, path))
 
 
 @pytest.mark.parametrize("figure", FIGURES)

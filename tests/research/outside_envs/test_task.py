@@ -94,6 +94,37 @@ def test_bare_environment_measures_distance_to_nearest_box(segments):
     assert env.unwrapped.steps == 10
 
 
+@pytest.mark.parametrize("when", [1, 2])
+def test_unknown_violation_of_the_bare_environment_is_not_dropped(when, segments):
+    env = TASK.make("none", 0, segments)
+    env.reset(seed=0)
+    pose = env._pose
+    env._pose = lambda inner, seen: pose(inner, seen) * (np.nan if inner.unwrapped.steps == when else 1.0)
+    *_, info = env.step(np.zeros(3))
+    assert np.isnan(info["constraint_violation"])
+
+
+@pytest.mark.parametrize("violations", [(np.nan, -0.1), (-0.1, np.nan)])
+def test_unknown_violation_counts_as_one(violations):
+    info = {"is_success": True, "fallback": 0, "side": 1.0}
+    row = {}
+    for violation in violations:
+        row = learn.add_step(row, {**info, "constraint_violation": violation})
+    summary = learn.summarize([row, learn.add_step({}, {**info, "constraint_violation": -0.1})])
+    assert summary["violated_episodes"] == 1
+    assert np.isnan(summary["max_violation"])
+
+
+def test_table_has_an_unknown_violation(tmp_path):
+    row = {
+        "episodes": 1, "successes": 1, "by_side": [[1, 1], [0, 0]], "violated_episodes": 1, "max_violation": np.nan,
+        "fallbacks": 0, "median_force": 1.0, "max_force": 20.0,
+    }  # fmt: skip
+    result = {"task": "peg", "method": "kgrl", "seed": 1, "held_out": {"learned": row}, "cpu_s": 1.0}
+    (tmp_path / "a.json").write_text(json.dumps(result))
+    assert np.isnan(read_rows(tmp_path)[0]["max_commanded_violation"])
+
+
 def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
     row = {
         "episodes": 10, "successes": 9, "by_side": [[5, 5], [4, 5]], "violated_episodes": 0, "max_violation": -0.1,
