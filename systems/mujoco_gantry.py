@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError, import_extra
+from guiderail.models.common.errors import InputError, brief, import_extra
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
@@ -176,7 +176,14 @@ class MujocoGantry(LeafSystem):
 
         `friction` and `modulus` are factors. For a modulus above 1 the step of the engine is divided by √modulus,
         rounded up.
+
+        Raises:
+            InputError: If a factor is not finite, the friction is negative, or the modulus is not positive.
         """
+        if not 0.0 <= friction < math.inf:
+            raise InputError(f"the factor of the friction is finite and not negative, not {brief(friction)}")
+        if not 0.0 < modulus < math.inf:
+            raise InputError(f"the factor of the contact's stiffness is finite and positive, not {brief(modulus)}")
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 
     def _at_rest(self, pose: np.ndarray) -> np.ndarray:

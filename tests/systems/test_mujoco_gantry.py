@@ -103,6 +103,20 @@ def test_step_is_nominal_when_the_modulus_is_at_most_one(station):
         np.testing.assert_array_equal(after[name], value)
 
 
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        *(((wrong, 1.0), "friction is finite and not negative") for wrong in (-0.1, np.nan, np.inf)),
+        *(((1.0, wrong), "stiffness is finite and positive") for wrong in (0.0, -1.0, np.nan, np.inf)),
+    ],
+)
+def test_factor_of_the_contact_is_refused_out_of_range(station, factors, words):
+    context = station.CreateDefaultContext()
+    with pytest.raises(InputError, match=words):
+        station.set_contact(context, *factors)
+    station.set_contact(context, 0.0, 1e-3)
+
+
 @pytest.mark.parametrize(("period", "constant"), [(PLANT_PERIOD * 1.0001, 0.0), (PLANT_PERIOD, -1.0), (0.0, 0.0)])
 def test_constructor_refuses_arguments_out_of_range(station, period, constant):
     plant = station.plant
