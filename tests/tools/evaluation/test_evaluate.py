@@ -104,7 +104,7 @@ def test_evaluate_takes_a_policy_without_a_run(bead_run, tmp_path):
     zero, function = (evaluate(act, "Bead", episodes=2) for act in ("zero", lambda observation: np.zeros(2)))
     assert zero["mean_return"] == function["mean_return"]
     assert list((tmp_path / "exported").rglob("*.csv")) == []
-    with pytest.raises(InputError, match="name it"):
+    with pytest.raises(InputError, match="name the task"):
         evaluate(lambda observation: np.zeros(2), episodes=2)
 
 
