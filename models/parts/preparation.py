@@ -199,7 +199,6 @@ def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") 
 
     The result is None if there are too many pieces or they deviate too much. `kind` is one of `KINDS`, not tetrahedra.
     """
-    manifold3d = import_extra("manifold3d")
     cutters: dict[str, Callable[[Any], list[Any] | None]] = {
         "convex": cut_into_convex_pieces,
         "sectors": partial(cut_into_sectors, number=surface.sectors),
@@ -212,16 +211,23 @@ def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") 
         cut = cutters[kind](solid)
         if cut is None:
             return None
-        joint = manifold3d.Manifold.batch_boolean(cut, manifold3d.OpType.Add)
-        added = to_arrays(joint - solid)  # the difference `solid - joint` would contain the seams between pieces
-        if len(added[0]):
-            if float(SurfaceLocator(*arrays).find_nearest(added[0])[1].max()) > 2.0 * tolerance:
-                return None
+        if (added := _added(cut, solid)) and float(
+            SurfaceLocator(*arrays).find_nearest(added[0])[1].max()
+        ) > 2.0 * tolerance:
+            return None
+        kept = [one for one in cut if 2.0 * one.volume() > THINNEST * one.surface_area()]
+        if added := _added(kept, solid):
             deviation = max(deviation, measure_distance(added, arrays))
-        pieces += [
-            Piece(number, ".obj", *to_arrays(one)) for one in cut if 2.0 * one.volume() > THINNEST * one.surface_area()
-        ]
+        pieces += [Piece(number, ".obj", *to_arrays(one)) for one in kept]
     return pieces, deviation
+
+
+def _added(pieces: Sequence[Any], solid: Any) -> Arrays | None:
+    """Return the surface of what pieces add to a solid; None if they add nothing."""
+    manifold3d = import_extra("manifold3d")
+    # The opposite difference would contain the seams between pieces.
+    added = to_arrays(manifold3d.Manifold.batch_boolean(list(pieces), manifold3d.OpType.Add) - solid)
+    return added if len(added[0]) else None
 
 
 def _mesh_bodies(surface: ContactSurface, tolerance: float) -> tuple[list[Piece], float]:
