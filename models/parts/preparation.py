@@ -211,12 +211,13 @@ def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") 
         cut = cutters[kind](solid)
         if cut is None:
             return None
-        if (added := _added(cut, solid)) and float(
-            SurfaceLocator(*arrays).find_nearest(added[0])[1].max()
-        ) > 2.0 * tolerance:
+        added = _added(cut, solid)
+        if added and float(SurfaceLocator(*arrays).find_nearest(added[0])[1].max()) > 2.0 * tolerance:
             return None
         kept = [one for one in cut if 2.0 * one.volume() > THINNEST * one.surface_area()]
-        if added := _added(kept, solid):
+        if len(kept) < len(cut):
+            added = _added(kept, solid)
+        if added:
             deviation = max(deviation, measure_distance(added, arrays))
         pieces += [Piece(number, ".obj", *to_arrays(one)) for one in kept]
     return pieces, deviation

@@ -224,13 +224,14 @@ def _describe_surfaces(
         f"{name} {sum(len(triangles) for _, triangles in part.bodies)} → {surface.num_triangles}"
         for name, part, surface in zip(("plug", "socket"), parts, surfaces, strict=True)
     )
-    return f"triangles: {counts}; {_describe_deviation(deviation, 1e3 * clearance)}"
+    return f"triangles: {counts}; {_describe_deviation(1e3 * deviation, 1e3 * clearance)}"
 
 
-def _describe_deviation(deviation: float, clearance_mm: float | None) -> str:
-    text = f"deviation from the drawing at most {1e3 * deviation:.4f} mm"
-    if clearance_mm is not None and np.isfinite(clearance_mm) and deviation > 1e-4 * clearance_mm:
-        text += f", which is more than a tenth of the clearance ({0.1 * clearance_mm:.4f} mm)"
+def _describe_deviation(deviation: float, clearance: float | None) -> str:
+    """Return the deviation as text, compared with the clearance if there is one, both in millimeters."""
+    text = f"deviation from the drawing at most {deviation:.4f} mm"
+    if clearance is not None and np.isfinite(clearance) and deviation > 0.1 * clearance:
+        text += f", which is more than a tenth of the clearance ({0.1 * clearance:.4f} mm)"
     return text
 
 
@@ -321,7 +322,7 @@ def _measure(
     log(f"misaligned by 1.5 mm: {'blocked (as required)' if is_blocked else 'seated, but must be blocked'}")
     deviation = prepared["deviation_mm"] + round(1e3 * contact.deviation, 4)
     if contact.deviation:
-        total = _describe_deviation(1e-3 * deviation, prepared["clearance_mm"])
+        total = _describe_deviation(deviation, prepared["clearance_mm"])
         log(f"{contact.compliant}: with its pieces, {total}")
     penetration, clearance = 1e3 * max(trial.penetration for trial in trials), prepared["clearance_mm"]
     if clearance is not None and penetration > 0.5 * clearance:
