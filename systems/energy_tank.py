@@ -12,7 +12,7 @@ from guiderail.models.control.wrench import (
     MAX_WRENCH_SIZE,
     POSE_ORDER,
     WrenchBound,
-    admissible_share,
+    admissible_change,
     check_spring_damper,
     spring_energy,
 )
@@ -122,18 +122,16 @@ class EnergyTank(LeafSystem):
             return _Admitted(reference, limits, float(content[0]))
         moved = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
         dissipated = float(self._damping @ moved**2) / self._period
-        energy = min(self._capacity, float(content[0]) + dissipated)
         error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)
-        stored = spring_energy(K, last_limits, error)
-        released = stored - spring_energy(K, limits, error)
-        share = admissible_share(K, (limits, requested), (error, desired_error), energy + released)
+        # Energy of tank and spring together.
+        energy = min(self._capacity, float(content[0]) + dissipated) + spring_energy(K, last_limits, error)
+        share, stored = admissible_change(K, (limits, requested), (error, desired_error), energy)
         if share == 1.0:
             next_reference, admitted = desired, requested
         else:
             next_reference = pose + error + share * (desired_error - error)
             admitted = limits + share * (requested - limits)
-        added = spring_energy(K, admitted, pose_difference(next_reference, pose)) - stored
-        return _Admitted(next_reference, admitted, min(self._capacity, max(energy - added, 0.0)))
+        return _Admitted(next_reference, admitted, min(self._capacity, max(energy - stored, 0.0)))
 
     def _reference_pose(self, context: Context) -> np.ndarray:
         desired = self._desired_pose_port.Eval(context)

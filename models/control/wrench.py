@@ -248,33 +248,33 @@ def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) 
     return energy
 
 
-def admissible_share(
+def admissible_change(
     stiffness: np.ndarray,
     limits: tuple[np.ndarray, np.ndarray],
     errors: tuple[np.ndarray, np.ndarray],
     energy: float,
-) -> float:
-    """Return the largest share from 0 to 1 of a change of reference and limits that adds at most `energy` [J].
+) -> tuple[float, float]:
+    """Return the largest share from 0 to 1 of a change of reference and limits, and the springs' energy after it [J].
 
-    The energy is convex in the reference, so the share is found by bisection. The share is 1 if the whole change is
-    admissible. No limit may decrease: the caller applies a lower limit at once, which removes energy.
+    The energy after the change is at most `energy`, if the energy before it is. It is convex in the reference, so the
+    share is found by bisection. The share is 1 if the whole change is admissible. No limit may decrease: the caller
+    applies a lower limit at once, which removes energy.
 
     Args:
         stiffness: Stiffness (n,).
         limits: Limits (n,) before and after the change.
         errors: Reference minus measured pose (n,) before and after the change.
-        energy: Energy that may be added [J].
+        energy: Largest energy of the springs [J].
     """
-    before = spring_energy(stiffness, limits[0], errors[0])
 
-    def added(share: float) -> float:
-        changed = [first + share * (second - first) for first, second in (limits, errors)]
-        return spring_energy(stiffness, changed[0], changed[1]) - before
+    def stored(share: float) -> float:
+        return spring_energy(stiffness, *(first + share * (second - first) for first, second in (limits, errors)))
 
-    if added(1.0) <= energy:
-        return 1.0
+    whole = spring_energy(stiffness, limits[1], errors[1])
+    if whole <= energy:
+        return 1.0, whole
     low, high = 0.0, 1.0
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if added(middle) <= energy else (low, middle)
-    return low
+        low, high = (middle, high) if stored(middle) <= energy else (low, middle)
+    return low, stored(low)
