@@ -36,11 +36,11 @@ class ChunkSafetyLimiter(LeafSystem):
         - rate
         - fallback
 
-    ``chunk`` is (K*O,), requested outputs (K, O), row-major, the current control step first, and constant during a
-    control step. ``pose`` is the measured pose (O,), read at initialization. ``desired_pose`` is (O,). ``rate`` (1,) is
-    the executed speed relative to that of the requested chunk, below 1 only with the mode "slowdown" or at a fallback.
-    ``fallback`` (1,) is 1 if the rest of the previous chunk is executed because no chunk within the limits was found,
-    or because the requested chunk is not finite.
+    ``chunk`` (K*O,) has the requested outputs (K, O) in row-major order, from the current control step on. Its value
+    must be constant during a control step. ``pose`` is the measured pose (O,), read at initialization. ``desired_pose``
+    is (O,). ``rate`` (1,) is the executed speed relative to that of the requested chunk, below 1 only with the mode
+    "slowdown" or at a fallback. ``fallback`` (1,) is 1 if the rest of the previous chunk is executed because no chunk
+    within the limits was found, or because the requested chunk is not finite.
 
     Args:
         guard: Limits and mode, for O outputs; its state is not used.
@@ -77,7 +77,7 @@ class ChunkSafetyLimiter(LeafSystem):
     get_pose_input_port = input_getter("pose", "measured pose, (O,), read at initialization")
     get_desired_pose_output_port = output_getter("desired_pose", "command within the limits, (O,)")
     get_rate_output_port = output_getter("rate", "executed speed relative to the requested one, (1,)")
-    get_fallback_output_port = output_getter("fallback", "flag that the previous chunk is executed further, (1,)")
+    get_fallback_output_port = output_getter("fallback", "flag that the rest of the previous chunk is executed, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         start = self._guard.constraints.nearest(declare.start_pose(self._pose_port, context))

@@ -18,7 +18,7 @@ MAX_HALVINGS = 7
 ImpedanceControl = Literal["joint", "cartesian"]
 MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; a larger one is probably in millimeters or degrees
 MAX_FACTOR = 100.0
-"""Largest factor of a disturbance; its inverse is the smallest."""
+"""Largest factor of a disturbance; its inverse is the smallest factor of a sampled range."""
 
 
 class ContactOptions(Options):
@@ -66,7 +66,7 @@ class HardwareOptions(Options):
     robot: str = Field(DEFAULT_ROBOT, description="arm")
     end_effector: str = Field(DEFAULT_END_EFFECTOR, description="tool on the flange")
     driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
-    robot_url: str = Field("", description="address of the robot: LCM's URL, or a host; default: LCM's own")
+    robot_url: str = Field("", description="LCM URL of the driver's bus, or host of the robot; default: LCM's default")
     robot_timeout: Number = Field(10.0, gt=0, description="longest wait for the robot's first status [s]")
 
 
@@ -81,7 +81,7 @@ CalibrationError = Annotated[
     Magnitudes,
     satisfies(
         lambda pair: max(pair) <= MAX_CALIBRATION_ERROR,
-        f"give a position in meters and an angle in radians, at most {MAX_CALIBRATION_ERROR}",
+        f"give an error in meters and one in radians, each at most {MAX_CALIBRATION_ERROR}",
     ),
 ]
 
@@ -115,7 +115,7 @@ class Disturbances(Options):
         "largest offset of the measured wrench, sampled every episode: force [N], torque [Nm]"
     )
     wrench_drift: Magnitudes | None = _sensor_error(
-        "standard deviation after 10 s of a random walk of the measured wrench: force [N], torque [Nm]"
+        "random walk of the measured wrench, by its standard deviation after 10 s: force [N], torque [Nm]"
     )
     wrench_noise: Magnitudes | None = _sensor_error("standard deviation of the measured wrench: force [N], torque [Nm]")
     wrench_delay: Integer | None = Field(

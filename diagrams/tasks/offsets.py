@@ -56,7 +56,7 @@ def reference_of_file(
     return _REFERENCES[key]
 
 
-# Fitted trajectories, because a fit takes seconds. Keys have a digest, not a path, because `create-task` moves files.
+# Cache, because a fit takes seconds. Keys have a file's digest, not its path, because `create-task` moves files.
 _REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 
 
@@ -75,7 +75,7 @@ class HiddenOffsets(ABC):
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the offsets (2,) [m] of fixture and workpiece; `options` is an instance of `InsertionReset`."""
-        # Every reset draws the same samples, used or not, so that the samples of an episode depend only on its seed.
+        # Every reset takes equally many numbers from `rng`, used or not: an episode's samples depend only on its seed.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)
         if self._run is None or options.new_run:
@@ -101,7 +101,7 @@ _HELD_OUT_STREAM = 0x8E1D  # last seed word of the held-out stream; the training
 
 
 def episode_stream(rng: np.random.Generator, held_out: bool) -> np.random.Generator:
-    """Return the generator of an episode's conditions, of the training or the held-out stream.
+    """Return the random generator of an episode's conditions, for training or for held-out episodes.
 
     Both streams take one number from `rng`, so that later samples from `rng` do not depend on `held_out`.
     """

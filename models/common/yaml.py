@@ -1,7 +1,8 @@
 """Reader of YAML files: templates, tasks, run configurations and studies.
 
-Files hold numbers, texts, lists and mappings of YAML 1.2's core schema: `yes` is a text, `1e-3` a number, and `010` a
-text and not the number 8. Reading takes bounded time and memory for any content.
+Files hold null, booleans, numbers, texts, lists and mappings as in YAML 1.2's core schema, except that integers are
+decimal without leading zeros: `yes` and `010` are texts, `1e-3` is a number. Reading takes bounded time and memory for
+any content.
 """
 
 import re
@@ -88,7 +89,7 @@ def _refusals(text: str, where: str) -> Iterator[None]:
     except ReaderError as error:
         raise InputError(f"{where} is not YAML: it holds a character that can't be printed") from error
     except MarkedYAMLError as error:
-        problem = str(error.problem).partition(" with value ")[0]  # ends the message of a duplicate key
+        problem = str(error.problem).partition(" with value ")[0]  # the values of a duplicate key are left out
         mark = error.problem_mark or error.context_mark
         line = f" in line {mark.line + 1}" if mark is not None else ""
         words = shorten(", ".join(part for part in (error.context, problem) if part), 200)
@@ -147,7 +148,7 @@ class _Parser(Parser):
             entries, levels = self._sizes[collection.anchor] = collection.entries, collection.levels
         elif isinstance(event, AliasEvent):
             if any(parent.anchor == event.anchor for parent in self._parents):
-                _refuse(f"{brief(event.anchor)} contains itself: write out what it stands for", event)
+                _refuse(f"{brief(event.anchor)} contains itself: leave this alias out", event)
             entries, levels = self._sizes.get(event.anchor, (1, 1))
             self._num_entries += entries
         elif isinstance(event, ScalarEvent | CollectionStartEvent):

@@ -10,14 +10,16 @@ from guiderail.models.primitives.kernels import Kernel
 # Conditioning on a history with a standard deviation √ρ far below the kernel's, which is 1, loses digits in double
 # precision. Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
-# A point can have an action of its own if its variance given the points before it in the list, relative to the
-# kernel's, is at least this.
+# Least ratio of a point's variance given the previous points to the kernel's variance there. Below it, the point cannot
+# have an action of its own.
 _MIN_INDEPENDENCE = 1e-9
 
 
 @dataclass(frozen=True)
 class WindowFeatures:
-    """Prior of a window, which depends on its inputs alone: y_j = W_j h + (F_j ⊗ I) w, with weights w of unit prior.
+    """Prior of the outputs y_j in a window given the history h: y_j = W_j h + (F_j ⊗ I) w.
+
+    The weights w are standard normal. W and F depend on the inputs of history and window, and not on any outputs.
 
     Attributes:
         history_map: W (H+1, P), the map from the history to the prior mean of the future.
@@ -33,8 +35,8 @@ def window_features(
 ) -> WindowFeatures:
     """Condition the kernel on the history and factor the conditional kernel.
 
-    The history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs.
-    The history is kept out of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ with both would lose accuracy.
+    The history's covariance is ρI for every output, so that all outputs share one P×P problem. The history is kept out
+    of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ of both would lose accuracy.
 
     Inputs of the history are (P,) or (P, I) and may be empty, those of the window (H+1,) or (H+1, I). `history_noise`
     is ħρ, positive if there is a history.
@@ -49,9 +51,9 @@ def window_features(
 def window_interpolation(
     kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float, points: np.ndarray
 ) -> np.ndarray:
-    """Compute the map (H+1, J) that interpolates actions at J different future points to all, given the history.
+    """Compute the map (H+1, J) from actions at J different points of the window to all its points, given the history.
 
-    The map is K̂ K̲⁻¹ of equation 4.17. K̂ is conditioned on the history, and K̲, between the J points, is not. See
+    The map is K̂ K̲⁻¹ (thesis, equation 4.17). K̂ is conditioned on the history, and K̲, between the J points, is not. See
     `window_features` for the arguments.
 
     Raises:
@@ -66,8 +68,8 @@ def window_interpolation(
         L = _cholesky(among)
     if not (np.diagonal(L) ** 2 >= _MIN_INDEPENDENCE * np.diagonal(among)).all():
         raise InputError(
-            "null-space actions are so close to each other that this kernel cannot separate them: leave some out, or "
-            "give a primitive without a history one at every point"
+            "null-space actions are so close to each other that this kernel cannot separate them: leave some out, or, "
+            "for a primitive without a history, give one at every point"
         )
     return _solve_lower(L[::-1, ::-1].T, _solve_lower(L, K[points])[::-1])[::-1].T.astype(float)
 
@@ -84,7 +86,7 @@ def _conditioned(
             L = _cholesky(kernel(past, past) + _Extended(history_noise) * np.eye(len(past), dtype=_Extended))
         if not (np.diagonal(L) > 0).all():
             raise InputError(
-                f"a history of {len(past)} outputs is too long for so small a variance, as rounding hides it: raise "
+                f"the variance of a history of {len(past)} outputs is too small compared with rounding errors: raise "
                 "history_variance, or shorten the history"
             )
         V = _solve_lower(L, kernel(past, future))
@@ -124,7 +126,7 @@ class KernelBasis:
         inputs = inputs.astype(_Extended)
         F = self._extended_features(inputs)
         residual = self.residual(inputs, F)
-        # Larger than the tolerance of a window: a feature of size 1e-7 would multiply weights that no data determines.
+        # Larger than the tolerance of `_pivoted_cholesky`: no data determines the weight of a feature below 3e-8.
         tolerance = 1e-15
         before = self.size
         while len(inputs) and residual.max() > tolerance:

@@ -19,18 +19,20 @@ from research.outside_envs.sawyer import (
 )
 from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
-OFFSETS = (0.025, 0.05)  # distance of the assumed hole from the true one in y, on either side [m]
-HEIGHT_OFFSET = 0.015  # largest distance in z [m]
+OFFSETS = (0.025, 0.05)  # least and largest distance of the assumed hole from the true one in y [m]
+HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true one in z [m]
 MAX_LAG = 0.035  # lag of the hand at which the first attempt ends, because the peg presses on the box [m]
-MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table [m]
+MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table, for the highest assumed hole [m]
 
 
 def is_blocked(env: Any, observation: Any) -> bool:
-    """Return True if the hand lags behind its command along the hole's axis."""
+    """Return True if the hand lags more than `MAX_LAG` behind its command along the hole's axis."""
     return bool(env.unwrapped.data.mocap_pos[0][0] - env.raw[0] < -MAX_LAG)
 
 
-_FLOORS = {"object_start": MIN_HEIGHT, "assumed_goal": MIN_HEIGHT - 0.13 - HEIGHT_OFFSET}  # the hole is 13 cm high
+# `MIN_HEIGHT` in each frame. The assumed hole is at most 0.13 m + `HEIGHT_OFFSET` above the table. If it is lower,
+# lower commands are allowed.
+_FLOORS = {"object_start": MIN_HEIGHT, "assumed_goal": MIN_HEIGHT - 0.13 - HEIGHT_OFFSET}
 LOWER = {name: np.array([-np.inf, -np.inf, height]) for name, height in _FLOORS.items()}
 PARTS = {
     "reach": Part(30, "object_start", OPEN, lower=LOWER["object_start"]),
@@ -45,20 +47,23 @@ LENGTH = num_steps(PARTS)
 
 
 class _Env(SawyerPegInsertionSideEnvV3):
-    """The environment without the peg's orientation, which is unused here and takes a fifth of a step's time."""
+    """Environment with zeros for the peg's quaternion, which is unused here and takes a fifth of a step's time."""
 
     def _get_quat_objects(self) -> np.ndarray:
         return np.zeros(4)
 
 
 class HiddenHole(HiddenGoal):
-    """Environment that requires a depth of 5 cm; metaworld's limit of 7 cm to the goal already holds at the mouth."""
+    """Environment in which a success requires a peg 5 cm deep in the hole.
+
+    Metaworld's criterion, at most 7 cm from the goal, is already satisfied at the hole's mouth.
+    """
 
     def __init__(self, seed: int = 0, length: int = LENGTH):
         super().__init__(_Env(), seed, length, OFFSETS, HEIGHT_OFFSET, "box", 5.0)
 
     def has_succeeded(self, info: dict[str, Any]) -> bool:
-        """Return True if the peg is inside of the hole."""
+        """Return True if the peg is at least 5 cm deep in the hole."""
         depth, y, z = self.head()
         return bool(depth < 0.015 and max(abs(y), abs(z)) < 0.03)
 
@@ -88,7 +93,10 @@ def _signal(env: HiddenHole) -> tuple[bool, bool, bool]:
 
 
 def record_peg(count: int, seed: int) -> list[Recording]:
-    """Return recordings of metaworld's scripted policy; they end deeper than needed, because grasps differ by 1 cm."""
+    """Return recordings of metaworld's scripted policy.
+
+    They end deeper in the hole than a success requires, because the position of the grasp on the peg varies by 1 cm.
+    """
     policy = SawyerPegInsertionSideV3Policy()
     return record(HiddenHole(seed, 250), policy, _signal, lambda env: env.head()[0] < -0.01, 130, count, seed)
 

@@ -1,4 +1,4 @@
-"""Pairs of meshes below a folder: AutoMate's, IndustReal's and Factory's by their file names, and any others."""
+"""Pairs of meshes below a folder, found by file name: IndustReal's, Factory's, and any named plug and socket."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
         if plug.suffix.lower() in ENDINGS and socket.is_file():
             pairs.append(Pair(plug.parent.name, plug, socket, unit))
     if not pairs:
-        raise InputError(f"{folder} has no pairs: name a folder with plug.stl and socket.stl in a subfolder of each")
+        raise InputError(f"{folder} has no pairs: name a folder that has subfolders with plug.stl and socket.stl")
     pairs = sorted(pairs, key=lambda pair: pair.name)
     for first, second in itertools.pairwise(pairs):
         if first.name == second.name:

@@ -21,7 +21,7 @@ class TemplateFrames:
     Args:
         system: System under construction; outputs that use the frames must depend on `ticket`.
         template: Template with the frames.
-        frames: Default poses by name of the frame.
+        frames: Default poses in the world, by name of the frame.
 
     Raises:
         InputError: If a frame of the template is missing or not finite.

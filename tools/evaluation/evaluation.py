@@ -41,7 +41,7 @@ class Evaluation(Mapping[str, Any]):
 
     Attributes:
         statistics: Statistics, as `guiderail evaluate --json` prints them.
-        rows: Episodes of each policy by name, one row each; the first is the policy evaluated.
+        rows: Episodes by name of the policy, one row each; the first policy is the evaluated one.
     """
 
     statistics: Mapping[str, Any]
@@ -58,7 +58,10 @@ class Evaluation(Mapping[str, Any]):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Statistics `COMPARED`, one row for each policy; the 95 % interval is from `success_low` to `success_high`."""
+        """Statistics `COMPARED`, one row for each policy; statistics without any value are left out.
+
+        `success_low` and `success_high` are the ends of the 95 % interval of the success rate.
+        """
         names = [self._name(name) for name in self.rows]
         rows = [statistics(rows) for rows in self.rows.values()]
         return pd.DataFrame(rows, index=pd.Index(names, name="policy")).dropna(axis="columns", how="all")
@@ -79,7 +82,8 @@ class Evaluation(Mapping[str, Any]):
         if self.comparison is not None:
             baseline, successes, p = self.comparison
             verdict = "better than" if p < SIGNIFICANT else "not shown to be better than"
-            text += f", {verdict} the best baseline, {self._name(baseline)} with {successes} (p = {p:.2g})"
+            text += f", {verdict} the best baseline, {self._name(baseline)} with {successes} of {len(rows)}"
+            text += f" (p = {p:.2g})"
         violation = self.statistics.get("max_commanded_violation")
         if violation is not None:
             if violation <= TOLERANCE:
@@ -104,10 +108,11 @@ class Evaluation(Mapping[str, Any]):
 def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of the policy named `POLICY` with that of baseline policies under the same conditions.
 
-    The test is McNemar's, exact and one-sided. Only episodes in which exactly one of the two policies succeeds count: a
-    policy that is not better wins at most half of them on average. The result is the largest p of all baseline
-    policies, so that "better than the best baseline" means better than each of them (intersection-union test). No
-    correction for their number is needed. Without a baseline policy the result is None.
+    The test is McNemar's, exact and one-sided. It uses only the episodes in which exactly one of the two policies
+    succeeds: a policy that is not better succeeds in at most half of these on average. The result has the largest
+    p-value of all baseline policies, so that "better than the best baseline" means better than each of them
+    (intersection-union test). No correction for the number of baseline policies is needed. Without a baseline policy
+    the result is None.
     """
     won = rows[POLICY]["success"].to_numpy(float)
     others = {name: table["success"].to_numpy(float) for name, table in rows.items() if name != POLICY}
@@ -123,7 +128,7 @@ def _mcnemar(won: Any, other: Any) -> float:
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
-    """Return the statistics `COMPARED` of episodes; None without rows, and where the rows lack a column."""
+    """Return the statistics `COMPARED` of episodes; a statistic is None without rows or without its column."""
     result: dict[str, Any] = dict.fromkeys(prefix + name for name in COMPARED)
     for name in COMPARED if len(rows) else ():
         with suppress(KeyError):

@@ -39,10 +39,10 @@ def _with_placeholders(**examples: Any) -> AfterValidator:
         try:
             fields = [field[1:] for field in string.Formatter().parse(name) if field[1] is not None]
         except ValueError:
-            raise ValueError(f"{name!r} has an open brace: it may have {known}") from None
+            raise ValueError(f"{name!r} has a brace without its counterpart: the placeholders are {known}") from None
         # Format specifications (which could set a width of gigabytes), conversions and attributes are not allowed.
         if any(word not in examples or specification or conversion for word, specification, conversion in fields):
-            raise ValueError(f"{name!r} has an unknown placeholder: it may have {known}")
+            raise ValueError(f"{name!r} has an unknown or formatted placeholder: the placeholders are {known}")
         path = PurePath(name.format(**examples))
         if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in name:
             raise ValueError(f"{name!r} would be outside the study's folder: name a path inside it")
@@ -94,7 +94,7 @@ class EvalSet(_Strict):
 
 
 class Sweep(_Strict):
-    """Quantity of the environment that makes the task harder; policies are evaluated at each value and plotted."""
+    """Quantity of the environment that makes the task harder; results of the policies are plotted over its values."""
 
     quantity: str  # name and unit, the label of the axis
     at: dict[float, dict[str, Any]] = Field(min_length=1)  # options of the environment by value, the easiest first
@@ -109,7 +109,7 @@ class Sweep(_Strict):
 
 
 class Ratio(_Strict):
-    """Ratio of a column between two methods."""
+    """Ratio of a table's column between two methods."""
 
     of: str  # name of the column
     method: str  # method of the numerator
@@ -164,8 +164,8 @@ class Study(_Strict):
         episodes = [one.episodes or self.learner.episodes or max(self.after_episodes, default=0) for one in learners]
         if unreached := [number for number in self.after_episodes if episodes and number > max(episodes)]:
             raise ValueError(
-                f"no method trains for {unreached[0]} episodes: leave that out of after_episodes, or give the learner "
-                f"more than {max(episodes)} episodes"
+                f"no method trains for {unreached[0]} episodes, only for {max(episodes)}: leave {unreached[0]} out of "
+                f"after_episodes, or give the learner at least {unreached[0]} episodes"
             )
         return self
 

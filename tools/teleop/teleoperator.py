@@ -79,7 +79,7 @@ class MeshcatPanel(Teleoperator):
         self.set(np.zeros(len(self._sliders)))
 
     def apply_gamepad(self, period: float) -> None:
-        """Move the sliders by the gamepad, if one is connected, for a time `period` [s]."""
+        """Change the sliders by what the gamepad's deflection adds during `period` [s], if a gamepad is connected."""
         gamepad = self.meshcat.GetGamepad()
         if gamepad.index is None:
             return
@@ -114,7 +114,7 @@ def set_camera(meshcat: Any, task: Any) -> Viewpoint | None:
 def page_address(meshcat: Any) -> str:
     """Return the address of a page, with the command that forwards its port to another machine."""
     port = meshcat.port()
-    return f"{meshcat.web_url()} (from another machine: ssh -L {port}:localhost:{port})"
+    return f"{meshcat.web_url()} (from another machine: ssh -L {port}:localhost:{port} HOST)"
 
 
 # Labels of an episode by button, and the buttons' keys.
@@ -144,7 +144,8 @@ class MeshcatSupervisor(Supervisor):
     def wait(self) -> None:
         """Show the page's address and block until a browser connects."""
         self._log(f"Watch at {page_address(self.panel.meshcat)}.")
-        self._log("Sliders push, each with two keys; Space lets go; Enter: success, Backspace: failure, Escape: stop.")
+        self._log("Sliders, each with two keys, correct the motion; Space sets them to zero.")
+        self._log("Enter ends the episode as a success, Backspace as a failure, Escape without a label.")
         while self.panel.meshcat.GetNumActiveConnections() == 0:
             time.sleep(0.1)
 

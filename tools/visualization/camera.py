@@ -26,7 +26,7 @@ PATH = "#00a33a"  # color of the robot's path
 class Frames(EnvCallback):
     """Camera frames of an episode, evenly spaced over its length, which is not known in advance.
 
-    The environment is created with `render_mode="rgb_array"`.
+    The environment must have been created with `render_mode="rgb_array"`.
 
     Attributes:
         frames: Time [s], contact force [N] and image of each frame.
@@ -43,7 +43,10 @@ class Frames(EnvCallback):
         self._stride, self._actions = 1, 0
 
     def on_step(self, transition: Transition) -> None:
-        """Render a frame if it is due; when `max_frames` are stored, drop every second one and double the interval."""
+        """Render a frame if it is due or the episode ends.
+
+        When `max_frames` are stored, drop every second one and double the interval.
+        """
         self._actions += 1
         if not transition.is_last and self._actions % self._stride:
             return
@@ -73,7 +76,7 @@ def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
 
 
 def write_video(video: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write its camera frames as an animated image in real time; return the episode's row.
+    """Run an episode and write its camera frames as an animated image that plays in real time; return its row.
 
     Raises:
         InputError: If this machine cannot render, or the video cannot be written.
@@ -122,7 +125,7 @@ def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]
 
 
 def path_in_picture(base: Any) -> np.ndarray:
-    """Return the poses of an environment's trace in the image of its task's camera, (n, 2) [pixel].
+    """Return the measured positions of an environment's trace in the image of its task's camera, (n, 2) [pixel].
 
     The result is empty if the task has no camera.
     """

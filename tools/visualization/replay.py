@@ -72,7 +72,8 @@ class Motion(EnvCallback):
 
         `frames` maps each body's path in Meshcat's tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32 in
         base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the
-        previous sample, so that no peak is lost. An episode that failed before its first control step has one sample.
+        previous sample, so that no peak is lost. `time` is in percent of the longest possible
+        episode. An episode that failed before its first control step has one sample.
         """
         trace = self.base.trace
         stride = max(1, -(-len(trace) // POINTS))
@@ -105,7 +106,7 @@ class Motion(EnvCallback):
         return self._query.Eval(self._system.GetMyContextFromRoot(root))
 
     def _record_poses(self, root: Context) -> EventStatus:
-        """Record the poses at the end of each control step, as the simulator's monitor."""
+        """Record the poses at time zero and after each control step, as the simulator's monitor."""
         time = root.get_time()
         if time == 0.0:
             self._poses.clear()
@@ -119,7 +120,7 @@ class Motion(EnvCallback):
 
 
 def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple[str, float]:
-    """Return the unit in which a violation is plotted, and the factor: mm if only positions are constrained."""
+    """Return the unit of plotted violations and its factor from m or rad: mm if only positions are constrained."""
     has_rotations = outputs >= 6 and (constraints is None or bool(np.any(constraints.G[..., 3:])))
     return (VIOLATION, 1.0) if has_rotations else ("mm", 1.0 / MM)
 
@@ -171,8 +172,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     """Run episodes and write them as a page; return the row of the policy's first episode.
 
     Each episode is run twice from the same conditions: by the policy and by a baseline without learning.
-    The baseline is the demonstration alone (an action of zero) if the guidance has one, and otherwise uniform random
-    actions.
+    The baseline is the demonstration alone (an action of zero) if the guidance has a demonstration, and otherwise
+    uniform random actions.
 
     Args:
         html: Page, .html.
@@ -256,7 +257,10 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
 
 
 def find_report(html: Path, run: Path | None) -> str | None:
-    """Return the relative path from the page to the report of its run, or of the run's study; None without a report."""
+    """Return the path of a report relative to the page; None without a report.
+
+    It is the report in the page's folder, or else that of the run, or else that of the run's study.
+    """
     folders = [html.parent, *([] if run is None else [run, run.parent])]
     report = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)
     return None if report is None else Path(os.path.relpath(report, html.parent)).as_posix()
@@ -284,7 +288,7 @@ def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, color: tup
 
 
 def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices (n·sides, 3) and triangles (m, 3) of a tube along every third of the points."""
+    """Return the vertices (n·sides, 3) and triangles (m, 3) of a tube through every third point and the last."""
     points = np.vstack([points[:-1:3], points[-1:]])
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)

@@ -6,9 +6,9 @@ of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by min
 X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
 
 Contact. The ring has two open rigid surfaces: a bore that collides only with the barrel, and a pair of slots that
-collide only with the lugs. They have a third of the triangles of a closed ring and are five times faster. The jack's
-barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket, which pushes the lugs into their
-detents.
+collide only with the lugs. These surfaces have a third of the triangles of a closed ring, and their contact is computed
+five times faster. The jack's barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket,
+which pushes the lugs into their detents.
 
 `python -m guiderail.models.objects.bnc_connector.sdf` writes the SDF and OBJ files in this folder.
 """
@@ -46,7 +46,7 @@ class BncDimensions:
     slot_clearance: float = 0.125 * MM  # on each side
     slot_depth: float = 0.9 * MM  # radial depth of the slots' walls
 
-    entry_height: float = 3.4 * MM  # bottom of the straight entry
+    entry_height: float = 3.4 * MM  # end of the straight entry, far from the mouth
     entry_angle: float = np.deg2rad(6.0)  # where the ramp starts
     apex_height: float = 5.4 * MM
     apex_angle: float = np.deg2rad(78.0)
@@ -104,7 +104,7 @@ class SlotColumns:
 
 
 def slot_columns(dimensions: BncDimensions) -> SlotColumns:
-    """Return the walls that a mill of the slot's half width leaves along the lug's path."""
+    """Return the walls that a mill of radius `slot_half_width` leaves along the lug's path."""
     d = dimensions
     radius, half_width = d.slot_radius, d.slot_half_width
     num_entry, num_ramp, num_end = 6, 14, 3  # columns of each part
@@ -168,7 +168,7 @@ def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) 
 def _faces_between_entries(
     dimensions: BncDimensions, radii: tuple[float, float], margin: float, height: float, num_sides: int
 ) -> np.ndarray:
-    """Return the flat ring between the entries of the slots, which faces the jack."""
+    """Return the half of the mouth's flat face that lies between the entries of the two slots."""
     columns = slot_columns(dimensions)
     angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
     return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))

@@ -204,7 +204,7 @@ def test_sentence_names_the_best_baseline():
     rows = {"policy": won(*[1] * 12), "zero": won(1, *[0] * 11)}
     statistics = {"success_low": 0.7, "success_high": 1.0, "max_commanded_violation": 2e-3}
     sentence = Evaluation(statistics, rows).sentence
-    assert "better than the best baseline, zero action with 1 (p = 0.00049); the largest constraint" in sentence
+    assert "better than the best baseline, zero action with 1 of 12 (p = 0.00049); the largest constraint" in sentence
     assert "was 0.002 m or rad." in sentence
 
 

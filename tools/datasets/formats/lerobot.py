@@ -1,4 +1,4 @@
-"""LeRobot datasets of version 3, read and written with pyarrow, because LeRobot requires other package versions."""
+"""LeRobot datasets of version 3, read and written without LeRobot, which requires other versions of dependencies."""
 
 from __future__ import annotations
 

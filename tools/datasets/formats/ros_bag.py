@@ -49,10 +49,11 @@ def find_bags(path: Path) -> list[Path]:
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
-    """Return one demonstration per bag; `target` is that of `poses_in_target`, and `choose_signal` selects the topic.
+    """Return one demonstration per bag; see `choose_signal` for `topic`, and `poses_in_target` for `target`.
 
     Raises:
-        InputError: If a bag cannot be read, or several topics could be imported.
+        InputError: If a bag cannot be read, no single topic can be chosen, its messages are not one motion, `target` is
+            given for a topic without poses, or the outputs of two bags differ.
     """
     recorded = Recorded([], [], ())
     for bag in find_bags(path):
@@ -62,7 +63,8 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
             names, outputs = recorded.names, outputs[:, [names.index(name) for name in recorded.names]]
         if recorded.names and names != recorded.names:
             raise InputError(
-                f"{bag} has {', '.join(names)}, the bag before {', '.join(recorded.names)}: record the same outputs"
+                f"{bag} has the outputs {', '.join(names)}, and the previous bag {', '.join(recorded.names)}: "
+                "record the same outputs in all bags"
             )
         recorded.times.append(times)
         recorded.outputs.append(outputs)
@@ -89,7 +91,8 @@ def _read_bag(
         connections = [one for one in reader.connections if one.topic == chosen]
         if len(connections) > 1:
             raise InputError(
-                f"{bag} has {len(connections)} publishers on {chosen}, which would be mixed: record one of them"
+                f"{bag} has {len(connections)} publishers on {chosen}, whose messages would be mixed: "
+                "record one of them"
             )
         received = islice(reader.messages(connections), MAX_LINES + 1)
         rows = [(stamp, reader.deserialize(raw, kinds[chosen])) for _, stamp, raw in received]
@@ -113,8 +116,8 @@ def _read_bag(
         for number, message in enumerate(messages):
             if len(message.data) != len(names):
                 raise InputError(
-                    f"message {number} on {chosen} of {bag} has {len(message.data)} numbers, and not {len(names)}: "
-                    "record as many in each"
+                    f"message {number} on {chosen} of {bag} has {len(message.data)} numbers instead of {len(names)}: "
+                    "record the same number in every message"
                 )
         return times, np.array([message.data for message in messages]), names, assumptions
     if kinds[chosen] == JOINTS:
@@ -134,25 +137,26 @@ def _read_bag(
 
 
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
-    """Return positions (N, J) in the order of the first message's names; the order may differ in every message.
+    """Return positions (N, J) in the order of the first message's names; other messages may have another order.
 
-    Messages of other joints are refused instead of skipped, because any device may have sent the first message.
+    Messages of other joints are refused, not skipped, because the first message may be from a device other than the
+    arm.
     """
     expected = list(messages[0].name)
     if len(set(expected)) < len(expected):
-        raise InputError(f"message 0 {where} is of {', '.join(expected)}, and one name is there twice: rename a joint")
+        raise InputError(f"message 0 {where} has a joint twice ({', '.join(expected)}): rename one")
     rows = []
     for number, message in enumerate(messages):
         names = list(message.name)
         if len(message.position) != len(names):
             raise InputError(
-                f"message {number} {where} has {len(message.position)} positions of {len(names)} joints: record a "
-                "position of each"
+                f"message {number} {where} has {len(message.position)} positions for {len(names)} joints: record a "
+                "position of each joint"
             )
         if sorted(names) != sorted(expected):
             raise InputError(
-                f"message {number} {where} is of {', '.join(names)}, and the first of {', '.join(expected)}: record "
-                "each device on a topic of its own"
+                f"message {number} {where} has the joints {', '.join(names)}, and message 0 {', '.join(expected)}: "
+                "record each device on a topic of its own"
             )
         rows.append(np.asarray(message.position)[[names.index(name) for name in expected]])
     return np.array(rows)
@@ -180,7 +184,9 @@ def _frame(message: Any, path: Sequence[str]) -> str:
 
 
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
-    """Write a folder of ROS 2 bags in MCAP, one per demonstration, as arrays with named dimensions; return remarks.
+    """Write a folder with one ROS 2 bag in MCAP per demonstration; return remarks.
+
+    A message is an array of the outputs of one sample, and the labels of its layout are their names.
 
     Raises:
         InputError: If a bag cannot represent the demonstrations' times, or the folder cannot be written.
@@ -203,13 +209,14 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
                     message = array(layout=layout(dim=dims, data_offset=0), data=y)
                     writer.write(connection, stamp, store.serialize_cdr(message, DATA))
     return [
-        f"{TOPIC} holds the outputs as {DATA}, named in its layout; its time is the bag's, to the nanosecond",
+        f"{TOPIC} holds the outputs as {DATA}, with their names in its layout; the time of a sample is that of its "
+        "message in the bag, rounded to nanoseconds",
         *notes,
     ]
 
 
 def _stamps(demonstrations: Demonstrations) -> tuple[list[np.ndarray], list[str]]:
-    """Return times in nanoseconds (N_m,) of each demonstration, shifted if one is negative, with remarks."""
+    """Return times in nanoseconds (N_m,) of each demonstration, with remarks; if one is negative, all start at zero."""
     times, notes = list(demonstrations.times), []
     if min(t[0] for t in times) < 0.0:
         times, notes = [t - t[0] for t in times], describe_time_shift(demonstrations)
@@ -217,7 +224,8 @@ def _stamps(demonstrations: Demonstrations) -> tuple[list[np.ndarray], list[str]
     for number, t in enumerate(times):
         if t[-1] > _MAX_TIME:
             raise InputError(
-                f"demonstration {number} ends at {t[-1]:g} s, and a bag's time at {_MAX_TIME:g}: subtract an offset"
+                f"demonstration {number} ends at {t[-1]:g} s, and the time of a bag at {_MAX_TIME:g} s: "
+                "subtract an offset"
             )
         stamps.append(np.rint(t / _NANO).astype(np.int64))
         if (np.diff(stamps[-1]) <= 0).any():

@@ -65,9 +65,9 @@ def test_joint_order_may_differ_between_bags(tmp_path):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (("g", (5,)), "message 1 on /it of .* is of g, and the first of a, b: record each device"),
-        (("ag", (1, 5)), "is of a, g, and the first of a, b"),
-        (("ab", ()), "has 0 positions of 2 joints"),
+        (("g", (5,)), "message 1 on /it of .* has the joints g, and message 0 a, b: record each device"),
+        (("ag", (1, 5)), "has the joints a, g, and message 0 a, b"),
+        (("ab", ()), "has 0 positions for 2 joints"),
     ],
 )
 def test_messages_of_other_joints_are_refused(other, words, tmp_path):
@@ -78,7 +78,7 @@ def test_messages_of_other_joints_are_refused(other, words, tmp_path):
 
 def test_joints_of_one_name_are_refused(tmp_path):
     bag = write(tmp_path / "bag", JOINTS, joints, [("aba", (1, 2, 3))] * 2)
-    with pytest.raises(InputError, match=r"message 0 on /it of .* is of a, b, a, and one name is there twice"):
+    with pytest.raises(InputError, match=r"message 0 on /it of .* has a joint twice \(a, b, a\)"):
         read_bags(bag, None, None)
 
 
@@ -91,7 +91,7 @@ def test_bag_quaternion_of_wrong_length_is_refused(wrong, tmp_path):
 
 def test_arrays_of_other_sizes_are_refused(tmp_path):
     bag = write(tmp_path / "bag", ARRAY, array, [range(6), range(5)])
-    with pytest.raises(InputError, match=r"message 1 on /it .* has 5 numbers, and not 6"):
+    with pytest.raises(InputError, match=r"message 1 on /it .* has 5 numbers instead of 6"):
         read_bags(bag, None, None)
 
 
