@@ -144,7 +144,8 @@ def _read(
         assumptions.append("there is no orientation")
     elif target is None:
         assumptions.append(
-            "poses stay in the frame of the recording: --target gives the pose of the task's target in it"
+            "poses stay in the frame of the recording: "
+            "to convert them, give the pose of the task's target in it as --target"
         )
     used = (clock, *position, *orientation)
     if left := [one.name for one in columns if one.name and not any(one is other for other in used)]:

@@ -132,7 +132,9 @@ def _read_bag(
     frame = _frame(messages[0], POSES[kinds[chosen]])
     assumptions.append("positions are in meters, and quaternions follow the names of their fields (REP 103)")
     if target is None:
-        assumptions.append(f"poses stay in the frame {frame!r}: --target gives the pose of the task's target in it")
+        assumptions.append(
+            f"poses stay in {frame}: to convert them, give the pose of the task's target in it as --target"
+        )
     return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumptions
 
 
@@ -178,9 +180,9 @@ def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
 def _frame(message: Any, path: Sequence[str]) -> str:
     for holder in (message, reduce(getattr, path[:1], message)):
         header = getattr(holder, "header", None)
-        if header is not None:
-            return str(header.frame_id)
-    return "of the recording"
+        if header is not None and header.frame_id:
+            return f"the frame {str(header.frame_id)!r}"
+    return "the frame of the recording"
 
 
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:

@@ -107,6 +107,11 @@ def test_time_is_that_of_the_recorder_if_messages_have_no_stamps(tmp_path):
     assert any("the messages have no stamps that increase" in text for text in result.assumptions)
 
 
+def test_assumption_names_no_frame_of_poses_without_header(tmp_path):
+    result = read_bags(write(tmp_path / "bag", POSE, pose, [1.0] * 2), None, None)
+    assert any(text.startswith("poses stay in the frame of the recording: ") for text in result.assumptions)
+
+
 def test_bag_export_shifts_negative_time(tmp_path):
     t = 0.1 * np.arange(5)
     notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
