@@ -172,11 +172,10 @@ class MeshcatSupervisor(Supervisor):
 
     def label(self) -> str | None:
         """Return the label clicked since the last call, or None; of several labels, the last one in `LABELS`."""
-        label, self._is_stop_pending = "stop" if self._is_stop_pending else None, False
-        for button, clicked in LABELS.items():
-            if self.panel.take_clicks(button):
-                label = clicked
-        return label
+        labels = [label for button, label in LABELS.items() if self.panel.take_clicks(button)]
+        labels += ["stop"] * self._is_stop_pending
+        self._is_stop_pending = False
+        return labels[-1] if labels else None
 
     def _add_sliders(self, base: Any) -> None:
         size = int(base.action_space.shape[0])

@@ -81,6 +81,18 @@ def test_only_a_stop_outlasts_the_start_of_an_episode(env, monkeypatch):
         assert supervisor.label() is None
 
 
+def test_pending_stop_outlasts_other_labels(env, monkeypatch):
+    page = Page()
+    supervisor = MeshcatSupervisor(print, page)
+    monkeypatch.setattr(supervising, "set_camera", lambda page, declaration: None)
+    monkeypatch.setattr(supervising, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
+    page.clicks["stop (Escape)"] += 1
+    supervisor.on_episode_start(env)
+    page.clicks["success (Enter)"] += 1
+    assert supervisor.label() == "stop"
+    assert supervisor.label() is None
+
+
 def test_keys_are_unique():
     keys = [key for pair in KEY_PAIRS for key in pair] + list(LABEL_KEYS.values())
     assert len(set(keys)) == len(keys)
