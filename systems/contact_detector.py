@@ -13,7 +13,7 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ContactDetector(LeafSystem):
-    """Detect contact between bodies and obstacles, at the present plant step and since the episode started.
+    """Detect contact between bodies and obstacles, at the last plant step and since the episode started.
 
     The contact results are evaluated at every plant step, so collisions shorter than a control step count. All outputs
     are state: they are one plant step old, without direct feedthrough.
@@ -63,7 +63,7 @@ class ContactDetector(LeafSystem):
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_contact_results_input_port = input_getter("contact_results", "plant's contact results")
-    get_collision_output_port = output_getter("collision", "flag that a body touches an obstacle now, (1,)")
+    get_collision_output_port = output_getter("collision", "flag of a contact at the last plant step, (1,)")
     get_has_collided_output_port = output_getter("has_collided", "flag of a contact in this episode, (1,)")
     get_contact_force_output_port = output_getter("contact_force", "largest contact force, (1,) [N]")
 

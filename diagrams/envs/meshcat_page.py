@@ -36,13 +36,14 @@ class MeshcatPage(Meshcat):
         is_served: True if browsers may connect; if False, the page can only be exported with `StaticHtml`.
 
     Raises:
-        RuntimeError: If the environment forbids Drake to open a network port, or Meshcat's own port cannot be closed.
+        RuntimeError: If `DRAKE_ALLOW_NETWORK` forbids Meshcat, the gateway ends at its start, or Meshcat's own port
+            cannot be closed.
     """
 
     def __init__(self, *, is_served: bool = True):
         drake_logger = logging.getLogger("drake")
         level = drake_logger.level
-        drake_logger.setLevel(logging.WARNING)  # Drake would print the address without the token
+        drake_logger.setLevel(logging.WARNING)  # Drake would log the address of Meshcat's own server
         try:
             super().__init__(MeshcatParams(host="localhost"))
         finally:
@@ -116,7 +117,7 @@ class _Gateway:
     def read_browsers(self) -> int:
         """Return the number of connected browsers; 0 after the process has ended."""
         received = b"" if self._output.closed else self._output.read()
-        if received == b"":  # end of the output; without a new number it is None
+        if received == b"":  # the gateway has ended; while it runs, `read` returns None if there is no new number
             return 0
         *lines, self._rest = (self._rest + (received or b"")).split(b"\n")
         if lines:
@@ -138,15 +139,15 @@ class _Gateway:
 def _close_port(port: int, keep: Sequence[int]) -> None:
     """Replace this process's listening socket of a port by an unconnected one, and end the port's connections.
 
-    Connections to peers with the ports `keep` stay open. Drake has no function for this. The descriptor keeps its
-    number, so that Drake can still close it.
+    Drake has no function to close the port. Connections to peers with the ports `keep` stay open. The descriptor keeps
+    its number, so that Drake can still close it.
 
     Raises:
         RuntimeError: If there is no such socket.
     """
     is_closed = False
     for descriptor in map(int, os.listdir("/dev/fd")):
-        with suppress(OSError):  # the descriptor was closed after it was listed
+        with suppress(OSError):  # the descriptor or its connection was closed after it was listed
             if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
                 continue
             with socket.socket(fileno=os.dup(descriptor)) as one, socket.socket() as unconnected:

@@ -1,4 +1,4 @@
-"""Options of single kinds of guidance; nothing here imports Drake."""
+"""Options that only some kinds of guidance have; this module does not import Drake."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BasePolicyOptions(Options):
 
 
 class GuardOptions(BasePolicyOptions):
-    """Options of `base_policy`, which executes the chunks."""
+    """Options of guidance of the kind `base_policy`, which executes the chunks."""
 
     guard: Literal["none", "projection", "slowdown"] = Field(
         "projection",
@@ -44,7 +44,8 @@ class GuardOptions(BasePolicyOptions):
     )
     max_jerk: PositiveNumbers = Field(
         (),
-        description="largest jerk of a guarded command, like max_speed; default of both: twice the demonstrations'",
+        description="largest jerk of a guarded command, in the form of max_speed; default of max_jerk and "
+        "max_speed: twice the largest value in the demonstrations",
     )
 
 
@@ -62,5 +63,6 @@ class TangentOptions(Options):
     slack_width: Number = Field(
         0.5,
         gt=0,
-        description="slack at which motion towards a constraint is halved, in displacements by an action of 1",
+        description="distance to a constraint at which motion towards it is halved, as a multiple of the "
+        "displacement by an action of 1",
     )

@@ -1,8 +1,8 @@
 """Filters of commanded positions that depend on the last command: a control barrier function, and ATACOM.
 
 Each filter bounds the change of a command from one control step to the next by constraints with rows of unit norm,
-h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. A desired command that
-is not finite repeats the last command.
+h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. If a desired command is
+not finite, the last command is repeated.
 """
 
 from typing import Protocol
@@ -28,7 +28,7 @@ class CommandLaw(Protocol):
         ...
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the state (S,) after the last one, and True if the desired command (O,) was changed."""
+        """Return the state (S,) that follows the state `last`, and True if the law intervened in the command (O,)."""
         ...
 
 
@@ -70,7 +70,7 @@ class BarrierFilter(_LastCommand):
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if it differs from the desired one.
 
-        If the last command violates a constraint and no allowed command is found, the last command is repeated.
+        The last command is repeated if no allowed one is found, which can happen while the last one is not allowed.
         """
         if not is_finite(desired):
             return last.copy(), True
@@ -89,8 +89,8 @@ class BarrierFilter(_LastCommand):
 class TangentSpaceFilter(_LastCommand):
     """Motion of commands in the tangent space of the constraint manifold (ATACOM; Liu et al., 2022 and 2024).
 
-    Each constraint has a slack s = G y − c, which changes by σ⁻¹ s per unit of its own velocity. A step v = desired −
-    last is projected to the null space of the Jacobian [−G, diag(s / σ)] of the constraints with their slacks:
+    Each constraint G y − s = c has a slack s ≥ 0, which is driven by a velocity of its own, ṡ = (s / σ) μ. A step
+    v = desired − last is projected to the null space of the Jacobian [−G, diag(s / σ)] in y and μ:
 
         y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
 
@@ -116,9 +116,10 @@ class TangentSpaceFilter(_LastCommand):
         self.num_outputs = keep_out.num_outputs
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the safe command (O,), and True if the step had to be shortened.
+        """Return the safe command (O,), and True if the step was shortened or the last command repeated.
 
-        Outside a constraint the error c − G y is corrected by the same pseudoinverse, as in ATACOM.
+        The projection, which changes every step towards a constraint, does not count as an intervention. The violation
+        c − G y of a constraint is corrected by the same pseudoinverse, as in ATACOM.
         """
         if not is_finite(desired):
             return last.copy(), True

@@ -9,7 +9,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 
 MAX_SENDERS = 8  # largest number of safety monitors whose heartbeats are distinguished
-MAX_MISSED_MESSAGES = 6  # consecutive status messages that may be missing before the arm is stopped
+MAX_MISSED_MESSAGES = 6  # number of periods without a status message after which the arm is stopped
 
 
 def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: float) -> np.ndarray:
@@ -24,7 +24,7 @@ def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: f
 
 
 class Fault(IntEnum):
-    """Reason for stopping the arm, in order of precedence.
+    """Reason for stopping the arm; the order of the codes is no precedence.
 
     Attributes:
         description: Description of the fault for messages.
@@ -41,7 +41,7 @@ class Fault(IntEnum):
     NONE = 0, "no fault"
     NO_STATUS = 1, "no status message received, or too few"
     STALE = 2, "the newest status message is too old: the robot, the network or this machine is late or has stopped"
-    OUT_OF_ORDER = 3, "a status message is older than its predecessor: the robot's clock was set back"
+    OUT_OF_ORDER = 3, "a status message is much older than its predecessor: the robot's clock was set back"
     FUTURE = 4, "a status message is in the future: the robot's clock has jumped"
     MALFORMED = 5, "the robot reports an error, or a status message cannot be decoded"
     WRONG_SIZE = 6, "a status message has the wrong number of joints"
@@ -50,8 +50,8 @@ class Fault(IntEnum):
     POSITION_JUMP = 9, "a joint position changed faster than the joint can move"
     VELOCITY_JUMP = 10, "a joint velocity changed faster than the joint can accelerate"
     FROZEN = 11, "a joint is moving, but its position or velocity does not change"
-    INCONSISTENT = 12, "a joint position does not change by its velocity"
-    NOT_REACTING = 13, "a joint velocity does not change by the joint's torques"
+    INCONSISTENT = 12, "a joint position does not change as the joint velocity requires"
+    NOT_REACTING = 13, "a joint velocity does not change as the joint torques require"
     CLOCK_RATE = 14, "the robot's clock is faster than this machine's"
     VELOCITY_LIMIT = 15, "a joint exceeds its velocity limit"
     WORKSPACE_LIMIT = 16, "the tool or its commanded pose is outside the workspace"
@@ -116,7 +116,7 @@ class StatusLimits:
 
     Args:
         velocity: Velocity limit of each joint, which bounds the change of its position (n,) [rad/s], positive.
-        max_age: Age above which a status is stale [s], positive. Messages may be lost or reordered within it.
+        max_age: Age above which a status is stale [s], positive. During this time messages may be lost or reordered.
         max_lead: Largest time by which a status may be ahead of the local clock [s], positive.
         position_jump: Largest position change beyond `velocity` times the time between two messages [rad], positive.
         velocity_jump: Largest velocity change between two messages [rad/s], positive; a collision causes changes up
@@ -151,9 +151,10 @@ class StatusLimits:
 
     @classmethod
     def at_rate(cls, velocity: Sequence[float], period: float, **others: float) -> "StatusLimits":
-        """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`.
+        """Return limits for a driver that sends a status every `period` [s].
 
-        `velocity` are the velocity limits of the joints, (n,) [rad/s], and `others` further limits by name.
+        The timeout is `MAX_MISSED_MESSAGES` periods. `velocity` are the velocity limits of the joints, (n,) [rad/s].
+        `others` are further limits by name.
         """
         timeout = MAX_MISSED_MESSAGES * period
         return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout, **others)
@@ -169,7 +170,7 @@ class LastStatus:
 
 
 def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
-    """Compare the newest status, None before the first message, with the last readable one at the local time `now` [s].
+    """Check the newest status, or None before the first message, against the last one at the local time `now` [s].
 
     Returns:
         The first fault, or `Fault.NONE`.

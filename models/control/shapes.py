@@ -1,7 +1,7 @@
 """Convex shapes that a command stays outside or inside of, and their linearization.
 
 The signed distance d to a convex set is a convex function (negative inside), and its unit normal n at a point p is a
-subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, for steps of any length:
+subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, however far y is from p:
 
 - Outside: d(y) ≥ 0 everywhere in the half-space nᵀ(y − p) ≥ −d(p). The half-space contains p if p is outside the set,
   hence also the straight line from p to every other point of the half-space.
@@ -28,7 +28,7 @@ _HALVINGS = 60  # bisections of an interval until its ends are neighboring float
 
 
 class ConvexShape(ABC):
-    """Convex set in the space of the first D outputs of a command, usually x, y and z, rounded by a margin."""
+    """Convex set in the space of the first D outputs of a command, usually x, y and z, enlarged by a margin."""
 
     num_dims: int
     margin: float
@@ -47,9 +47,10 @@ class ConvexShape(ABC):
         return self.surface(p)[0]
 
     def separate(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return a half-space outside of the shape that contains the straight line from p to q, if one exists.
+        """Return n and c of a half-space outside of the shape that contains the line from p to q, if one exists.
 
-        It is linearized at p or q if the result contains both, otherwise at the point of the line nearest to the shape.
+        It is linearized at p or q if the result contains both, otherwise at the point of the line nearest to the shape;
+        if the line crosses the shape, the result does not contain all of it.
         """
         for at, other in ((p, q), (q, p)):
             n, c = self.half_space(at)
@@ -95,7 +96,7 @@ class Sphere(ConvexShape):
         self.num_dims = len(self.center)
 
     def surface(self, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return distance and normal; at the center, where the normal is not unique, the first axis."""
+        """Return distance and normal; at the center, where no normal is unique, the normal is the first axis."""
         offset = p - self.center
         length = math.sqrt(offset @ offset)
         normal = offset / length if length > 0.0 else np.eye(self.num_dims)[0]
@@ -103,11 +104,11 @@ class Sphere(ConvexShape):
 
 
 class Box(ConvexShape):
-    """Axis-aligned box lower ≤ y ≤ upper with edges rounded by the margin; a side may be infinite.
+    """Axis-aligned box lower ≤ y ≤ upper, enlarged by the margin with rounded edges; it may extend to infinity.
 
     Args:
         lower: Lower corner (D,).
-        upper: Upper corner (D,), above it.
+        upper: Upper corner (D,), larger in every coordinate.
         margin: Distance to keep, not negative.
 
     Raises:
@@ -135,7 +136,7 @@ class Box(ConvexShape):
 
 
 class Cylinder(ConvexShape):
-    """Solid cylinder between the centers of its two faces, with edges rounded by the margin.
+    """Solid cylinder between the centers of its two faces, enlarged by the margin with rounded edges.
 
     Args:
         start: Center of one face (3,).

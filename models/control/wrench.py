@@ -1,6 +1,7 @@
-"""Wrenches in contact: measured on a tool, and bounded so that no push, impact or energy of a spring is too large.
+"""Wrenches in contact: measurement on a tool, and bounds of pushes, impacts and the energy of a controller's spring.
 
-Six-vectors of a bound are [translational, rotational], in the bound's axes. See `docs/concepts/forces.md`.
+The six limits of a bound are [translational, rotational], along and about the controller's axes. See
+`docs/concepts/forces.md`.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: floa
 def slow_down(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, impedance: float, force: float
 ) -> np.ndarray:
-    """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates to at most F / √(k m).
+    """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates the mass m to at most F / √(k m).
 
     d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
     that does positive work is reduced, so that no energy is added: on the way to its rest position, the spring returns
@@ -142,7 +143,7 @@ def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -
         s, d = spring[block], damping[block]
         dd, sd, slack = float(d @ d), float(s @ d), limit**2 - float(s @ s)
         if dd > 0.0 and np.isfinite(slack):
-            # ‖s − β d‖² = limit² at its larger root.
+            # β is the larger root of ‖s − β d‖² = limit².
             share = min(share, (sd + float(np.sqrt(max(sd * sd + dd * slack, 0.0)))) / dd)
     return max(share, 0.0)
 
@@ -156,11 +157,11 @@ def governed_error(
     step: float,
     bound: WrenchBound,
 ) -> np.ndarray:
-    """Compute the pose error (6,) that a spring and damper may be commanded for one step of a simulation.
+    """Limit the pose error (6,) of a spring and damper for one step of a simulation, so that their force is in a bound.
 
-    The damper belongs to the plant, which solves it implicitly: its force in the step is K e − (K h + D) v₁ with the
-    velocity v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, the force is inside the bound if K e is inside
-    the bound reduced by (K h + D) |v₀|.
+    The plant integrates spring and damper implicitly: their force in the step is K e − (K h + D) v₁ with the velocity
+    v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, it suffices for a force inside the bound that K e is inside the
+    bound reduced by (K h + D) |v₀|.
 
     Args:
         stiffness: Stiffness (6,) K of each coordinate.
@@ -254,11 +255,12 @@ def admissible_change(
     errors: tuple[np.ndarray, np.ndarray],
     energy: float,
 ) -> tuple[float, float]:
-    """Return the largest share from 0 to 1 of a change of reference and limits, and the springs' energy after it [J].
+    """Return a share from 0 to 1 of a change of reference and limits, and the energy of the springs after it [J].
 
-    The energy after the change is at most `energy`, if the energy before it is. It is convex in the reference, so the
-    share is found by bisection. The share is 1 if the whole change is admissible. No limit may decrease: the caller
-    applies a lower limit at once, which removes energy.
+    The energy after the change is at most `energy`, if the energy before it is. The share is 1 if the whole change is
+    admissible; otherwise it is found by bisection. With constant limits the energy is convex in the share, and the
+    result is the largest admissible share. With increasing limits it may be a smaller one. No limit may decrease: the
+    caller applies a lower limit at once, which removes energy.
 
     Args:
         stiffness: Stiffness (n,).

@@ -1,4 +1,4 @@
-"""Exact repair of open edges: loose triangles are removed, and flat faces triangulated again. No vertex moves."""
+"""Repair of open edges that moves no vertex: loose triangles are removed, and flat faces are triangulated again."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.objects.sdf import area_vectors
 
-_FLAT = 1e-6  # distance from a plane within which a vertex belongs to a flat face, the rounding of a text file [m]
-_MAX_PLANES = 100  # planes that are tried
+_FLAT = 1e-6  # largest distance of a flat face's vertices from its plane, due to rounding in text files [m]
+_MAX_PLANES = 100  # largest number of planes that are tried
 _AREA = 1e-6  # relative difference of areas that counts as rounding
 
 
@@ -23,8 +23,8 @@ def find_open_edges(triangles: np.ndarray) -> np.ndarray:
 def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the triangles of a mesh (V, 3), (T, 3) after the repair of its open edges; some may remain.
 
-    The edges that the triangles outside a plane leave open enclose the face in the plane, unless there is a gap in
-    another place. A plane that would leave as many open edges as before stays as it is.
+    If the triangles of one plane are removed, the open edges of the others enclose the face in that plane, provided
+    that no triangle is missing elsewhere. The face is replaced only if fewer edges are open afterwards.
     """
     triangles = _without_loose_triangles(triangles)
     left = find_open_edges(triangles)
@@ -33,7 +33,7 @@ def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
             break
         inside = (np.abs(vertices @ normal - distance) < _FLAT)[triangles].all(axis=1)
         along = area_vectors(vertices, triangles) @ normal > 0.0
-        # Faces on the other side of the plane may be another face, or a part of this one that is turned over.
+        # Triangles of the plane with the opposite normal belong to another face, or to this one in wrong orientation.
         for chosen in (inside, inside & along):
             face = _fill(vertices, triangles[~chosen], normal, distance)
             if face is None:
@@ -47,9 +47,10 @@ def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _count_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return edges (E, 2), lower vertex first, their balance and number of uses, and the edge of each use (T, 3).
+    """Return edges (E, 2), lower vertex first, their balance, their number of uses, and the uses (T, 3).
 
-    The balance is the number of uses from the lower to the higher vertex minus that of the opposite ones.
+    Each triangle uses three edges; the uses are indices into `edges`. The balance of an edge is the number of uses from
+    its lower to its higher vertex, minus the number of uses in the opposite direction.
     """
     uses = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2).astype(np.int64)
     size = int(triangles.max(initial=0)) + 1
@@ -60,13 +61,13 @@ def _count_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def _without_loose_triangles(triangles: np.ndarray) -> np.ndarray:
-    """Return triangles without those whose three edges are open and closed by the removal of the triangle."""
+    """Return triangles without the loose ones: all three edges are open, and would be closed without the triangle."""
     while True:
         _, balance, number, used = _count_edges(triangles)
         signs = np.sign(np.roll(triangles, -1, axis=1) - triangles)
         loose = np.flatnonzero(((number[used] % 2 == 1) & (balance[used] == signs)).all(axis=1))
         taken, removed = set[int](), []
-        for triangle in loose.tolist():  # two of them at one edge would leave it open
+        for triangle in loose.tolist():  # if two loose triangles at one edge were removed, the edge would be open again
             edges = set(used[triangle].tolist())
             if not edges & taken:
                 taken |= edges
@@ -77,7 +78,7 @@ def _without_loose_triangles(triangles: np.ndarray) -> np.ndarray:
 
 
 def _planes(vertices: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Return normals (3,) and distances from the origin [m] of planes of triangles at edges, the largest ones first."""
+    """Return normal (3,) and distance from the origin [m] of each plane of a triangle at the edges, largest first."""
     at_edge = np.isin(triangles, edges).sum(axis=1) >= 2
     near = triangles[at_edge]
     normals = area_vectors(vertices, near)
@@ -95,7 +96,7 @@ def _planes(vertices: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> l
 
 
 def _fill(vertices: np.ndarray, rest: np.ndarray, normal: np.ndarray, distance: float) -> np.ndarray | None:
-    """Return the triangles (T, 3) with a normal that close the open edges of `rest` in a plane; None if they can't."""
+    """Return triangles (T, 3) with a given normal that fill the open edges of `rest` in a plane; None if none can."""
     edges, balance, _, _ = _count_edges(rest)
     in_plane = (np.abs(vertices @ normal - distance) < _FLAT)[edges].all(axis=1)
     edges, balance = edges[in_plane & (balance != 0)], balance[in_plane & (balance != 0)]
@@ -123,7 +124,7 @@ def _areas(polygons: np.ndarray) -> np.ndarray:
 
 
 def _loops(edges: np.ndarray) -> list[list[int]] | None:
-    """Return the vertices of closed loops without repeated vertices from directed edges (E, 2); None if one is open."""
+    """Join directed edges (E, 2) to closed loops, lists of distinct vertices; return None if a path remains open."""
     following = defaultdict(list)
     for start, end in edges.tolist():
         following[start].append(end)

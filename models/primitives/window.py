@@ -72,12 +72,12 @@ class _Solution:
 
 
 class StepFactor:
-    """Factored problem 4.5 of one window, as a function of x = [history, null-space action].
+    """Factored problem 4.5 of the thesis for one window, as a function of x = [history, null-space action].
 
     With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w. Its QR factor
-    gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ directly, without forming Σ⁻¹ or K⁻¹ (equation 4.12 in terms of weights). The window
-    is linear in x; the executed point and the constrained directions are rows of it. Only those rows are stored: the
-    rest of the window is solved for again on request.
+    gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ with ħ = λ + β directly, without forming Σ⁻¹ or K⁻¹ (equation 4.12 for weights). The
+    window is affine in x, and so are the executed point and the constrained directions. Only their maps are stored; the
+    rest of the window is computed again on request.
 
     Args:
         window: Reference and constraints.
@@ -90,8 +90,8 @@ class StepFactor:
 
     Attributes:
         output_map, output_offset: Map (O, PO+O) and offset (O,) from x to the executed point.
-        constraint_map: Map (m, PO+O) from x to the constrained directions, each divided by its largest
-            displacement by a correction of norm one.
+        constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled so that a correction of norm one
+            changes it by at most one.
         lower, upper: Bounds (m,) of the constrained directions, minus their offset and scaled in the same way.
         constraint_rows: Unit rows (m, r), the map from a correction v to the constrained directions.
         correction_map: Map (O, r) from a correction v to the executed point.
@@ -225,7 +225,7 @@ class StepFactor:
         return alpha
 
     def violation(self, output: np.ndarray) -> float:
-        """Return max(c − G y) of an output (O,) at the executed point; at least one constraint must exist."""
+        """Return max(c − G y) of an output (O,) at the executed point, which must have a constraint."""
         return float((self._window.c[0] - self._window.G[0] @ output).max())
 
     def trajectory(self, x: np.ndarray, v: np.ndarray | None) -> np.ndarray:
@@ -241,7 +241,7 @@ class StepFactor:
         """Compute the window under null-space actions at several points (equation 4.18, multipliers of 4.17).
 
         Args:
-            x: [history, null-space action] with a null-space action of zero.
+            x: History and zeros instead of the null-space action (PO+O,), because `action` replaces it.
             action: Actions interpolated to every point of the window, K̂ K̲⁻¹ ξ̂ given the history, (H+1, O).
             solver: Solver of the least-norm problem.
 
@@ -312,10 +312,10 @@ class Prediction:
 
     Attributes:
         output: Output to execute (O,).
-        factor: Factor of the step.
+        factor: Factored problem of the step's window.
         x: History and null-space action of the prediction ((P + 1) O,).
         correction: Smallest correction v (r,) with which the window satisfies the constraints, or None if it satisfies
-            them uncorrected; `LcNsKmp.output_sizes` bounds the displacement of the output.
+            them uncorrected. It moves output i by at most ‖v‖ `LcNsKmp.output_sizes`[i].
         signed_multipliers: Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower
             bound, or None.
     """

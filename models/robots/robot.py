@@ -58,11 +58,11 @@ class Robot:
             singularities; inverse kinematics starts there.
         tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with the
             base's x axis at home, with the last joint in the middle of its range.
-        apparent_rotor_inertia: Fraction of the rotors' reflected inertia that remains under torque control; joint
-            torque feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
+        apparent_rotor_inertia: Fraction of the rotors' reflected inertia that acts on the joints under torque control;
+            joint torque feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
         drives: Drives of the joints under position control; None if unknown.
-        level_posture: Joint positions (n,) [rad] with a horizontal z axis of the flange, for a tool held like a cup;
-            None if unknown.
+        level_posture: Joint positions (n,) [rad] with a horizontal z axis of the flange, for a gripper that holds an
+            upright cup; None if unknown.
         source: Source of the model's numbers.
     """
 
@@ -132,7 +132,7 @@ class EndEffector:
             raise InputError(f"end effector {self.name!r} must name its bodies, the mount's first")
         missing = [name for name in self.joints if name not in self.opening]
         if missing or not _are_numbers(tuple(self.opening.values()), len(self.opening)):
-            raise InputError(f"end effector {self.name!r} needs an opening, a number, for each of its joints")
+            raise InputError(f"end effector {self.name!r} needs a finite opening position for each of its joints")
         if len(self.drives.stiffness if self.drives else ()) != len(self.joints):
             raise InputError(f"end effector {self.name!r} needs a drive for each of its {len(self.joints)} joints")
 

@@ -1,7 +1,7 @@
 """Cost of saving a run: `python -m research.benchmarks saving`.
 
-A short run is trained. The wall-clock time of its step log and its checkpoints, most of which is spent waiting for the
-disk, is given as a fraction of the run's.
+A short run is trained. The result is the fraction of its wall-clock time that its step log and its checkpoints take.
+Most of this time is spent waiting for the disk.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def timed(owner: Any, name: str) -> Iterator[list[float]]:
 
 
 def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
-    """Train a run in a temporary folder and return the shares of wall-clock time that saving took."""
+    """Train a run in a temporary folder; return its time [s], the shares that saving took, and numbers behind them."""
     config = configure(task, {}, **with_defaults(task, {"episodes": episodes, "seed": seed}))
     with (
         tempfile.TemporaryDirectory() as folder,

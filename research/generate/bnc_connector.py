@@ -67,12 +67,12 @@ def record_session(session: Session, seed: int) -> list[Recording] | None:
 
 
 def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
-    """Return the arrays of the first session in which every demonstration ends locked."""
+    """Return the arrays of a session, recorded with the first seed for which every demonstration ends locked."""
     for seed in seeds:
         if (recordings := record_session(session, seed)) is not None:
             break
     else:
-        raise InputError(f"no session of the seeds {seeds} ends locked every time: give more seeds")
+        raise InputError(f"some demonstration does not end locked, for each of {len(seeds)} seeds: try other seeds")
 
     def stacked(name: str) -> np.ndarray:
         return np.stack([recording[name] for recording in recordings])
@@ -93,7 +93,7 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
 
 
 def main(folder: Path | None = None, session: Session = INSERT_SESSION) -> None:
-    """Write the file of a session into a folder; that of the package by default."""
+    """Write the file of a session into `folder`, by default the one of the shipped recording."""
     arrays: dict[str, Any] = record(session, range(100))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)

@@ -38,7 +38,7 @@ def bootstrap_interval(statistic: Callable[..., np.ndarray], *methods: Scores, s
     Args:
         statistic: Function of the scores of one or more methods.
         methods: Scores of each method.
-        seed: Seed of the resampling; equal scores have equal intervals.
+        seed: Seed of the resampling; equal scores and seeds give equal intervals.
     """
     rng = np.random.default_rng(seed)
     resampled = [[rng.choice(scores, (RESAMPLES, len(scores))) for scores in method] for method in methods]

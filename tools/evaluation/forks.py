@@ -72,7 +72,11 @@ class Forks:
         return bool(self._idle)
 
     def submit(self, argument: Any) -> None:
-        """Let an idle process compute a result; see `has_idle`."""
+        """Let an idle process compute a result; see `has_idle`.
+
+        Raises:
+            KilledError: If the process was killed.
+        """
         connection = self._idle.pop(0)
         try:
             connection.send(argument)
@@ -84,7 +88,8 @@ class Forks:
         """Return the results that are complete, at least one unless the timeout [s] passes.
 
         Raises:
-            KilledError: If a process was killed. An exception of `compute` is raised as it is.
+            KilledError: If a process was killed. An exception of `compute` is raised with the process's traceback as a
+                note, or as a RuntimeError if it cannot be pickled.
         """
         results = []
         for connection in wait(self._busy, timeout):
@@ -114,11 +119,11 @@ class Forks:
 def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> Iterator[Result]:
     """Yield `compute(0)`, …, `compute(count - 1)` in this order, computed in `Forks` of this process.
 
-    Results must not depend on the order of the calls. They are computed in this process if one process is enough, or if
-    the system cannot fork.
+    Results must not depend on the order of the calls. They are computed in this process if `processes` or `count` is
+    less than 2, or if this process cannot have forks (`can_fork`).
 
     Raises:
-        KilledError: If a process is killed. An exception of `compute` is raised as it is.
+        KilledError: If a process is killed. An exception of `compute` is raised as by `Forks.collect`.
     """
     processes = min(processes, count)
     if processes < 2 or not can_fork():
@@ -151,7 +156,7 @@ def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequen
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the parent ends its forks
     # A fork inherits the parent's file locks, so it must not outlive the parent.
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
-    gc.freeze()  # a collection would write to, and so copy, the memory shared with the parent
+    gc.freeze()  # garbage collection would write to, and so copy, the memory shared with the parent
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)  # a fork does not have the parent's threads
     while True:

@@ -51,7 +51,7 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 COMPONENTS = 16  # components of the Gaussian mixture
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
-LOCKED_STEPS = 3  # consecutive steps of the default control period that count as locked
+LOCKED_STEPS = 3  # consecutive steps with a locked plug that count as success, at the default control period
 
 
 def reference_trajectory(demonstrations: str, count: int | None = None, **fit: Any) -> ReferenceTrajectory:
@@ -98,7 +98,8 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     """Return an action (2,) that moves the command one step towards the center of pressure, and so towards the jack.
 
-    Once the plug has dropped into the jack, the command is constant. The last command is part of the observation.
+    Once the plug has dropped into the jack, the command is constant until the search ends. Outside the time of the
+    search the action is zero. The last command is read from the observation, so that the policy has no state.
 
     Raises:
         InputError: If the observation has no center of pressure.
@@ -168,7 +169,7 @@ class BncConnector(DemonstratedInsertion):
         return LinearConstraints.box(-bound, bound)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return D and y0 that estimate height and turn; the lateral offset is not estimated but checked by a pull."""
+        """Return D and y0 of the estimate of height and turn; the lateral offset is only checked, by a pull."""
         size = self._workcell.dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = D[5, 3] = 1.0
@@ -176,7 +177,7 @@ class BncConnector(DemonstratedInsertion):
         return D, y0
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
+        """Return time, pose and wrench, and the center of pressure and force limit if observed; or the wrist camera."""
         return self.scaled_terms(POSE_CENTER, POSE_SCALE, WRENCH_SCALE)
 
     def termination_terms(self) -> list[TerminationTerm]:

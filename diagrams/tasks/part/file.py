@@ -37,7 +37,7 @@ HARD: dict[str, Any] = {
     "observation": "center_of_pressure",
     "action_repeat": 5,
 }
-"""Options of difficulty="hard" if task.yaml has none: the socket's offset is larger than most lead-ins can catch."""
+"""Options of difficulty="hard" if task.yaml has none; few lead-in chamfers are as wide as the socket's offset."""
 
 AUTOMATE: dict[str, Any] = {
     "fixture_offset": "per_episode",
@@ -56,10 +56,11 @@ class Piece(Options):
     """Collision mesh."""
 
     file: str = Field(
-        description="OBJ file, or VTK file of tetrahedra if compliant, next to this file, in the target frame [m]"
+        description="file next to this one, in the target frame [m]: OBJ (convex if compliant), or VTK with tetrahedra "
+        "(compliant)"
     )
     modulus: Number | None = Field(
-        None, gt=0, description="hydroelastic modulus of a compliant convex mesh [Pa]; default: rigid"
+        None, gt=0, description="hydroelastic modulus of a compliant mesh [Pa]; default: rigid"
     )
     friction: Number = Field(0.2, ge=0, le=2, description="friction coefficient of the surface, static and dynamic")
     # With 100 s/m no part leaves a contact faster than 10 mm/s. Otherwise a contact that is a micrometer too deep after
@@ -77,7 +78,7 @@ class PartModel(Options):
     gyration: Number = Field(gt=0, description="radius of gyration [m]")
     pieces: tuple[Piece, ...] = Field(min_length=1, description="collision meshes")
     convex: tuple[str, ...] = Field(
-        (), description="OBJ files of convex pieces: station=mujoco needs some of both parts; default: none"
+        (), description="OBJ files of convex pieces, which station=mujoco needs for both parts; default: none"
     )
 
 
@@ -102,7 +103,7 @@ class MotionNumbers(Options):
     @classmethod
     def _is_within_the_socket(cls, value: float, info: ValidationInfo) -> float:
         if value and value > info.data.get("rim", np.inf) - TOUCH:
-            raise ValueError(f"the advance is at least {TOUCH:g} m less than rim")
+            raise ValueError(f"the advance must be at least {TOUCH:g} m less than rim")
         return value
 
     def plan_straight_insertion(self) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +159,7 @@ class Bounds(Options):
             return phases  # the errors of `lower` and `upper` are reported instead
         lower, upper = _filled(info.data["lower"], -np.inf), _filled(info.data["upper"], np.inf)
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
-            raise ValueError("bounds that change need phases, and for each phase a list in lower and a list in upper")
+            raise ValueError("without phases, lower and upper are one list each; with phases, one list for each phase")
         if phases is not None and (phases[0] != 0.0 or any(np.diff([*phases, 1.0]) <= 0.0)):
             raise ValueError("phases begin at 0, increase, and are below 1")
         for bound in (np.isfinite(lower), np.isfinite(upper)):
@@ -194,17 +195,20 @@ def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
 
 
 class DemonstrationFile(PriorOptions):
-    """Demonstrations in the folder."""
+    """Demonstrations in the task folder, and the fit of their reference trajectory."""
 
     file: str = Field("demonstrations.npz", description="file .npz or .csv of poses in the target frame")
     components: int | None = Field(
-        None, ge=1, description="components of the Gaussian mixture; default: by the Bayesian information criterion"
+        None,
+        ge=1,
+        description="number of components of the Gaussian mixture; default: selected by the Bayesian information "
+        "criterion",
     )
     floor: Numbers = Field(
         REPEATABILITY_STD,
         min_length=6,
         max_length=6,
-        description="standard deviation of a hand's repeatability, whose square is added to the variances [m], [rad]",
+        description="standard deviation of a hand's repeatability, added to the covariance as its square [m], [rad]",
     )
 
     def reference(self, folder: Path) -> ReferenceTrajectory:
@@ -218,7 +222,7 @@ class Recommended(Options):
     environment: dict[str, Any] = Field(
         {
             "fixture_offset": "per_episode",
-            "offset_range": (1.5 * MM, 2.0 * MM),  # a straight insertion must fail; the bounds must allow the offsets
+            "offset_range": (1.5 * MM, 2.0 * MM),  # too large for a straight insertion, within the default bounds
             "observation": "center_of_pressure",
             "reward": "aligned",
             "action_repeat": 5,
@@ -260,7 +264,7 @@ class PartTaskFile(Options):
         COLLISION_FORCE, ge=1, le=60, description="force that ends an episode as a collision [N]"
     )
     time_step: Number | None = Field(None, gt=0, description="time step of the simulation [s]; default: the station's")
-    stiction_tolerance: Number = Field(1e-5, gt=0, description="largest creep of a sticking contact [m/s]")
+    stiction_tolerance: Number = Field(1e-5, gt=0, description="largest slip speed of a sticking contact [m/s]")
     demonstrations: DemonstrationFile = DemonstrationFile.model_validate({})
     action_dims: tuple[int, ...] | None = Field((0, 1), description="indices of the outputs that an action moves")
     sides: tuple[str, ...] = Field((), description="symmetries of both parts: see models/parts/symmetry.py")
