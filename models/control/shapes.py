@@ -73,7 +73,8 @@ def _finite(values: ArrayLike, what: str) -> np.ndarray:
 
 def _length(value: float, what: str, *, can_be_zero: bool = False) -> float:
     if not (0.0 < value < math.inf or (can_be_zero and value == 0.0)):
-        raise InputError(f"{what} must be positive, not {brief(value)}")
+        bound = "not negative" if can_be_zero else "positive"
+        raise InputError(f"{what} must be finite and {bound}, not {brief(value)}")
     return float(value)
 
 
