@@ -29,7 +29,7 @@ class CommandFilter(LeafSystem):
         - intervention
 
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1
-    if the law had to change the command, or the last command is repeated.
+    if the law intervened (see its class), or the last command is repeated.
 
     Args:
         law: Law of the filter.
@@ -56,7 +56,7 @@ class CommandFilter(LeafSystem):
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
     get_safe_pose_output_port = output_getter("safe_pose", "safe command, (O,)")
-    get_intervention_output_port = output_getter("intervention", "flag that the law changed the command, (1,)")
+    get_intervention_output_port = output_getter("intervention", "flag that the law intervened, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._law.start(declare.start_pose(self._pose_port, context)))

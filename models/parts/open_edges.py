@@ -16,8 +16,8 @@ _AREA = 1e-6  # relative difference of areas that counts as rounding
 
 def find_open_edges(triangles: np.ndarray) -> np.ndarray:
     """Return the edges (E, 2) of triangles (T, 3) that are not balanced by opposite edges of other triangles."""
-    edges, balance, uses, _ = _count_edges(triangles)
-    return edges[(balance != 0) | (uses % 2 != 0)]
+    edges, balance, _, _ = _count_edges(triangles)
+    return edges[balance != 0]
 
 
 def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:

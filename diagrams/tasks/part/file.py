@@ -338,13 +338,14 @@ def read_task_file(folder: Path) -> PartTaskFile:
 
 
 def task_folder_digest(folder: Path) -> str:
-    """Return a digest of `task.yaml` without its measurements, and of all files that `task.yaml` names.
+    """Return a digest of `task.yaml`, of whose measurements only the clearance counts, and of all files that it names.
 
     Raises:
         InputError: As `read_task_file`.
     """
     file = read_task_file(folder)
     content = hashlib.blake2b(file.model_dump_json(exclude={"measured"}).encode(), digest_size=16)
+    content.update(repr(file.clearance).encode())  # it determines the hold tests
     for name in file.files:
         content.update(hashlib.blake2b((folder / name).read_bytes()).digest())
     return content.hexdigest()

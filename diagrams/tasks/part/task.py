@@ -273,7 +273,7 @@ class PartInsertion(DemonstratedInsertion):
         return bounds.constraints(self.reference().num_steps)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return D and y0 that estimate height and turn; the lateral offset is not estimated but checked by pushes."""
+        """Return D and y0 of an estimate D x + y0 of height and turn; pushes check the lateral offset instead."""
         D = np.zeros((POSE_SIZE, POSE_SIZE))
         D[2, 2] = D[5, 3] = 1.0
         return D, np.zeros(POSE_SIZE)

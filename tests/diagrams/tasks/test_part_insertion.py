@@ -13,7 +13,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE
-from guiderail.diagrams.tasks.part.file import Bounds, read_task_file
+from guiderail.diagrams.tasks.part.file import Bounds, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.task import load_task_folder, write_workcell
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
@@ -126,6 +126,14 @@ def test_folder_is_the_same_task_until_a_file_changes(tmp_path):
             (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
         tasks.append(load_task_folder(folder))
     assert len(set(tasks)) == 5
+
+
+def test_of_the_measurements_only_the_clearance_changes_the_digest(tmp_path):
+    digests = []
+    for clearance, speed in ((0.5, 3.0), (0.5, 4.0), (0.2, 4.0)):
+        write(tmp_path / "task", measured={"clearance_mm": clearance, "real_time_factor": speed})
+        digests.append(task_folder_digest(tmp_path / "task"))
+    assert digests[0] == digests[1] != digests[2], "the clearance determines the hold tests"
 
 
 @pytest.mark.parametrize("kind", ["per_run", "none"])
