@@ -23,6 +23,8 @@ from guiderail.diagrams.tasks.registry import (
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 
+_POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in its folder
+
 
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     """Return the name of a task, given its name or its folder's path, and the imports that a run of it needs.
@@ -40,7 +42,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     """Return a digest of the files that a task consists of; empty if all of them are installed.
 
     These are the files of the task folder, the files that an option of the environment names, such as demonstrations,
-    and the imported files, as `import_modules` returns them.
+    the policy of a folder that an option names, such as a base policy, and the imported files, as `import_modules`
+    returns them.
 
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.
@@ -52,7 +55,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
 
         folder_digest = task_folder_digest(folder)
     named = [*imports, *(value for _, value in sorted(environment.items()) if isinstance(value, str))]
-    files = [path for path in map(Path, named) if path.is_absolute() and folder not in path.parents and path.is_file()]
+    paths = [path for path in map(Path, named) if path.is_absolute() and folder not in (path, *path.parents)]
+    files = [file for path in paths for file in (path, *(path / name for name in _POLICY_FILES)) if file.is_file()]
     if not files:
         return folder_digest
     digest = hashlib.blake2b(folder_digest.encode(), digest_size=16)

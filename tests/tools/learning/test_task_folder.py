@@ -5,12 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import yaml
 
 import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
 from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.cache import episodes_file
 from guiderail.tools.experiments.declaration import Study
@@ -83,6 +85,34 @@ def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
     (folder / "task.yaml").write_text(yaml.safe_dump(TASK | {"measured": {"clearance": 1}}))
     assert files() == before, "nothing reads what was measured"
     (folder / "part.obj").write_text(CHANGES["part.obj"])
+    assert all(one != other for one, other in zip(files(), before, strict=True))
+
+
+def test_stored_episodes_are_of_the_content_of_the_base_policy(tmp_path):
+    def train(bias):
+        layers = [(np.zeros((8, 5), np.float32), np.full(8, bias, np.float32))]
+        description = {"observation_shape": [5], "action_low": [-1] * 8, "action_high": [1] * 8, "chunk": [1, 4, 2]}
+        Policy(layers, description).save(tmp_path)
+
+    train(0.0)
+    environment = {"guidance": "kgrl_base_policy", "base_policy": str(tmp_path)}
+    config = configure("NarrowPassage", environment, episodes=2)
+    declaration = {
+        "name": "chunks",
+        "task": "NarrowPassage",
+        "env": environment,
+        "methods": {"zero": {"policy": "zero"}},
+        "seeds": [0],
+    }
+    job = Job(Study.model_validate(declaration), "zero", 0, tmp_path)
+
+    def files():
+        return episodes_file(tmp_path, "zero", config, config.environment, episodes=2), digest(job)
+
+    before = files()
+    (tmp_path / "episodes.csv").write_text("")
+    assert files() == before, "only the policy matters"
+    train(0.5)
     assert all(one != other for one, other in zip(files(), before, strict=True))
 
 
