@@ -58,7 +58,16 @@ class Camera:
     frame: str | None = None  # name of the frame of the plant that carries the camera; None: the world
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixel coordinates (n, 2), from the upper left corner, of points (n, 3) in the world [m]."""
+        """Return the pixel coordinates (n, 2), from the upper left corner, of points (n, 3) in the world [m].
+
+        Raises:
+            InputError: If the camera is not fixed in the world.
+        """
+        if self.frame is not None:
+            raise InputError(
+                f"a camera that moves with the frame {self.frame!r} has no fixed pose to project points of the world "
+                "with: use a camera that is fixed in the world"
+            )
         p_C = self.X_WC.inverse() @ np.asarray(points, float).T
         focal = 0.5 * self.size[1] / np.tan(0.5 * self.vertical_fov)
         return (focal * p_C[:2] / p_C[2]).T + 0.5 * np.array(self.size)

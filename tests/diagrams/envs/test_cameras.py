@@ -26,6 +26,18 @@ def test_camera_without_a_level_horizon_is_refused(target):
         look_at(np.array([0.5, 0.0, 1.0]), np.array(target))
 
 
+def test_project_returns_pixels_when_camera_is_fixed_in_the_world():
+    camera = Camera((40, 20), np.deg2rad(90.0), look_at(np.zeros(3), np.array([1.0, 0.0, 0.0])))
+    points = [[2.0, 0.0, 0.0], [2.0, 1.0, 0.0], [2.0, 0.0, 1.0]]
+    np.testing.assert_allclose(camera.project(points), [[20.0, 10.0], [15.0, 10.0], [20.0, 5.0]])
+
+
+def test_project_is_refused_when_a_frame_carries_the_camera():
+    camera = Camera((40, 20), np.deg2rad(90.0), RigidTransform(), frame="wrist")
+    with pytest.raises(InputError, match=r"'wrist'.*fixed in the world"):
+        camera.project(np.ones((1, 3)))
+
+
 def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
     (tmp_path / "triton.py").write_text("")
     monkeypatch.syspath_prepend(str(tmp_path))
