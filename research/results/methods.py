@@ -12,6 +12,7 @@ import pandas as pd
 
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.experiments.declaration import load_study
+from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.tables import read_table
 from research.results.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
@@ -427,7 +428,10 @@ def knowledge(section: Section, tables: Path) -> list[str]:
 
 
 def demonstrated_episodes(row: Row) -> int:
-    """Return the number of episodes of a demonstrator that a method of a study learns from."""
+    """Return the number of episodes of a demonstrator that a method of a study learns from.
+
+    The imports of the study are executed only if the default of the method's learner is needed.
+    """
     study = load_study(study_path(row.study))
     choices = [study.learner, study.methods[row.method].learner]
     algorithm, preset = (
@@ -435,8 +439,10 @@ def demonstrated_episodes(row: Row) -> int:
         for name in ("algorithm", "preset")
     )
     settings = {**choices[0].settings, **choices[1].settings}
-    default = 0 if algorithm is None else resolve_preset(preset, algorithm).demonstration_episodes
-    return int(settings.get("demonstration_episodes", default))
+    if "demonstration_episodes" in settings or algorithm is None:
+        return int(settings.get("demonstration_episodes", 0))
+    import_modules(study.imports)  # modules of this checkout, because the study is
+    return resolve_preset(preset, algorithm).demonstration_episodes
 
 
 def _is_trained(seeds: pd.DataFrame) -> bool:

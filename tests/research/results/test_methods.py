@@ -1,14 +1,18 @@
 """Tables of all methods, on the pages of results and in the README."""
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from guiderail.tools.experiments.declaration import load_study
+from guiderail.tools.learning.config import LEARNERS
 from research.results.methods import (
     BASELINES,
     NO_DEMONSTRATION,
     SECTIONS,
+    Row,
+    Section,
     knowledge,
     readme_table,
     task_table,
@@ -115,6 +119,14 @@ def test_methods_of_unequal_knowledge_are_marked():
     (sentence,) = knowledge(hard, TABLES)
     assert "equal knowledge.** 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other" in sentence
     assert knowledge(SECTIONS["BncConnector"][0], TABLES) == []
+
+
+def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
+    monkeypatch.delitem(LEARNERS._entries, "plain_tqc", raising=False)
+    monkeypatch.delitem(sys.modules, "research.benchmarks.learner", raising=False)
+    rows = [Row("here", "connector_learners", "here"), Row("Stable-Baselines3", "connector_learners", "sb3_contrib")]
+    assert knowledge(Section("Learners", rows), TABLES) == []
+    assert "plain_tqc" in LEARNERS.names()
 
 
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
