@@ -26,7 +26,7 @@ from guiderail.tools.learning.learner import described_observation, learner_argu
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.learning.train import configure
-from guiderail.tools.tables import write_table
+from guiderail.tools.tables import read_table, write_table
 from research.command import Parser, print_result, run_program
 from research.distillation import median_time, teacher_actions
 
@@ -103,11 +103,13 @@ def train_both(out: Path, episodes: int, refinement: int, seed: int) -> None:
         for name in ("teacher", "student", "refined"):
             (out / name).mkdir(parents=True, exist_ok=True)
         for index in range(episodes):
-            rows.append({"acting": "teacher", **rollout(envs[0], teacher.act, teacher, copied, index=index)})
+            rows.append(
+                {"seed": seed, "acting": "teacher", **rollout(envs[0], teacher.act, teacher, copied, index=index)}
+            )
         teacher.policy(description).save(out / "teacher")
         student.policy(description).save(out / "student")
         for index in range(episodes, episodes + refinement):
-            rows.append({"acting": "student", **rollout(envs[1], student.act, student, index=index)})
+            rows.append({"seed": seed, "acting": "student", **rollout(envs[1], student.act, student, index=index)})
         student.policy(description).save(out / "refined")
         write_table(out / "training", rows)
     finally:
@@ -159,11 +161,13 @@ def compare(
         seed: Seed of training.
 
     Raises:
-        InputError: If there is no episode.
+        InputError: If there is no episode, or the policies in the folder were trained with other arguments.
     """
     if min(episodes, training, refinement) < 1:
         raise InputError(f"give at least one episode each, not {episodes}, {training} and {refinement}")
-    if not (out / "training.csv").exists():
+    if (out / "training.csv").exists():
+        _refuse_other_training(out, training, refinement, seed)
+    else:
         train_both(out, training, refinement, seed)
     times, rows = times_per_action(out), []
     for number, variant in enumerate(VARIANTS):
@@ -189,6 +193,18 @@ def compare(
         )
     write_table(out / "alongside", rows)
     return rows
+
+
+def _refuse_other_training(out: Path, episodes: int, refinement: int, seed: int) -> None:
+    """Raise an InputError if the policies in a folder were trained with another seed or number of episodes."""
+    rows = read_table(out / "training.csv")
+    # Older tables have no seed.
+    acting, seeds = (rows[name].tolist() if name in rows else [] for name in ("acting", "seed"))
+    if acting != ["teacher"] * episodes + ["student"] * refinement or {*seeds} != {seed}:
+        raise InputError(
+            f"{out} has policies that were not trained with seed {seed}, {episodes} episodes of the teacher and "
+            f"{refinement} of the student: give their --seed, --training and --refinement, or another --out"
+        )
 
 
 def main(arguments: list[str]) -> None:

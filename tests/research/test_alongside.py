@@ -8,6 +8,7 @@ import research.alongside as alongside
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.tables import write_table
 
 
 class RecordingStudent:
@@ -45,7 +46,9 @@ def test_equivalent_actions_command_nearly_the_same(action):
     np.testing.assert_allclose(other[:size, 2:], commanded[:size, 2:], atol=2e-2)
 
 
-def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, monkeypatch):
+@pytest.fixture
+def evaluated(monkeypatch):
+    """Replace training and evaluation; return the list of evaluated variants and numbers of episodes."""
     evaluated = []
 
     def evaluate(out, variant, episodes, seed, run_seed):
@@ -53,16 +56,29 @@ def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, monke
         columns = ("peak_force", "jerk_commanded_linear", "max_commanded_violation")
         return pd.DataFrame([{"success": 1, **dict.fromkeys(columns, 1.0)}] * episodes)
 
-    def train(out, *arguments):
-        out.mkdir()
-        (out / "training.csv").write_text("")
+    def train(out, episodes, refinement, seed):
+        acting = ["teacher"] * episodes + ["student"] * refinement
+        write_table(out / "training", [{"seed": seed, "acting": one} for one in acting])
 
     monkeypatch.setattr(alongside, "evaluate_variant", evaluate)
     monkeypatch.setattr(alongside, "train_both", train)
     monkeypatch.setattr(alongside, "times_per_action", lambda out: {"teacher": 1.0})
+    return evaluated
+
+
+def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, evaluated):
     for _ in range(2):
         rows = alongside.compare(tmp_path / "out", episodes=11)
         assert [row["variant"] for row in rows] == list(alongside.VARIANTS)
         assert len(evaluated) == 2 * len(alongside.VARIANTS)
     with pytest.raises(InputError, match="at least one"):
         alongside.compare(tmp_path / "out", episodes=0)
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"training": 3}, {"refinement": 2}])
+def test_comparison_is_refused_when_other_training_is_stored(change, tmp_path, evaluated):
+    given = {"episodes": 1, "training": 2, "refinement": 1, "seed": 0}
+    alongside.compare(tmp_path, **given)
+    with pytest.raises(InputError, match="--seed, --training and --refinement, or another --out"):
+        alongside.compare(tmp_path, **given | change)
+    assert len(evaluated) == len(alongside.VARIANTS)
