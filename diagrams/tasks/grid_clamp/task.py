@@ -43,7 +43,7 @@ A clamp next to its holes is pressed with 27 N and pushed sideways with 2 N, a t
 0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s this drift decides
 whether the clamp slips in by itself or stands still.
 """
-SEATED_HEIGHT = 0.5e-3  # [m] height below which a clamp has snapped in
+SEATED_HEIGHT = 0.5e-3  # [m] largest deviation of a seated clamp along z
 SEATED_OFFSET = 1.0e-3  # [m] largest lateral offset of a seated clamp
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
@@ -100,7 +100,7 @@ class GridClampWorkcell(MovableWorkcell):
     def is_seated(self, clamp: np.ndarray) -> bool:
         """Return True if a clamp with X_GClamp, as position and rotation vector (6,), has snapped in."""
         return bool(
-            clamp[2] - self.X_FT.translation()[2] < SEATED_HEIGHT and np.hypot(clamp[0], clamp[1]) < SEATED_OFFSET
+            abs(clamp[2] - self.X_FT.translation()[2]) < SEATED_HEIGHT and np.hypot(clamp[0], clamp[1]) < SEATED_OFFSET
         )
 
 

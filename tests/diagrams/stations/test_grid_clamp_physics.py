@@ -46,6 +46,24 @@ def test_clamp_snaps_in_with_at_most_10_n(inserted):
     assert np.abs(recording["wrench"][:, :3]).max() <= 10.0
 
 
+@pytest.mark.parametrize(
+    ("position_mm", "is_seated"),
+    [
+        ((0.0, 0.0, 0.0), True),
+        ((0.0, 0.0, 0.4), True),
+        ((0.0, 0.0, -0.4), True),
+        ((0.0, 0.0, 0.6), False),
+        ((0.0, 0.0, -0.6), False),  # the shoulder would be below the table's face
+        ((0.0, 0.0, -50.0), False),
+        ((1.1, 0.0, 0.0), False),
+    ],
+)
+def test_clamp_is_seated_only_near_the_target(position_mm, is_seated):
+    clamp = np.zeros(6)
+    clamp[:3] = WORKCELL.X_FT.translation() + np.array(position_mm) * MM
+    assert WORKCELL.is_seated(clamp) is is_seated
+
+
 def test_snap_resists_then_yields(inserted):
     """The force grows up to the lip, drops behind it, and grows again at the shoulder."""
     _, recording = inserted
