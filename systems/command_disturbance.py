@@ -11,9 +11,10 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class CommandDisturbance(LeafSystem):
     """Delay commands and lose some of them at random; a lost command is replaced by the last delivered one.
 
-        y_n = y_{n−1} with probability p, otherwise u_{n−k}
+        y_n = y_{n−1} with probability p, otherwise u_{n−k},  n = 0, 1, …
 
-    Before the first command the output is the measured pose.
+    where y_{−1} and u_{−1}, …, u_{−k} are the measured pose at initialization. Every command, also the first one, is
+    therefore delayed by k periods.
 
     .. pydrake_system::
 
@@ -77,8 +78,11 @@ class CommandDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state(self._count).value()[0] + 1.0
         discrete_state.set_value(self._count, [count])
-        discrete_state.set_value(self._last_delivered, self._delivered(context))
-        if self._delay_line is not None:
+        # At time zero no period has ended: the values from before this instant's updates are no command.
+        has_ended = context.get_time() > 0
+        if has_ended:
+            discrete_state.set_value(self._last_delivered, self._delivered(context))
+        if has_ended and self._delay_line is not None:
             command = self._command_port.Eval(context)
             line = context.get_discrete_state(self._delay_line).value()
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(command) :], command]))

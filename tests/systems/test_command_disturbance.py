@@ -11,10 +11,10 @@ from guiderail.systems import CommandDisturbance
 PERIOD, POSE = 0.125, -5.0
 
 
-def delivered(steps=12, seed=0, **options):
-    """Return the delivered commands of each period, for commands that count the periods."""
+def delivered(steps=12, seed=0, first=0.0, **options):
+    """Return the delivered commands of each period, for commands that count the periods from `first`."""
     builder = DiagramBuilder()
-    ramp = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 500.0 * PERIOD], [[0.0, 500.0]]))
+    ramp = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 500.0 * PERIOD], [[first, first + 500.0]]))
     ramp = builder.AddSystem(ramp)
     hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
     pose = builder.AddSystem(ConstantVectorSource([POSE]))
@@ -37,10 +37,17 @@ def test_every_command_is_delivered_without_disturbance():
     np.testing.assert_allclose(delivered(), np.arange(12.0), atol=1e-9)
 
 
-def test_commands_arrive_later_by_the_delay():
-    outputs = delivered(delay=2)
-    np.testing.assert_allclose(outputs[2:], np.arange(10.0), atol=1e-9)
-    assert outputs[0] == POSE
+@pytest.mark.parametrize("delay", [1, 2, 5])
+def test_every_command_arrives_later_by_the_delay(delay):
+    """The first command is 7. The output of the hold before its first update is 0, which is no command."""
+    outputs = delivered(first=7.0, delay=delay)
+    np.testing.assert_array_equal(outputs[:delay], POSE)
+    np.testing.assert_allclose(outputs[delay:], 7.0 + np.arange(12.0 - delay), atol=1e-9)
+
+
+def test_measured_pose_replaces_the_first_command_if_it_is_lost():
+    firsts = [delivered(1, seed, first=7.0, loss_probability=0.5)[0] for seed in range(20)]
+    assert set(firsts) == {POSE, 7.0}
 
 
 def test_lost_command_is_replaced_by_the_last_delivered_one():
