@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,19 +154,21 @@ class SkillExecutor:
         return (self._skill_station if is_skill else self._station), self._simulator.get_mutable_context()
 
     def _step(self) -> Outcome | None:
-        """Advance by a control step; return the outcome if the arm is stopped or must be stopped."""
+        """Advance by a control step; return the outcome if the arm is stopped or must be stopped.
+
+        The `steps` of the outcome are 0.
+        """
         station, root_context = self._active_station()
         self._clock.advance(self._simulator, station, self._steps)
         context = station.GetMyContextFromRoot(root_context)
         arm_state, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("arm_state", "fault"))
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
-        steps = len(self.trace)
         if arm_state in (ArmState.DAMPING, ArmState.OFF):
-            return Outcome(Fault(fault), describe_stop(Fault(fault), station.driver), steps)
+            return Outcome(Fault(fault), describe_stop(Fault(fault), station.driver), 0)
         if self._is_stop_requested():
-            return Outcome(Fault.USER_STOP, Fault.USER_STOP.description, steps)
+            return Outcome(Fault.USER_STOP, Fault.USER_STOP.description, 0)
         if force > limit:
-            return Outcome(Fault.FORCE_LIMIT, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", steps)
+            return Outcome(Fault.FORCE_LIMIT, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", 0)
         return None
 
     def _approach(self, pose: np.ndarray) -> Outcome | None:
@@ -205,7 +207,7 @@ class SkillExecutor:
             outcome = self._step()
             self._record(context)
             if outcome is not None:
-                return outcome
+                return replace(outcome, steps=len(self.trace))  # the step in which the arm was stopped counts
         return Outcome(Fault.NONE, COMPLETED, len(self.trace))
 
     def _record(self, context: Context) -> None:

@@ -166,6 +166,26 @@ def test_execution_ends_when_the_operator_stops(make_executor):
     assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.USER_STOP, 1, 0)
 
 
+@pytest.mark.parametrize("num_steps", [1, 5])
+def test_outcome_counts_the_step_in_which_the_operator_stops(make_executor, tmp_path, num_steps):
+    """The recording, its metadata and the message have the same number of control steps."""
+    messages, executors = [], []
+
+    def is_stop_requested():
+        # The trace is one step behind while a step is executed.
+        return any(one._simulator.get_system() is one._diagram and len(one.trace) >= num_steps - 1 for one in executors)
+
+    executor, _ = make_executor(is_stop_requested=is_stop_requested)
+    executors.append(executor)
+    outcome = executor.run(messages.append)
+    assert (outcome.fault, outcome.steps, len(executor.trace)) == (Fault.USER_STOP, num_steps, num_steps)
+    executor.save(tmp_path, outcome, {}, messages.append)
+    metadata = json.loads((tmp_path / "episode-000000.json").read_text())
+    assert metadata["steps"] == len(pd.read_parquet(tmp_path / "episode-000000.parquet")) == num_steps
+    assert metadata["peak_force"] == executor.trace.force.max()
+    assert f"after {num_steps} control steps" in messages[-1]
+
+
 def test_execution_ends_when_the_force_exceeds_the_tasks(make_executor):
     """The limit is below the force of the impedance during the approach."""
     executor, _ = make_executor()
