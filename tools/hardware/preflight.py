@@ -16,7 +16,9 @@ from guiderail.models.common.transforms import DEGREE, MM, pose_difference
 from guiderail.tools.hardware.operator import confirm
 
 SPEED, ANGULAR_SPEED = 0.02, 0.1  # speeds of a slow approach [m/s], [rad/s]
-MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum speeds of the way back [m/s], [rad/s]
+# Minimum speeds of the way back [m/s], [rad/s]. A slower motion is repeated at less than twice the minimum speed, so it
+# does not exceed the speed of a slow approach.
+MIN_SPEED, MIN_ANGULAR_SPEED = 0.5 * SPEED, 0.5 * ANGULAR_SPEED
 POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # tolerances of a reached pose [m], [rad]
 SETTLING_TIME = 0.5  # time that the target is held at the end of an approach [s]
 

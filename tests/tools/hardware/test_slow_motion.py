@@ -1,8 +1,16 @@
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
-from guiderail.tools.hardware.preflight import MIN_ANGULAR_SPEED, MIN_SPEED, pose_distance, retrace
+from guiderail.tools.hardware.preflight import (
+    ANGULAR_SPEED,
+    MIN_ANGULAR_SPEED,
+    MIN_SPEED,
+    SPEED,
+    pose_distance,
+    retrace,
+)
 
 PERIOD = 0.02
 
@@ -25,6 +33,22 @@ def test_retrace_skips_segments_at_rest():
         assert distance <= MIN_SPEED * PERIOD + np.abs(steps[:, :3]).max() * np.sqrt(3)
         assert angle <= MIN_ANGULAR_SPEED * PERIOD + np.abs(steps[:, 3:]).max()
     assert len(poses) < 0.7 * len(path)
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.045, 0.08, 0.2, 0.45, 1.0])
+def test_retrace_turns_at_recorded_or_approach_speed(speed):
+    path = np.zeros((400, 6))
+    path[:, 3] = speed * PERIOD * np.arange(len(path))
+    fastest = max(pose_distance(*pair)[1] for pair in pairwise(retrace(path, PERIOD))) / PERIOD
+    assert fastest <= max(speed, ANGULAR_SPEED) + 1e-9
+
+
+@pytest.mark.parametrize("speed", [0.004, 0.009, 0.03, 0.2])
+def test_retrace_moves_at_recorded_or_approach_speed(speed):
+    path = np.zeros((400, 6))
+    path[:, 0] = speed * PERIOD * np.arange(len(path))
+    fastest = max(pose_distance(*pair)[0] for pair in pairwise(retrace(path, PERIOD))) / PERIOD
+    assert fastest <= max(speed, SPEED) + 1e-9
 
 
 def test_retrace_returns_nothing_for_an_empty_path():

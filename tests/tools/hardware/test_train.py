@@ -384,9 +384,9 @@ def test_reset_repeats_its_path_once_if_the_start_is_not_reached(env, monkeypatc
     env.reset()
     back = [tuple(pose) for pose in path[::-1]]
     commanded = [tuple(pose) for pose in commanded]
-    second = commanded.index(back[-1], commanded.index(back[-1]) + 1)
     there_and_back = back[::-1] + back
-    assert commanded[second : second + len(there_and_back)] == there_and_back
+    first = range(commanded.index(back[-1]) + 1, len(commanded))  # the path's end may be commanded twice in a row
+    assert sum(commanded[step : step + len(there_and_back)] == there_and_back for step in first) == 1
 
 
 def test_reset_has_the_workpiece_released_by_hand_if_the_start_is_not_reached(env, monkeypatch):
