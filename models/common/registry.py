@@ -54,14 +54,20 @@ class Registry(Generic[Entry]):
         """Add an entry; without a value, return a decorator that adds the decorated object.
 
         Raises:
-            InputError: If the name is already used by an object that is defined elsewhere.
+            InputError: If the name is already used by an object that is defined elsewhere, also in a module of the
+                package that is not imported yet.
         """
         if value is None:
             return lambda decorated: self.register(name, decorated)
         origin = _origin(value)
         existing = self._origins.get(name, origin)
-        if name in self._entries and existing != origin:
-            raise InputError(f"there is a {self.noun} {name!r} already, from {existing[0]}: choose another name")
+        is_used, place = name in self._entries and existing != origin, existing[0]
+        if self._decorator is not None and name not in self._entries and name in self._declarations:
+            place = self._declarations[name].module
+            # Not used by another one: the declaring module is being imported, or is run under another name.
+            is_used = place not in sys.modules and origin[0] != _file(place)
+        if is_used:
+            raise InputError(f"there is a {self.noun} {name!r} already, from {place}: choose another name")
         self._entries[name], self._origins[name] = value, origin
         return value
 
@@ -159,6 +165,12 @@ def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str
 def _folders(package: str) -> list[Path]:
     spec = find_spec(package)
     return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec is not None else []
+
+
+def _file(module: str) -> str | None:
+    """Return the path of a module's file, without importing the module; None if there is none."""
+    spec = find_spec(module)
+    return None if spec is None or spec.origin is None else str(Path(spec.origin).resolve())
 
 
 def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, Any]]]:

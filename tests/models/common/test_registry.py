@@ -1,6 +1,8 @@
 """Registries refuse unknown and duplicate names with a sentence."""
 
+import sys
 from dataclasses import dataclass
+from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
@@ -65,5 +67,29 @@ def test_declared_reads_literals_without_importing(tmp_path, monkeypatch):
     assert shapes.declared("triangle", "sides") == 3
     with pytest.raises(NameError, match="register_shape"):  # no literal: the module is imported
         shapes.declared("square", "sides")
-    shapes.register("triangle", SimpleNamespace(sides=30))
+    own = _from(tmp_path / "shapes_of_mine/some.py")
+    shapes.register("triangle", SimpleNamespace(sides=30, build=own))
     assert shapes.declared("triangle", "sides") == 30
+
+
+def test_register_refuses_a_declared_name_before_its_import(tmp_path, monkeypatch):
+    (tmp_path / "lazy_shapes").mkdir()
+    (tmp_path / "lazy_shapes/__init__.py").touch()
+    (tmp_path / "lazy_shapes/some.py").write_text(
+        'from lazy_shapes.kinds import register_shape\n\n\n@register_shape("triangle")\ndef triangle():\n    pass\n'
+    )
+    (tmp_path / "lazy_shapes/kinds.py").write_text(
+        "from guiderail.models.common.registry import Registry\n\n"
+        'SHAPES = Registry("shape", package="lazy_shapes", decorator="register_shape")\n'
+        "register_shape = SHAPES.register\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    shapes = import_module("lazy_shapes.kinds").SHAPES
+    with pytest.raises(InputError, match=r"there is a shape 'triangle' already, from lazy_shapes\.some: choose"):
+        shapes.register("triangle", _from(tmp_path / "other.py"))
+    assert "lazy_shapes.some" not in sys.modules  # a refusal imports nothing
+    triangle = shapes.get("triangle")
+    assert triangle.__module__ == "lazy_shapes.some"
+    with pytest.raises(InputError, match="there is a shape 'triangle' already"):
+        shapes.register("triangle", _from(tmp_path / "other.py"))
+    assert shapes.get("triangle") is triangle
