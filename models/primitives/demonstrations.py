@@ -179,6 +179,9 @@ def _as_list(values: Any, what: str) -> list[Any]:
         raise InputError(f"{what} must be a list, not {brief(values)}") from error
 
 
+MAX_ALIGNED_SAMPLES = 10_000  # largest number of samples of an alignment; memory and time grow with its square
+
+
 def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> Demonstrations:
     """Warp demonstrations in time onto the demonstration of median duration, by dynamic time warping.
 
@@ -193,11 +196,16 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
         Demonstrations on one clock.
 
     Raises:
-        InputError: If the band is out of range.
+        InputError: If the band is out of range, or a demonstration has more than `MAX_ALIGNED_SAMPLES` samples.
     """
     if not 0.0 < band <= 1.0:
         raise InputError(f"the band of an alignment is a share of the duration in (0, 1], not {band}")
     common = demonstrations.resampled()
+    if len(common.times[0]) > MAX_ALIGNED_SAMPLES:
+        raise InputError(
+            f"demonstrations of {len(common.times[0]):,} samples can't be aligned, at most {MAX_ALIGNED_SAMPLES:,}: "
+            "resample them first, for example with demonstrations.resampled(1000)"
+        )
     durations = [t[-1] - t[0] for t in demonstrations.times]
     target = int(np.argsort(durations, kind="stable")[len(durations) // 2])
     stacked = np.stack(common.outputs)
@@ -217,20 +225,31 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
 def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tuple[int, int]]:
     """Return the first and the last sample of `other` (N, O) that match each sample of `target` (N, O)."""
     size = len(target)
-    cost = np.full((size + 1, size + 1), np.inf)
-    cost[0, 0] = 0.0
+    # Of the matrix of costs only two rows are kept, and for each match in the band its predecessor: 0 for the match of
+    # both previous samples, 1 for the previous sample of `target`, 2 for that of `other`.
+    predecessors = np.zeros((size, min(size, 2 * width + 1)), dtype=np.uint8)
+    last = [0.0] + [np.inf] * size
     for i in range(size):
         low, high = max(0, i - width), min(size, i + width + 1)
         distances = np.linalg.norm(other[low:high] - target[i], axis=1)
+        costs, choices = [np.inf] * (size + 1), []
         for j, distance in zip(range(low, high), distances.tolist(), strict=True):
-            cost[i + 1, j + 1] = distance + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
+            cost, choice = last[j], 0
+            if last[j + 1] < cost:
+                cost, choice = last[j + 1], 1
+            if costs[j] < cost:
+                cost, choice = costs[j], 2
+            costs[j + 1] = distance + cost
+            choices.append(choice)
+        predecessors[i, : high - low] = choices
+        last = costs
     matches = [(size, -1)] * size
-    i, j = size, size
-    while i > 0 and j > 0:
-        first, last = matches[i - 1]
-        matches[i - 1] = min(first, j - 1), max(last, j - 1)
-        steps = ((i - 1, j - 1), (i - 1, j), (i, j - 1))
-        i, j = min(steps, key=lambda at: cost[at])
+    i, j = size - 1, size - 1
+    while i >= 0 and j >= 0:
+        first, end = matches[i]
+        matches[i] = min(first, j), max(end, j)
+        choice = predecessors[i, j - max(0, i - width)]
+        i, j = i - (choice != 2), j - (choice != 1)
     return matches
 
 

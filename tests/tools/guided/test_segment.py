@@ -1,10 +1,13 @@
 """Cutting at events, discrete outputs and alignment in time."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from guiderail import Demonstrations, Frame, Segment, align_demonstrations, cut_demonstrations, find_events
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.demonstrations import MAX_ALIGNED_SAMPLES, _warping_path
 
 
 def recordings():
@@ -99,6 +102,47 @@ def test_alignment_moves_an_event_to_the_same_phase():
     assert np.ptp(at[1]) <= 2
     assert all(y.min() >= 0 and y.max() <= 1 for y in after.outputs)
     np.testing.assert_array_equal(after.outputs[1], steps[1])
+
+
+def path_of_the_full_matrix(target, other, width):
+    """Return the warping path from the matrix of all costs."""
+    size = len(target)
+    cost = np.full((size + 1, size + 1), np.inf)
+    cost[0, 0] = 0.0
+    for i in range(size):
+        for j in range(max(0, i - width), min(size, i + width + 1)):
+            distance = np.linalg.norm(other[j : j + 1] - target[i], axis=1)[0]
+            cost[i + 1, j + 1] = distance + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
+    matched, i, j = [[] for _ in target], size, size
+    while i > 0 and j > 0:
+        matched[i - 1].append(j - 1)
+        i, j = min(((i - 1, j - 1), (i - 1, j), (i, j - 1)), key=lambda at: cost[at])
+    return [(min(samples), max(samples)) for samples in matched]
+
+
+@pytest.mark.parametrize("decimals", [0, 6])  # rounded samples have equal costs
+@pytest.mark.parametrize("width", [1, 7, 60])
+def test_alignment_path_equals_that_of_the_full_matrix(width, decimals):
+    rng = np.random.default_rng(width)
+    target, other = (np.round(rng.normal(size=(50, 2)).cumsum(axis=0), decimals) for _ in range(2))
+    assert _warping_path(target, other, width) == path_of_the_full_matrix(target, other, width)
+
+
+def test_alignment_needs_less_than_a_byte_per_pair_of_samples():
+    rng = np.random.default_rng(0)
+    target, other = (rng.normal(size=(1000, 2)).cumsum(axis=0) for _ in range(2))
+    tracemalloc.start()
+    _warping_path(target, other, 200)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1000**2
+
+
+def test_alignment_of_too_many_samples_is_refused():
+    times = np.linspace(0.0, 1.0, MAX_ALIGNED_SAMPLES + 1)
+    long = Demonstrations(times, [np.sin(times)[:, None], times[:, None]])
+    with pytest.raises(InputError, match=r"10,001 samples can't be aligned, at most 10,000: resample them first"):
+        align_demonstrations(long)
 
 
 @pytest.mark.parametrize("band", [0.0, -1.0, 1.5])
