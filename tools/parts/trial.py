@@ -52,7 +52,7 @@ class Trial:
     penetration: float  # largest penetration of the parts [m], without snapping pieces
     resting_penetration: float  # largest penetration at the end of the motion, while the resting plug is pushed [m]
     snap: float  # largest penetration of snapping pieces [m]
-    real_time_factor: float  # duration of the motion per CPU time, also if a blocked plug ended the trial early
+    real_time_factor: float  # simulated time per CPU time; less is simulated than the motion lasts if a plug is blocked
     recording: Recording  # poses, wrench and force at the control steps
 
 
@@ -175,7 +175,7 @@ def insert(
         penetration=depths.deepest,
         resting_penetration=depths.deepest_at_rest,
         snap=depths.deepest_snap,
-        real_time_factor=float(times[-1] / max(spent, 1e-9)),
+        real_time_factor=float(driven.context.get_time() / max(spent, 1e-9)),
         recording=recording,
     )
 

@@ -195,6 +195,28 @@ def test_parts_of_convex_pieces_are_offered_in_mujoco(folder):
     assert info["is_success"]
 
 
+@pytest.mark.parametrize("offset", [0.0, 1.5e-3])
+def test_real_time_factor_counts_only_simulated_time(folder, monkeypatch, offset):
+    """With a clock that shows the simulated time instead of the CPU time, the factor is one."""
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.tools.parts import trial
+
+    contexts = []
+
+    class Driven(trial.DrivenStation):
+        def __init__(self, *arguments, **keywords):
+            super().__init__(*arguments, **keywords)
+            contexts.append(self.context)
+
+    monkeypatch.setattr(trial, "DrivenStation", Driven)
+    monkeypatch.setattr(trial, "time", SimpleNamespace(process_time=lambda: contexts[0].get_time()))
+    file = read_task_file(folder)
+    result = trial.insert(folder, file, offset=(offset, 0.0))
+    is_complete = contexts[0].get_time() == pytest.approx(file.motion.plan_straight_insertion()[0][-1], abs=0.02)
+    assert (result.success, is_complete) == (offset == 0.0, offset == 0.0)
+    assert result.real_time_factor == pytest.approx(1.0)
+
+
 def test_turned_socket_accepts_a_turned_plug_without_a_turn_at_the_end(folder):
     from guiderail.diagrams.envs.config import EnvConfig
 
