@@ -355,7 +355,7 @@ def test_screw_is_inserted_by_its_turn(tmp_path, capsys):
     assert (file.motion.turn, file.motion.advance) == (pytest.approx(-180.0), pytest.approx(4e-3))
     assert file.measured["inserted"]
     assert file.measured["penetration_mm"] < 0.5 * file.measured["clearance_mm"]
-    with pytest.raises(ValueError, match="the advance is at least"):
+    with pytest.raises(ValueError, match="the advance must be at least"):
         MotionNumbers.model_validate({"travel": 0.02, "rim": 0.004, "turn": -180.0, "advance": 0.004})
 
 
