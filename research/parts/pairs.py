@@ -53,9 +53,10 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
         unit: Unit of all files.
 
     Raises:
-        InputError: If there are no pairs, or two pairs have the same name, by which their results are stored.
+        InputError: If there are no pairs, two pairs have the same name, by which their results are stored, or a file
+            of IndustReal or Factory is in two folders.
     """
-    files = {path.name: path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS}
+    meshes = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS]
     names = {
         f"{_INDUSTREAL}{shape}_{size}mm": (
             f"industreal_{shape}_peg_{size}mm.obj",
@@ -69,6 +70,11 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
         for size in ("small", "medium", "large")
     }
     names |= {f"{_FACTORY}{name}": pair for name, pair in _FACTORY_PAIRS.items()}
+    known = {name for pair in names.values() for name in pair}
+    files: dict[str, Path] = {}
+    for path in meshes:
+        if path.name in known and files.setdefault(path.name, path) != path:
+            raise InputError(f"{path.name} is in two folders ({files[path.name].parent}, {path.parent}): remove one")
     pairs = [
         Pair(name, files[plug], files[socket], unit)
         for name, (plug, socket) in names.items()

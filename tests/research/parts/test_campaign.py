@@ -30,6 +30,9 @@ def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_p
         (tmp_path / name).touch()
     with pytest.raises(InputError, match="two pairs are named 'b'"):
         find_pairs(tmp_path)
+    (tmp_path / "c/industreal_gear_small.obj").touch()
+    with pytest.raises(InputError, match=r"industreal_gear_small\.obj is in two folders \(.*/c, .*/d\)"):
+        find_pairs(tmp_path)
 
 
 def test_finished_steps_are_not_repeated(tmp_path):

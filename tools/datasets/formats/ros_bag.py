@@ -112,7 +112,7 @@ def _read_bag(
     if target is not None and kinds[chosen] in (DATA, JOINTS):
         raise InputError(f"{chosen} of {bag} does not state which numbers are a pose: leave --target out")
     if kinds[chosen] == DATA:
-        names = tuple(dimension.label for dimension in messages[0].layout.dim) or POSE_NAMES
+        names = _array_names(messages[0])
         for number, message in enumerate(messages):
             if len(message.data) != len(names):
                 raise InputError(
@@ -136,6 +136,17 @@ def _read_bag(
             f"poses stay in {frame}: to convert them, give the pose of the task's target in it as --target"
         )
     return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumptions
+
+
+def _array_names(message: Any) -> tuple[str, ...]:
+    """Return the names of an array's numbers: the labels of dimensions of size 1, as `write_mcap` writes them.
+
+    The numbers of a single longer dimension are counted. An array without dimensions is a pose.
+    """
+    dimensions = message.layout.dim
+    if len(dimensions) == 1 and dimensions[0].size == len(message.data) > 1:
+        return tuple(f"{dimensions[0].label or 'output'} {number}" for number in range(dimensions[0].size))
+    return tuple(dimension.label for dimension in dimensions) or POSE_NAMES
 
 
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:

@@ -95,6 +95,19 @@ def test_arrays_of_other_sizes_are_refused(tmp_path):
         read_bags(bag, None, None)
 
 
+def test_numbers_of_an_array_with_one_dimension_are_counted(tmp_path):
+    def sized(types, label):
+        dimension = types["MultiArrayDimension"](label=label, size=3, stride=3)
+        layout = types["MultiArrayLayout"](dim=[dimension], data_offset=0)
+        return types["Float64MultiArray"](layout=layout, data=np.arange(3.0))
+
+    result = read_bags(write(tmp_path / "bag", ARRAY, sized, ["force", "force"]), None, None)
+    assert result.names == ("force 0", "force 1", "force 2")
+    np.testing.assert_array_equal(result.outputs[0], [[0, 1, 2]] * 2)
+    unnamed = read_bags(write(tmp_path / "other", ARRAY, sized, ["", ""]), None, None)
+    assert unnamed.names == ("output 0", "output 1", "output 2")
+
+
 @pytest.mark.parametrize(("kind", "make", "one"), [(ARRAY, array, range(6)), (JOINTS, joints, ("ab", (1, 2)))])
 def test_target_is_refused_without_poses(kind, make, one, tmp_path):
     with pytest.raises(InputError, match=r"/it of .* does not state which numbers are a pose: leave --target out"):
