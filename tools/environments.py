@@ -41,9 +41,9 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
 def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
     """Return a digest of the files that a task consists of; empty if all of them are installed.
 
-    These are the files of the task folder, the files that an option of the environment names, such as demonstrations,
-    the policy of a folder that an option names, such as a base policy, and the imported files, as `import_modules`
-    returns them.
+    These are the files of the task folder, the files that an option of the environment names, such as demonstrations
+    or the code of FILE.py:FUNCTION, the policy of a folder that an option names, such as a base policy, and the
+    imported files, as `import_modules` returns them.
 
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.
@@ -54,7 +54,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
         from guiderail.diagrams.tasks.part.file import task_folder_digest  # imports Drake
 
         folder_digest = task_folder_digest(folder)
-    named = [*imports, *(value for _, value in sorted(environment.items()) if isinstance(value, str))]
+    texts = [value for _, value in sorted(environment.items()) if isinstance(value, str)]
+    named = [*imports, *(re.sub(r"\.py:\w+$", ".py", text) for text in texts)]
     paths = [path for path in map(Path, named) if path.is_absolute() and folder not in (path, *path.parents)]
     files = [file for path in paths for file in (path, *(path / name for name in _POLICY_FILES)) if file.is_file()]
     if not files:

@@ -179,7 +179,9 @@ def add_base_policy(source: str) -> str:
     """
     if source in BASE_POLICIES.names() or not is_policy_file(source):
         return source
-    name = source if _function_of(source) is not None else str(Path(source).resolve())
+    module, separator, function = source.rpartition(":") if _function_of(source) is not None else (source, "", "")
+    path = module if separator and not module.endswith(".py") else str(Path(module).resolve())
+    name = path + separator + function
     if name not in BASE_POLICIES.names():
         if Path(source).suffix != ".onnx" and not is_trusted():
             raise InputError(f"the base policy {source} can execute code: give --trust-imports if you trust its origin")

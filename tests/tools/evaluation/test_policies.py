@@ -13,7 +13,7 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import BASE_POLICIES, Policy, chunk_samples, find_base_policy
-from guiderail.tools.environments import check_environment, make_environment
+from guiderail.tools.environments import check_environment, make_environment, task_content
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (
     PredictPolicy,
@@ -111,6 +111,20 @@ def test_base_policy_of_a_file_needs_trust_if_it_executes(tmp_path, monkeypatch,
     with trust_imports():
         check_environment("NarrowPassage", environment | {"base_policy": "policy.pt"})
     assert str(tmp_path / "policy.pt") in base_policies.names()
+
+
+def test_base_policy_of_a_function_is_stored_with_its_path_and_its_code(tmp_path, monkeypatch, base_policies):
+    file = tmp_path / "chunk_of_mine.py"
+    file.write_text("import numpy as np\ndef chunk(observation):\n    return np.zeros((1, 2, 2))\n")
+    monkeypatch.chdir(tmp_path)
+    with trust_imports():
+        environment = check_environment(
+            "NarrowPassage", {"guidance": "kgrl_base_policy", "base_policy": "chunk_of_mine.py:chunk"}
+        )
+    assert environment["base_policy"] == f"{file}:chunk"
+    before = task_content("NarrowPassage", environment, ())
+    file.write_text(file.read_text().replace("zeros", "ones"))
+    assert task_content("NarrowPassage", environment, ()) != before
 
 
 def test_function_of_a_file_is_a_policy(env, tmp_path):
