@@ -74,7 +74,7 @@ class Method(_Strict):
     """Environment and policy that a study compares with others."""
 
     env: dict[str, Any] = {}  # options of the environment, in addition to the study's
-    learner: LearnerChoice = LearnerChoice()  # choices that override the study's
+    learner: LearnerChoice = LearnerChoice()  # choices that override the study's; null stands for the task's own
     policy: str = LEARNED  # "learned", "best_constant", or the name of a baseline or scripted policy
     grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each action component that best_constant tries
     seeds: tuple[Integer, ...] | None = None  # default: the study's; one seed is enough for a policy without learning

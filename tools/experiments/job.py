@@ -89,7 +89,8 @@ class Job:
         """Return the configuration of the run with a number of episodes; raise an InputError as `configure` does."""
         study, method = self.study, self.study.methods[self.method]
         choices = [study.learner, method.learner]
-        given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
+        chosen = {k: getattr(c, k) for c in choices for k in ("algorithm", "preset") if k in c.model_fields_set}
+        given = {k: v for k, v in chosen.items() if v is not None}
         settings = {**study.learner.settings, **method.learner.settings}
         if "init_from" in settings:  # the run of another method of the study
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))

@@ -335,6 +335,13 @@ def test_invalid_study_is_one_sentence_and_writes_nothing(changed, words, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
+def test_null_preset_of_a_method_leaves_the_study_s_out(tmp_path):
+    methods = {"sac": {}, "bc": {"learner": {"algorithm": "bc", "preset": None}}}
+    declaration = {"name": "clamp", "task": "GridClamp", "methods": methods, "seeds": [0], "after_episodes": [5]}
+    study = Study.model_validate(declaration | {"learner": {"algorithm": "sac", "preset": "sac_gridclamp"}})
+    assert [Job(study, name, 0, tmp_path).config(5).learner.algorithm for name in methods] == ["sac", "bc"]
+
+
 def test_job_is_evaluated_after_the_numbers_that_it_reaches():
     methods = {"short": {"learner": {"episodes": 2}}, "long": {}, "nothing": {"policy": "zero"}}
     one = study(methods=methods)
