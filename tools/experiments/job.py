@@ -90,7 +90,7 @@ class Job:
         study, method = self.study, self.study.methods[self.method]
         choices = [study.learner, method.learner]
         chosen = {k: getattr(c, k) for c in choices for k in ("algorithm", "preset") if k in c.model_fields_set}
-        given = {k: v for k, v in chosen.items() if v is not None}
+        given: dict[str, Any] = {k: v for k, v in chosen.items() if v is not None}
         settings = {**study.learner.settings, **method.learner.settings}
         if "init_from" in settings:  # the run of another method of the study
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
