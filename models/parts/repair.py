@@ -1,7 +1,11 @@
-"""Repair of meshes exported from CAD programs to closed solids: slivers, open seams, doubled faces, cavities."""
+"""Repair of meshes exported from CAD programs to closed solids: slivers, open seams, doubled faces, cavities.
+
+The repair of open edges moves no vertex: loose triangles are removed, and flat faces are triangulated again.
+"""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -10,7 +14,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.open_edges import close_edges, find_open_edges
+from guiderail.models.objects.sdf import area_vectors
 from guiderail.models.parts.solids import measure_distance, to_arrays, to_manifold
 from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
 
@@ -151,3 +155,143 @@ def _outward_bodies(solid: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], in
             triangles, inverted = triangles[:, ::-1], inverted + 1
         bodies.append((vertices, triangles))
     return bodies, cavities, inverted
+
+
+_FLAT = 1e-6  # largest distance of a flat face's vertices from its plane, due to rounding in text files [m]
+_MAX_PLANES = 100  # largest number of planes that are tried
+_AREA = 1e-6  # relative difference of areas that counts as rounding
+
+
+def find_open_edges(triangles: np.ndarray) -> np.ndarray:
+    """Return the edges (E, 2) of triangles (T, 3) that are not balanced by opposite edges of other triangles."""
+    edges, balance, _, _ = _count_edges(triangles)
+    return edges[balance != 0]
+
+
+def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the triangles of a mesh (V, 3), (T, 3) after the repair of its open edges; some may remain.
+
+    If the triangles of one plane are removed, the open edges of the others enclose the face in that plane, provided
+    that no triangle is missing elsewhere. The face is replaced only if fewer edges are open afterwards.
+    """
+    triangles = _without_loose_triangles(triangles)
+    left = find_open_edges(triangles)
+    for normal, distance in _planes(vertices, triangles, left):
+        if not len(left):
+            break
+        inside = (np.abs(vertices @ normal - distance) < _FLAT)[triangles].all(axis=1)
+        along = area_vectors(vertices, triangles) @ normal > 0.0
+        # Triangles of the plane with the opposite normal belong to another face, or to this one in wrong orientation.
+        for chosen in (inside, inside & along):
+            face = _fill(vertices, triangles[~chosen], normal, distance)
+            if face is None:
+                continue
+            changed = np.concatenate([triangles[~chosen], face])
+            now = find_open_edges(changed)
+            if len(now) < len(left):
+                triangles, left = changed, now
+                break
+    return triangles
+
+
+def _count_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges (E, 2), lower vertex first, their balance, their number of uses, and the uses (T, 3).
+
+    Each triangle uses three edges; the uses are indices into `edges`. The balance of an edge is the number of uses from
+    its lower to its higher vertex, minus the number of uses in the opposite direction.
+    """
+    uses = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2).astype(np.int64)
+    size = int(triangles.max(initial=0)) + 1
+    keys, inverse = np.unique(uses.min(axis=1) * size + uses.max(axis=1), return_inverse=True)
+    balance = np.bincount(inverse, weights=np.sign(uses[:, 1] - uses[:, 0]), minlength=len(keys)).astype(int)
+    number = np.bincount(inverse, weights=uses[:, 0] != uses[:, 1], minlength=len(keys)).astype(int)
+    return np.column_stack([keys // size, keys % size]), balance, number, inverse.reshape(-1, 3)
+
+
+def _without_loose_triangles(triangles: np.ndarray) -> np.ndarray:
+    """Return triangles without the loose ones: all three edges are open, and would be closed without the triangle."""
+    while True:
+        _, balance, number, used = _count_edges(triangles)
+        signs = np.sign(np.roll(triangles, -1, axis=1) - triangles)
+        loose = np.flatnonzero(((number[used] % 2 == 1) & (balance[used] == signs)).all(axis=1))
+        taken, removed = set[int](), []
+        for triangle in loose.tolist():  # if two loose triangles at one edge were removed, the edge would be open again
+            edges = set(used[triangle].tolist())
+            if not edges & taken:
+                taken |= edges
+                removed.append(triangle)
+        if not removed:
+            return triangles
+        triangles = np.delete(triangles, removed, axis=0)
+
+
+def _planes(vertices: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> list[tuple[np.ndarray, float]]:
+    """Return normal (3,) and distance from the origin [m] of each plane of a triangle at the edges, largest first."""
+    at_edge = np.isin(triangles, edges).sum(axis=1) >= 2
+    near = triangles[at_edge]
+    normals = area_vectors(vertices, near)
+    sizes = np.linalg.norm(normals, axis=1)
+    longest = np.linalg.norm(vertices[near] - vertices[np.roll(near, 1, axis=1)], axis=2).max(axis=1)
+    found: list[tuple[np.ndarray, float]] = []
+    for number in np.argsort(-sizes, kind="stable"):
+        if sizes[number] < 10.0 * _FLAT * longest[number] or len(found) == _MAX_PLANES:
+            continue
+        normal = normals[number] / sizes[number]
+        corners = vertices[near[number]]
+        if not any(n @ normal > 0.0 and (np.abs(corners @ n - d) < _FLAT).all() for n, d in found):
+            found.append((normal, float((corners @ normal).mean())))
+    return found
+
+
+def _fill(vertices: np.ndarray, rest: np.ndarray, normal: np.ndarray, distance: float) -> np.ndarray | None:
+    """Return triangles (T, 3) with a given normal that fill the open edges of `rest` in a plane; None if none can."""
+    edges, balance, _, _ = _count_edges(rest)
+    in_plane = (np.abs(vertices @ normal - distance) < _FLAT)[edges].all(axis=1)
+    edges, balance = edges[in_plane & (balance != 0)], balance[in_plane & (balance != 0)]
+    loops = _loops(np.where(balance[:, None] > 0, edges[:, ::-1], edges)) if (np.abs(balance) == 1).all() else None
+    if not loops:
+        return None
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    axes = np.column_stack([first, np.cross(normal, first)])
+    order = np.concatenate(loops)
+    flat = 1e3 * (vertices[order] - vertices[order[0]]) @ axes
+    polygons = np.split(flat, np.cumsum([len(loop) for loop in loops])[:-1])
+    manifold3d = import_extra("manifold3d")
+    face = np.asarray(manifold3d.triangulate([np.ascontiguousarray(one) for one in polygons])).reshape(-1, 3)
+    enclosed = float(sum(map(_areas, polygons)))
+    if not enclosed > 0.0 or abs(np.abs(_areas(flat[face])).sum() - enclosed) > _AREA * enclosed:
+        return None
+    return order[face]
+
+
+def _areas(polygons: np.ndarray) -> np.ndarray:
+    """Return the areas (...) of counterclockwise polygons (..., V, 2)."""
+    following = np.roll(polygons, -1, axis=-2)
+    return 0.5 * (polygons[..., 0] * following[..., 1] - polygons[..., 1] * following[..., 0]).sum(axis=-1)
+
+
+def _loops(edges: np.ndarray) -> list[list[int]] | None:
+    """Join directed edges (E, 2) to closed loops, lists of distinct vertices; return None if a path remains open."""
+    following = defaultdict(list)
+    for start, end in edges.tolist():
+        following[start].append(end)
+    loops = []
+    for start in list(following):
+        path = [start] if following[start] else []
+        position = {start: 0}
+        while path:
+            if not following[path[-1]]:
+                if len(path) > 1:
+                    return None
+                break
+            vertex = following[path[-1]].pop()
+            if vertex in position:
+                loops.append(path[position[vertex] :])
+                for one in path[position[vertex] + 1 :]:
+                    del position[one]
+                del path[position[vertex] + 1 :]
+            else:
+                position[vertex] = len(path)
+                path.append(vertex)
+    return loops
