@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import import_extra
-from guiderail.models.parts.solids import SurfaceLocator, measure_distance, to_arrays
+from guiderail.models.parts.solids import SCALE, SurfaceLocator, measure_distance, to_arrays
 
 MAX_PIECES = 300  # the base of two gears with a third between them has 282
 MAX_FINE_PIECES = 800  # of a fine decomposition; few of them touch at a time
@@ -26,7 +26,6 @@ _ALMOST_FLAT = 1e-3  # angle below which no cut starts at an edge [rad]
 _NUM_RADII = 40  # radii at which a sector may be cut
 _SMALLEST_FACE = 2e-4  # smallest area of a face [mm²]; Drake cannot compute the plane of a face of 5e-5
 _DIGITS = 9  # decimal places [m] in an OBJ file; rounding may bend a flat face
-_SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d are meant
 
 
 def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: float | None = None) -> list[Any] | None:
@@ -76,7 +75,7 @@ def cut_into_sectors(solid: Any, number: int, max_pieces: int = MAX_PIECES) -> l
         half = solid.trim_by_plane((-np.sin(angle), np.cos(angle), 0.0), 0.0)
         for part in half.trim_by_plane((np.sin(end), -np.cos(end), 0.0), 0.0).decompose():
             outward = np.array([np.cos(middle), np.sin(middle), 0.0])
-            distances = to_arrays(part)[0] @ outward * _SCALE
+            distances = to_arrays(part)[0] @ outward * SCALE
             cuts = [
                 [one for half in part.split_by_plane(outward, distance) for one in half.decompose()]
                 for distance in np.linspace(distances.min(), distances.max(), _NUM_RADII + 2)[1:-1]
@@ -103,13 +102,13 @@ def _with_large_faces(convex: Any) -> Any:
             points = np.delete(points, corner, axis=0)
             continue
         # A face of Drake's hull may be several triangles in the file, one of them almost without area.
-        written = manifold3d.Manifold.hull_points(np.ascontiguousarray(points * _SCALE))
+        written = manifold3d.Manifold.hull_points(np.ascontiguousarray(points * SCALE))
         vertices, triangles = to_arrays(written)
         smallest, corner = _smallest_face(vertices, np.insert(triangles, 0, 3, axis=1).ravel().tolist())
         if smallest > _SMALLEST_FACE:
             return written
         points = np.delete(vertices, corner, axis=0)
-    return manifold3d.Manifold.hull_points(np.ascontiguousarray(points * _SCALE))
+    return manifold3d.Manifold.hull_points(np.ascontiguousarray(points * SCALE))
 
 
 def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
@@ -123,7 +122,7 @@ def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
         start += 1 + len(fan)
         for second, third in itertools.pairwise(fan[1:]):
             triangle = np.array([fan[0], second, third])
-            a, b, c = points[triangle] * _SCALE
+            a, b, c = points[triangle] * SCALE
             area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a)))
             if area < smallest:
                 # The corner opposite the longest side is nearest to the line of the other two.
@@ -141,7 +140,7 @@ def _depth(solid: Any) -> float:
     """Return the largest distance of a solid's vertices from its convex hull, and of hull samples from it [mm]."""
     surface, hull = to_arrays(solid), to_arrays(solid.hull())
     inside = float(SurfaceLocator(*hull).find_nearest(surface[0])[1].max())
-    return _SCALE * max(inside, measure_distance(hull, surface, _DEPTH_SAMPLES))
+    return SCALE * max(inside, measure_distance(hull, surface, _DEPTH_SAMPLES))
 
 
 def _best_cut(solid: Any, total: float, sliver: float, *, fine: bool) -> list[Any] | None:
@@ -151,7 +150,7 @@ def _best_cut(solid: Any, total: float, sliver: float, *, fine: bool) -> list[An
     shift_size = 1e-5 * total ** (1 / 3)
     trimesh = import_extra("trimesh")
     vertices, triangles = to_arrays(solid)
-    mesh = trimesh.Trimesh(vertices * _SCALE, triangles, process=False)
+    mesh = trimesh.Trimesh(vertices * SCALE, triangles, process=False)
     for find in (_planes, _bisectors) if fine else (_planes,):
         for normal, distance in find(mesh):
             for shift in (0.0, shift_size, -shift_size):

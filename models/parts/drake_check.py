@@ -13,8 +13,7 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.mesh_file import obj_text
-from guiderail.models.parts.solids import to_arrays
-from guiderail.models.parts.tetrahedra import vtk_text
+from guiderail.models.parts.solids import to_arrays, vtk_text
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,15 @@ from guiderail.models.parts.drake_check import Piece, accepted_pieces
 from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import (
     SurfaceLocator,
+    add_interior_points,
+    boundary_of,
     join_surfaces,
     measure_deviation,
     measure_distance,
+    tetrahedralize,
     to_arrays,
     to_manifold,
 )
-from guiderail.models.parts.tetrahedra import add_interior_points, boundary_of, tetrahedralize
 
 MIN_TOLERANCE, MAX_TOLERANCE = 2e-6, 5e-5  # bounds of the deviation that decimation aims at [m]
 NO_CLEARANCE_TOLERANCE = 2e-5  # deviation that decimation aims at if no walls face each other [m]

@@ -15,8 +15,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.objects.sdf import area_vectors
-from guiderail.models.parts.solids import measure_distance, to_arrays, to_manifold
-from guiderail.models.parts.tetrahedra import boundary_of, tetrahedralize
+from guiderail.models.parts.solids import boundary_of, measure_distance, tetrahedralize, to_arrays, to_manifold
 
 MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
