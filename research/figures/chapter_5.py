@@ -403,7 +403,7 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
         axis.set_ylim(-1.2e3 * ALIGNMENT, 1.2e3 * ALIGNMENT)
     return {
         **save_results(out, "figure_5_8", figure, rows),
-        "demonstrations": len(bnc_connector.load().outputs),
+        "demonstrations": bnc_connector.NUM_DEMONSTRATIONS,
         "condition": "random actions in x and y for ten control steps, gains calibrated by authority",
     }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance, Stati
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
-from guiderail.models.objects.bnc_connector import search_demonstrations as bnc_search
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES, NUM_STEPS
 from guiderail.systems.recorder import Recording
 from guiderail.tools.files import write_atomically
@@ -44,10 +44,10 @@ class Session:
 
 
 INSERT_SESSION = Session(bnc_connector.demonstrator_motions, bnc_connector.PATH)
-SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
+SEARCH_SESSION = Session(bnc_connector.search_motions, bnc_connector.SEARCH_PATH)
 FIRM_SEARCH_SESSION = Session(
-    bnc_search.firm_motions,
-    bnc_search.FIRM_PATH,
+    partial(bnc_connector.search_motions, push=bnc_connector.FIRM_PUSH),
+    bnc_connector.FIRM_SEARCH_PATH,
     ArmStation,
     "scripted motion on the arm station, through its impedance; outputs are commands",
 )

@@ -31,10 +31,8 @@ from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
-from guiderail.models.objects.bnc_connector import demonstrations as inserting
-from guiderail.models.objects.bnc_connector import search_demonstrations as searching
-from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS, RIM
-from guiderail.models.objects.bnc_connector.search_demonstrations import HOLD_UNTIL, SEARCH
+from guiderail.models.objects.bnc_connector import demonstrations as shipped
+from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 
@@ -50,7 +48,7 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
 COMPONENTS = 16  # components of the Gaussian mixture
 FLOOR = np.array(REPEATABILITY_STD)
-DEMONSTRATIONS = {"insert": inserting.load, "search": searching.load, "firm_search": searching.load_firm}
+DEMONSTRATIONS = {"insert": shipped.PATH, "search": shipped.SEARCH_PATH, "firm_search": shipped.FIRM_SEARCH_PATH}
 LOCKED_STEPS = 3  # consecutive steps with a locked plug that count as success, at the default control period
 
 
@@ -66,7 +64,7 @@ def reference_trajectory(demonstrations: str, count: int | None = None, **fit: A
 def _fit_reference(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **dict(fit))
-    loaded = DEMONSTRATIONS[demonstrations]().first(count)
+    loaded = Demonstrations.load(DEMONSTRATIONS[demonstrations]).first(count)
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, **dict(fit))
 
 
@@ -220,7 +218,7 @@ class BncConnector(DemonstratedInsertion):
         to_world = in_frame(self._workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
         bound, name = self.options.bound, self.options.demonstrations
-        demonstrations = DEMONSTRATIONS[name]() if name in DEMONSTRATIONS else Demonstrations.load(Path(name))
+        demonstrations = Demonstrations.load(DEMONSTRATIONS.get(name, Path(name)))
         return Scene(
             to_world=to_world,
             demonstrations=tuple(demonstrations.first(self.options.num_demonstrations).outputs),

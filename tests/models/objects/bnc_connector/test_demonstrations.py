@@ -4,19 +4,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import demonstrations
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
+from guiderail.models.primitives import Demonstrations
 from research.generate import bnc_connector as generator
+from research.generate.bnc_connector import FIRM_SEARCH_SESSION, SEARCH_SESSION, record_one
 from research.generate.bnc_connector import TIMES as TIMES_RECORDED
-from research.generate.bnc_connector import record_one
 
 TIMES = 0.02 * np.arange(NUM_STEPS)
 
 
 def test_load_returns_five_times_400_poses():
-    loaded = demonstrations.load()
+    loaded = Demonstrations.load(demonstrations.PATH)
     assert loaded.num_demonstrations == NUM_DEMONSTRATIONS
     assert all(output.shape == (NUM_STEPS, 6) for output in loaded.outputs)
     assert loaded.names == demonstrations.NAMES
@@ -49,7 +51,7 @@ def test_push_is_the_difference_of_command_and_measurement():
 
 
 def test_deviations_are_wide_at_the_rim_and_small_when_seated():
-    outputs = np.stack(demonstrations.load().outputs)
+    outputs = np.stack(Demonstrations.load(demonstrations.PATH).outputs)
     spread = outputs.std(axis=0)[:, :2].mean(axis=1)
     assert spread[80:170].mean() > 4.0 * spread[240:].mean()
 
@@ -63,7 +65,7 @@ def test_motions_differ_and_repeat_with_a_seed():
 
 def test_mean_of_the_motions_has_no_search_offset():
     """The mean of the demonstrations leads to the expected position of the jack without a search."""
-    mean = np.mean(demonstrations.load().outputs, axis=0)
+    mean = np.mean(Demonstrations.load(demonstrations.PATH).outputs, axis=0)
     assert np.abs(mean[:, :2]).max() < 0.3 * MM
 
 
@@ -89,3 +91,50 @@ def test_shipped_file_is_kept_when_writing_is_interrupted(tmp_path, monkeypatch)
     with pytest.raises(InputError, match="cannot be written"):
         generator.main(session=session)
     np.testing.assert_array_equal(np.load(session.path)["times"], np.arange(3.0))
+
+
+SEARCHING = slice(0, round(demonstrations.SEARCH[1] / 0.02))
+
+
+def test_search_file_holds_five_times_400_poses_that_end_locked():
+    with np.load(demonstrations.SEARCH_PATH, allow_pickle=False) as file:
+        measured = file["measured"]
+    assert measured.shape == (NUM_DEMONSTRATIONS, NUM_STEPS, 6)
+    assert np.abs(measured[:, -1, 2]).max() < 0.6 * MM
+    assert np.abs(np.rad2deg(measured[:, -1, 3])).max() < 4.0
+
+
+def test_covariance_is_isotropic_until_the_plug_drops_in():
+    reference = reference_trajectory("search")
+    deviations = reference.standard_deviations[SEARCHING, :2]
+    assert deviations.max() < 1.15 * deviations.min()
+    correlation = reference.covariances[SEARCHING, 0, 1] / deviations.prod(axis=1)
+    assert np.abs(correlation).max() < 0.15
+    assert np.abs(reference.means[SEARCHING, :2]).max() < 0.4 * MM
+
+
+def test_deviations_are_small_after_the_insertion():
+    reference = reference_trajectory("search")
+    seated = slice(round((demonstrations.IN_BY + 0.4) / 0.02), NUM_STEPS)
+    assert reference.standard_deviations[seated, :2].max() < 0.3 * MM
+
+
+def test_firm_search_commands_four_times_the_depth():
+    searching = slice(round(demonstrations.SEARCH[0] / 0.02), SEARCHING.stop)
+    light, firm = (reference_trajectory(name).means[searching, 2] for name in ("search", "firm_search"))
+    assert np.abs(light - firm).mean() == pytest.approx(
+        demonstrations.FIRM_PUSH - demonstrations.LIGHT_PUSH, abs=0.7 * MM
+    )
+    with np.load(demonstrations.FIRM_SEARCH_PATH, allow_pickle=False) as file:
+        assert file["contact_force"].max() < 15.0  # inside the force bound of the task
+
+
+@pytest.mark.parametrize("session", [SEARCH_SESSION, FIRM_SEARCH_SESSION], ids=["gantry", "arm"])
+def test_recording_a_search_again_reproduces_the_file(session):
+    with np.load(session.path, allow_pickle=False) as file:
+        everything = dict(file)
+    motion = session.motions(int(everything["seed"]), TIMES_RECORDED)[0]
+    recording, is_locked = record_one(motion, session.station)
+    assert is_locked
+    np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
+    assert recording["pose"][-1, :3] == pytest.approx(everything["measured"][0, -1, :3], abs=0.1 * MM)
