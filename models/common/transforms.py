@@ -221,6 +221,7 @@ def axis_angle(R: RotationMatrix) -> tuple[np.ndarray, float]:
     return vector / (-norm if w < 0 else norm), 2 * math.atan2(norm, abs(w))
 
 
+POSE_NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 POSE_SIZE = 6
 """Number of coordinates of a pose."""
 

@@ -17,8 +17,9 @@ from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance, Station
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
-from guiderail.models.objects.bnc_connector.demonstrations import NAMES, NUM_STEPS
+from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS
 from guiderail.systems.recorder import Recording
 from guiderail.tools.files import write_atomically
 
@@ -80,7 +81,7 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
     return {
         "times": recordings[0].times,
         "outputs": stacked("desired_pose"),
-        "names": np.array(NAMES),
+        "names": np.array(POSE_NAMES),
         # Measured values are stored in single precision, which resolves nanometers.
         "measured": stacked("pose").astype(np.float32),
         "wrench": stacked("wrench").astype(np.float32),

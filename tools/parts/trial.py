@@ -23,9 +23,8 @@ from guiderail.diagrams.tasks.part.file import PartModel, PartTaskFile
 from guiderail.diagrams.tasks.part.task import PLUG, SOCKET, write_workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.common.transforms import DEGREE
+from guiderail.models.common.transforms import DEGREE, POSE_NAMES
 from guiderail.models.control.wrench import center_of_pressure
-from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.parts.demonstrator import demonstrator_motions, socket_offsets, socket_turns
 from guiderail.models.parts.drake_check import piece_text
@@ -259,7 +258,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
                 break
         else:
             chosen.append(attempts[0])
-    Demonstrations([times] * len(chosen), chosen, NAMES).save(folder / file.demonstrations.file)
+    Demonstrations([times] * len(chosen), chosen, POSE_NAMES).save(folder / file.demonstrations.file)
     return seated
 
 

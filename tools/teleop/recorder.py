@@ -26,8 +26,7 @@ from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.envs.scene import Viewpoint
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
-from guiderail.models.objects.bnc_connector.demonstrations import NAMES
+from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.systems.meshcat_device import MeshcatDevice
@@ -374,7 +373,7 @@ class DemonstrationRecorder:
 
 
 def _to_demonstrations(recorded: list[tuple[np.ndarray, np.ndarray]]) -> Demonstrations:
-    return Demonstrations([times for times, _ in recorded], [outputs for _, outputs in recorded], NAMES)
+    return Demonstrations([times for times, _ in recorded], [outputs for _, outputs in recorded], POSE_NAMES)
 
 
 def record_demonstrations(

@@ -33,7 +33,6 @@ PATH, SEARCH_PATH, FIRM_SEARCH_PATH = (
 )
 NUM_DEMONSTRATIONS = 5
 NUM_STEPS = 400
-NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 
 QUARTER_TURN = np.pi / 2
 # Heights of the plug in the locked frame.

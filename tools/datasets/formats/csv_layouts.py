@@ -20,8 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import in_order, read_bytes
+from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
-from guiderail.tools.datasets.formats.recorded import POSE_NAMES, UNITS, Recorded, poses_in_target, rotations_of
+from guiderail.tools.datasets.formats.recorded import UNITS, Recorded, poses_in_target, rotations_of
 
 TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

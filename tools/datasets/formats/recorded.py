@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 
-POSE_NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 COMMANDED = ("command", "desired", "target", "equilibrium", "cmd", "action", "goal", "setpoint", "reference")
 """Words in the name of a commanded signal, as opposed to a measured one."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError, brief, import_extra
 from guiderail.models.common.files import in_order
+from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.datasets.formats.recorded import (
-    POSE_NAMES,
     Recorded,
     choose_signal,
     describe_time_shift,

@@ -6,7 +6,7 @@ import pytest
 
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import MM
+from guiderail.models.common.transforms import MM, POSE_NAMES
 from guiderail.models.objects.bnc_connector import demonstrations
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
 from guiderail.models.primitives import Demonstrations
@@ -21,7 +21,7 @@ def test_load_returns_five_times_400_poses():
     loaded = Demonstrations.load(demonstrations.PATH)
     assert loaded.num_demonstrations == NUM_DEMONSTRATIONS
     assert all(output.shape == (NUM_STEPS, 6) for output in loaded.outputs)
-    assert loaded.names == demonstrations.NAMES
+    assert loaded.names == POSE_NAMES
     np.testing.assert_allclose(loaded.times[0], TIMES, atol=1e-9)
 
 
