@@ -8,8 +8,13 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 
 
-def _main(module: str) -> Callable[..., None]:
-    return lambda *folder: import_module(module).main(*folder)
+def _objects(name: str, dimensions: str) -> Callable[..., None]:
+    def write(*folder: Path) -> None:
+        sdf = import_module(f"guiderail.models.objects.{name}.sdf")
+        for file, content in sdf.files(getattr(sdf, dimensions)()).items():
+            Path(*(folder or (sdf.FOLDER,)), file).write_text(content)
+
+    return write
 
 
 def _passage(*folder: Path) -> None:
@@ -27,12 +32,12 @@ def _session(name: str) -> Callable[..., None]:
 
 # Functions that write the files into a folder; without an argument, into the folder of the package.
 GENERATORS: dict[str, Callable[..., None]] = {
-    "connector-demonstrations": _main("research.generate.bnc_connector"),
+    "connector-demonstrations": _session("INSERT_SESSION"),
     "connector-search-demonstrations": _session("SEARCH_SESSION"),
     "connector-firm-search-demonstrations": _session("FIRM_SEARCH_SESSION"),
     "passage-demonstrations": _passage,
-    "connector-objects": _main("guiderail.models.objects.bnc_connector.sdf"),
-    "clamp-objects": _main("guiderail.models.objects.grid_clamp.sdf"),
+    "connector-objects": _objects("bnc_connector", "BncDimensions"),
+    "clamp-objects": _objects("grid_clamp", "GridClampDimensions"),
 }
 
 

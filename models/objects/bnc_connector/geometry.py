@@ -10,7 +10,7 @@ collide only with the lugs. These surfaces have a third of the triangles of a cl
 five times faster. The jack's barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket,
 which pushes the lugs into their detents.
 
-`python -m guiderail.models.objects.bnc_connector.sdf` writes the SDF and OBJ files in this folder.
+`python -m research.generate connector-objects` writes the SDF and OBJ files in this folder.
 """
 
 import itertools

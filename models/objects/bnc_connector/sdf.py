@@ -229,13 +229,3 @@ def _shoulders(d: BncDimensions, a: np.ndarray, wall: np.ndarray, i: int, facing
         left_surface = np.interp(a[i] - wide, a, h)
         points.append([a[i] - wide, facing * (min(h[i] - slope * wide, left_surface) - BELOW)])
     return points
-
-
-def main(folder: Path = FOLDER) -> None:
-    """Write all files of the standard connector."""
-    for name, content in files(BncDimensions()).items():
-        (folder / name).write_text(content)
-
-
-if __name__ == "__main__":
-    main()

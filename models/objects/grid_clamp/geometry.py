@@ -10,7 +10,7 @@ compliant convex solids with as many sides as their holes, so that few triangles
 hole has a lip and the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains
 the clamp. The body is a soft pad, thick enough for impacts, that collides only with the table's slab.
 
-`python -m guiderail.models.objects.grid_clamp.sdf` writes the SDF and OBJ files in this folder.
+`python -m research.generate clamp-objects` writes the SDF and OBJ files in this folder.
 """
 
 from dataclasses import dataclass, replace

@@ -190,13 +190,3 @@ def bead_hulls(dimensions: GridClampDimensions) -> list[tuple[np.ndarray, tuple[
         vertices = np.concatenate([*(np.column_stack([end, height]) for end in ends), crown[None]])
         sides.append((vertices, (float(outward[0]), float(outward[1]), 0.0)))
     return sides
-
-
-def main(folder: Path = FOLDER) -> None:
-    """Write all files of the standard clamp and table."""
-    for name, content in files(GridClampDimensions()).items():
-        (folder / name).write_text(content)
-
-
-if __name__ == "__main__":
-    main()

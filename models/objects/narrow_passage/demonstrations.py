@@ -75,7 +75,3 @@ def load() -> Demonstrations:
 
 def _profile(knots: list[tuple[float, float]], progress: np.ndarray) -> np.ndarray:
     return PchipInterpolator(*np.array(knots).T)(progress)
-
-
-if __name__ == "__main__":
-    generate().save(PATH)

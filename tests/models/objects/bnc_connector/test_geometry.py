@@ -21,8 +21,9 @@ from guiderail.models.objects.bnc_connector.geometry import (
     slot_columns,
     slot_mesh,
 )
-from guiderail.models.objects.bnc_connector.sdf import BARREL, barrel_sides, files, jack_sdf, main
+from guiderail.models.objects.bnc_connector.sdf import BARREL, barrel_sides, files, jack_sdf
 from guiderail.models.objects.sdf import TriangleMesh
+from research.generate import generate
 
 DIMENSIONS = BncDimensions()
 
@@ -36,8 +37,8 @@ def test_shipped_files_equal_the_generated_ones(name):
     assert (FOLDER / name).read_text() == files(DIMENSIONS)[name]
 
 
-def test_main_writes_the_shipped_files(tmp_path):
-    main(tmp_path)
+def test_generate_writes_the_shipped_files(tmp_path):
+    generate("connector-objects", tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(files(DIMENSIONS))
     assert (tmp_path / "bnc_slots.obj").read_bytes() == (FOLDER / "bnc_slots.obj").read_bytes()
 

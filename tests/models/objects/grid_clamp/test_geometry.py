@@ -13,7 +13,8 @@ from guiderail.models.objects.grid_clamp.geometry import (
     peg_mesh,
     slab_mesh,
 )
-from guiderail.models.objects.grid_clamp.sdf import files, main
+from guiderail.models.objects.grid_clamp.sdf import files
+from research.generate import generate
 
 DIMENSIONS = GridClampDimensions()
 
@@ -30,8 +31,8 @@ def test_shipped_files_equal_the_generated_ones(name):
     assert (FOLDER / name).read_text() == files(DIMENSIONS)[name]
 
 
-def test_main_writes_the_shipped_files(tmp_path):
-    main(tmp_path)
+def test_generate_writes_the_shipped_files(tmp_path):
+    generate("clamp-objects", tmp_path)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (FOLDER / path.name).read_bytes()
 
