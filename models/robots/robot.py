@@ -146,6 +146,7 @@ _ROBOTS: Registry[Robot] = Registry("robot", package="guiderail.models.robots", 
 _END_EFFECTORS: Registry[EndEffector] = Registry(
     "end effector", package="guiderail.models.robots", entry_points="guiderail.end_effectors"
 )
+robot_names, end_effector_names = _ROBOTS.names, _END_EFFECTORS.names
 
 
 def register_robot(robot: Robot) -> Robot:
@@ -169,11 +170,6 @@ def find_robot(name: str | Robot) -> Robot:
     return name if isinstance(name, Robot) else _ROBOTS.get(name)
 
 
-def robot_names() -> list[str]:
-    """Return the names of all robots, sorted."""
-    return _ROBOTS.names()
-
-
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
     """Add an end effector, whose name is not registered yet, to the registry and return it.
 
@@ -190,11 +186,6 @@ def find_end_effector(name: str | EndEffector) -> EndEffector:
         InputError: If no entry has this name; the message suggests the nearest name.
     """
     return name if isinstance(name, EndEffector) else _END_EFFECTORS.get(name)
-
-
-def end_effector_names() -> list[str]:
-    """Return the names of all end effectors, sorted."""
-    return _END_EFFECTORS.names()
 
 
 def _are_numbers(values: Sequence[float], count: int) -> bool:

@@ -200,16 +200,10 @@ class SharedControlTemplate:
     @cached_property
     def _max_speeds(self) -> tuple[tuple[float, float], ...]:
         """Largest speed [m/s] and angular speed [rad/s] of the command in each state."""
-
-        def least(speed: float, of_state: float | None) -> float:
-            return speed if of_state is None else min(speed, of_state)
-
+        own = self.max_speed_m_per_s, self.max_speed_rad_per_s
+        limits = ((state.max_speed_m_per_s, state.max_speed_rad_per_s) for state in self.states)
         return tuple(
-            (
-                least(self.max_speed_m_per_s, state.max_speed_m_per_s),
-                least(self.max_speed_rad_per_s, state.max_speed_rad_per_s),
-            )
-            for state in self.states
+            (own[0] if v is None else min(own[0], v), own[1] if w is None else min(own[1], w)) for v, w in limits
         )
 
     def _speed_ratio(self, state: int, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:

@@ -38,6 +38,7 @@ from guiderail.tools.hardware.preflight import (
     SPEED,
     PreflightChecks,
     confirm_checks,
+    describe_distance,
     is_near,
     pose_distance,
     slow_approach,
@@ -190,9 +191,7 @@ class SkillExecutor:
                 return outcome
         reached = station.get_pose_output_port().Eval(context)
         if not is_near(reached, self._start):
-            distance, angle = pose_distance(reached, self._start)
-            remaining = f"{distance / MM:.1f} mm and {angle / DEGREE:.1f} degrees are left"
-            return Outcome(Fault.NONE, f"the arm did not reach the start: {remaining}", 0)
+            return Outcome(Fault.NONE, describe_distance(reached, self._start), 0)
         return None
 
     def _execute(self) -> Outcome:

@@ -35,6 +35,13 @@ def is_near(a: np.ndarray, b: np.ndarray) -> bool:
     return distance <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE
 
 
+def describe_distance(pose: np.ndarray, start: np.ndarray) -> str:
+    """Return a sentence on an arm that did not reach its start; poses are (6,)."""
+    distance, angle = pose_distance(pose, start)
+    left = f"{distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left"
+    return f"the arm did not reach the start: {left}"
+
+
 def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
     """Return commands (n, 6) from `pose` to `target`, (6,), along a straight line at `SPEED`, then at `target`.
 

@@ -24,7 +24,14 @@ from guiderail.models.control.joint_status import Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.connection import Log
 from guiderail.tools.hardware.operator import OperatorKeys
-from guiderail.tools.hardware.preflight import PreflightChecks, is_near, pose_distance, retrace, slow_approach
+from guiderail.tools.hardware.preflight import (
+    PreflightChecks,
+    describe_distance,
+    is_near,
+    pose_distance,
+    retrace,
+    slow_approach,
+)
 
 MIN_HOLD_FORCE = 1.5  # smallest measured force with which an inserted workpiece resists a push [N]
 HOLD_STEPS = 25  # control steps of a push
@@ -304,18 +311,13 @@ class RobotEnv(DiagramEnv):
             self._return_path = path + path[::-1]
             self._follow_return_path()
         if path and not self._is_at_start():
-            self._must_be_freed = self._describe_distance()
+            self._must_be_freed = describe_distance(self.pose, self._start)
             self.rest()
             self._return_path = path
             self._follow_return_path()
         if not self._is_at_start():
-            raise InputError(f"{self._describe_distance()}; is something in its way?")
+            raise InputError(f"{describe_distance(self.pose, self._start)}; is something in its way?")
         gc.collect()
-
-    def _describe_distance(self) -> str:
-        distance, angle = pose_distance(self.pose, self._start)
-        left = f"{distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left"
-        return f"the arm did not reach the start: {left}"
 
     def _is_at_start(self) -> bool:
         return is_near(self.pose, self._start)

@@ -302,8 +302,10 @@ def add_convex_pieces(
                     written[-1].write_text(piece_text(piece), encoding="utf-8")
             changes[name] = model.model_copy(update={"convex": tuple(names)})
         changed = file.model_copy(update=changes)
-        aligned, blocked = run_isolated(_try_insertions, folder, changed, cpu_seconds=CHECK_SECONDS)
-        if not aligned or blocked:
+        aligned, seated = run_isolated(
+            lambda: [insert_in_mujoco(folder, changed, offset) for offset in (0.0, OFFSET)], cpu_seconds=CHECK_SECONDS
+        )
+        if not aligned or seated:
             raise IsolatedError("an aligned plug does not seat" if not aligned else "a misaligned plug is not blocked")
     except IsolatedError as error:
         log(f"station=mujoco is not offered: {error}")
@@ -312,10 +314,6 @@ def add_convex_pieces(
         return file
     log(f"station=mujoco: inserted ({' + '.join(str(len(model.convex)) for model in changes.values())} convex pieces)")
     return changed
-
-
-def _try_insertions(folder: Path, file: PartTaskFile) -> tuple[bool, bool]:
-    return insert_in_mujoco(folder, file), insert_in_mujoco(folder, file, OFFSET)
 
 
 def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> bool:

@@ -154,18 +154,12 @@ class DemonstrationRecorder:
     """Session in which an operator moves a station and records demonstrations.
 
     Attributes:
-        task: The task.
-        out: File of the demonstrations.
-        station: The station.
-        simulator: Simulator of the station.
-        panel: Controls of the page.
         demonstrations: Recorded times (N,) and commanded poses (N, 6).
         successes: Success of each demonstration; None if the task does not define it by the pose.
         start: Pose at the start of a demonstration, (6,).
         command: Commanded pose, (6,).
         offset: Offset of the sliders from the start pose, (6,).
         steps: Control steps since the start of the demonstration.
-        recording: The demonstration that is being recorded.
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any], out: Path, meshcat: Any = None):
@@ -223,7 +217,7 @@ class DemonstrationRecorder:
             self._set_rate((SLOW_RATE if self._is_slow else 1.0) if real_time else 0.0)
             self.step()
             for button in BUTTONS:
-                while self.panel.take_click(button):
+                for _ in range(self.panel.take_clicks(button)):
                     if button == END:
                         return
                     self._press(button, log)

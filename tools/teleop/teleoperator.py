@@ -42,11 +42,7 @@ class Slider:
 
 
 class MeshcatPanel(Teleoperator):
-    """Sliders and buttons of a Meshcat page, each with keys; a gamepad moves the sliders.
-
-    Attributes:
-        meshcat: The page.
-    """
+    """Sliders and buttons of a Meshcat page, each with keys; a gamepad moves the sliders."""
 
     def __init__(self, meshcat: Any, sliders: Mapping[str, Slider], buttons: Mapping[str, str]):
         """Add sliders, and buttons with their keys, to a page."""
@@ -89,17 +85,11 @@ class MeshcatPanel(Teleoperator):
                 value = self.meshcat.GetSliderValue(name) + sign * deflection * slider.speed * period
                 self.meshcat.SetSliderValue(name, float(np.clip(value, -slider.limit, slider.limit)))
 
-    def take_click(self, button: str) -> bool:
-        """Return True if a click on a button has not been taken yet, and take one click."""
-        clicks, taken = self.meshcat.GetButtonClicks(button), self._clicks.get(button, 0)
-        self._clicks[button] = min(taken + 1, clicks)
-        return clicks > taken
-
-    def take_clicks(self, button: str) -> bool:
-        """Return True if a button was clicked since the last call, however often."""
+    def take_clicks(self, button: str) -> int:
+        """Return the number of clicks on a button since the last call."""
         clicks, taken = self.meshcat.GetButtonClicks(button), self._clicks.get(button, 0)
         self._clicks[button] = clicks
-        return clicks > taken
+        return int(clicks - taken)
 
 
 def set_camera(meshcat: Any, task: Any) -> Viewpoint | None:
@@ -128,9 +118,6 @@ class MeshcatSupervisor(Supervisor):
     """Supervisor at a Meshcat page: sliders correct the policy, buttons label an episode.
 
     An episode runs in real time while it is supervised.
-
-    Attributes:
-        panel: The page's controls.
     """
 
     def __init__(self, log: Callable[[str], None], meshcat: Any = None):
