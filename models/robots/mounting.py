@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,19 +51,17 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
     Raises:
         InputError: If its model file is missing, can't be read, or does not match the robot's data.
     """
-    models = _read(plant, robot.model, f"robot {robot.name!r}")
-    joints = [_find(plant, models, "joint", name, robot) for name in robot.joints]
+    label = f"robot {robot.name!r}"
+    models = _read(plant, robot.model, label)
+    find = partial(_find, plant, models, label, robot.model)
+    joints = [find("joint", name) for name in robot.joints]
     model = joints[0].model_instance()
     if any(joint.model_instance() != model for joint in joints):
-        raise InputError(f"robot {robot.name!r}: its joints must all be of one model instance")
-    base = _find(plant, models, "frame", robot.base_frame, robot)
+        raise InputError(f"{label}: its joints must all be of one model instance")
+    base = find("frame", robot.base_frame)
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
-    return MountedRobot(
-        model=model,
-        flange=_find(plant, models, "frame", robot.flange_frame, robot),
-        actuators=_list_actuators(plant, joints, f"robot {robot.name!r}"),
-    )
+    return MountedRobot(model, find("frame", robot.flange_frame), _list_actuators(plant, joints, label))
 
 
 def add_end_effector(
@@ -82,21 +81,12 @@ def add_end_effector(
     """
     X_FlangeMount = RigidTransform(RotationMatrix.MakeZRotation(robot.tool_turn), [0.0, 0.0, 0.0])
     X_FlangeMount = X_FlangeMount @ end_effector.X_FlangeMount
-    label = f"end effector {end_effector.name!r}"
     if as_rigid and end_effector.is_gripper:
         return _add_rigid_copy(plant, mounted, end_effector, X_FlangeMount)
-    (model,) = _read(plant, end_effector.model, label, only_one=True)
-    _check_names(plant, model, end_effector)
-    wrist = plant.WeldFrames(mounted.flange, plant.GetFrameByName(end_effector.mount_frame, model), X_FlangeMount)
-    joints = [plant.GetJointByName(name, model) for name in end_effector.joints]
-    _set_opening(plant, model, end_effector)
-    return MountedEndEffector(
-        wrist=wrist,
-        tool_center=plant.GetFrameByName(end_effector.tool_center, model),
-        bodies=[plant.GetBodyByName(name, model) for name in end_effector.bodies],
-        model=model,
-        actuators=_list_actuators(plant, joints, label),
-    )
+    mount, tool_center, bodies, joints = _add_opened(plant, end_effector)
+    wrist = plant.WeldFrames(mounted.flange, mount, X_FlangeMount)
+    actuators = _list_actuators(plant, joints, f"end effector {end_effector.name!r}")
+    return MountedEndEffector(wrist, tool_center, bodies, mount.model_instance(), actuators)
 
 
 def lighten_rotors(robot: Robot, mounted: MountedRobot) -> None:
@@ -123,13 +113,28 @@ def _read(plant: MultibodyPlant, file: Path, label: str, *, only_one: bool = Fal
     return models
 
 
-def _find(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], kind: str, name: str, robot: Robot) -> Any:
-    """Return the frame or the joint with a name; `kind` is "frame" or "joint"."""
+def _find(
+    plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], label: str, file: Path, kind: str, name: str
+) -> Any:
+    """Return the element with a name; `kind` is "frame", "body" or "joint"."""
     has_name = getattr(plant, f"Has{kind.title()}Named")
     for model in models:
         if has_name(name, model):
             return getattr(plant, f"Get{kind.title()}ByName")(name, model)
-    raise InputError(f"robot {robot.name!r}: {robot.model.name} has no {kind} {name!r}")
+    raise InputError(f"{label}: {file.name} has no {kind} {name!r}")
+
+
+def _add_opened(plant: MultibodyPlant, end_effector: EndEffector) -> tuple[Frame, Frame, list[RigidBody], list[Joint]]:
+    """Add the model of an end effector at its opening; return mount, tool center, bodies and actuated joints."""
+    label = f"end effector {end_effector.name!r}"
+    models = _read(plant, end_effector.model, label, only_one=True)
+    find = partial(_find, plant, models, label, end_effector.model)
+    mount, tool_center = (find("frame", name) for name in (end_effector.mount_frame, end_effector.tool_center))
+    bodies = [find("body", name) for name in end_effector.bodies]
+    joints = [find("joint", name) for name in end_effector.joints]
+    for name, position in end_effector.opening.items():
+        find("joint", name).set_default_positions([position])
+    return mount, tool_center, bodies, joints
 
 
 def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:
@@ -148,40 +153,18 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
     return actuators
 
 
-def _check_names(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
-    """Raise an InputError if the data of an end effector name an element that its model file does not have."""
-    for kind, names, has_name in (
-        ("frame", (end_effector.mount_frame, end_effector.tool_center), plant.HasFrameNamed),
-        ("body", end_effector.bodies, plant.HasBodyNamed),
-        ("joint", (*end_effector.joints, *end_effector.opening), plant.HasJointNamed),
-    ):
-        for name in names:
-            if not has_name(name, model):
-                file = end_effector.model.name
-                raise InputError(f"end effector {end_effector.name!r}: {file} has no {kind} {name!r}")
-
-
-def _set_opening(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
-    for name, position in end_effector.opening.items():
-        plant.GetJointByName(name, model).set_default_positions([position])
-
-
 def _add_rigid_copy(
     plant: MultibodyPlant, mounted: MountedRobot, end_effector: EndEffector, X_FlangeMount: RigidTransform
 ) -> MountedEndEffector:
     """Add one body with the inertia of the open gripper."""
     gripper_plant = MultibodyPlant(time_step=1e-3)  # only discrete plants support mimic joints
     gripper_plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
-    (model,) = _read(gripper_plant, end_effector.model, f"end effector {end_effector.name!r}", only_one=True)
-    _check_names(gripper_plant, model, end_effector)
-    mount = gripper_plant.GetFrameByName(end_effector.mount_frame, model)
+    mount, gripper_center, bodies, _ = _add_opened(gripper_plant, end_effector)
     gripper_plant.WeldFrames(gripper_plant.world_frame(), mount)
-    _set_opening(gripper_plant, model, end_effector)
     gripper_plant.Finalize()
     context = gripper_plant.CreateDefaultContext()
-    bodies = [gripper_plant.GetBodyByName(name, model).index() for name in end_effector.bodies]
-    M = gripper_plant.CalcSpatialInertia(context, mount, bodies)
-    X_MountP = gripper_plant.GetFrameByName(end_effector.tool_center, model).CalcPose(context, mount)
+    M = gripper_plant.CalcSpatialInertia(context, mount, [body.index() for body in bodies])
+    X_MountP = gripper_center.CalcPose(context, mount)
 
     instance = plant.AddModelInstance(end_effector.name)
     body = plant.AddRigidBody(end_effector.bodies[0], instance, M)
