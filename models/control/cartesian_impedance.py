@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from guiderail.models.common.arrays import cross
+from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.wrench import WrenchBound, bounded_wrench
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
@@ -16,7 +17,6 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 # Towards a singular posture, the effective mass at the tool, usually 1 to 50 kg, grows in the lost direction. Up to
 # LIGHT [kg], only the impedance acts in this direction; above HEAVY [kg], only the posture's torque.
 LIGHT, HEAVY = 300.0, 3000.0
-LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
 _ROUNDING = 1e-9  # a wrench that a bound changes by more than this is saturated [N, Nm]
 _SCALE = np.repeat([1.0, LEVER], 3)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-LEVER = 0.25  # distance from the tool center that converts rotational to translational velocities [m]
+LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
 # Smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more.
 REGULAR = 0.03
 STILL = 1e-3  # desired tool speed up to which any motion is accepted [m/s]

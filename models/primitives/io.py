@@ -52,7 +52,11 @@ def read(path: Path) -> Recording:
     Raises:
         InputError: If there is no such file, it is damaged or too large, or it does not hold demonstrations.
     """
-    if not _is_folder(path):
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:
+        raise InputError(f"the path '{brief(str(path))}' can't be read ({error.strerror}): check it") from error
+    if not is_folder:
         return _read_file(path, MAX_FILE_SIZE)
     try:
         return _read_folder(path)
@@ -94,13 +98,6 @@ def write_csv(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndar
     for m, (t, y) in enumerate(zip(times, outputs, strict=True)):
         writer.writerows([m, repr(float(a)), *(repr(float(v)) for v in b)] for a, b in zip(t, y, strict=True))
     write_atomically(path, text.getvalue().encode())
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError as error:
-        raise InputError(f"the path '{brief(str(path))}' can't be read ({error.strerror}): check it") from error
 
 
 # --- .npz ---

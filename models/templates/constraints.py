@@ -20,6 +20,7 @@ from guiderail.models.templates.geometry import (
     WORLD,
     Frames,
     StatePart,
+    axes,
     bearing,
     chord_angle,
     largest,
@@ -328,11 +329,6 @@ class TiltConstraint(FrameConstraint):
         c, s = math.cos(tilt), math.sin(tilt)
         R = R_FH @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return (R if self.turns_along else R @ R_FH.T) @ matrix_deg(self.rpy_deg), p_FE
-
-
-def axes(frame: str, frames: Frames) -> np.ndarray:
-    """Return R_WF (3, 3), the orientation of a frame."""
-    return np.eye(3) if frame == WORLD else frames[frame].rotation().matrix()
 
 
 def nearest_turn(angle: float, center: float) -> float:

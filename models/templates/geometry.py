@@ -39,18 +39,17 @@ NEAR_AXIS = 1e-9  # distance from the axis below which the bearing is undefined 
 
 
 @lru_cache(maxsize=64)
-def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
-    """Return the rotation of roll, pitch and yaw angles (about fixed axes x, y, z) [deg]."""
-    roll, pitch, yaw = np.deg2rad(rpy_deg).tolist()
-    return rpy_rotation(roll, pitch, yaw)
-
-
-@lru_cache(maxsize=64)
 def matrix_deg(rpy_deg: tuple[float, ...]) -> np.ndarray:
-    """Return `rotation_deg` as a read-only matrix (3, 3)."""
-    matrix = rotation_deg(rpy_deg).matrix()
+    """Return the rotation of roll, pitch and yaw angles (about fixed axes x, y, z) [deg], a read-only matrix (3, 3)."""
+    roll, pitch, yaw = np.deg2rad(rpy_deg).tolist()
+    matrix = rpy_rotation(roll, pitch, yaw).matrix()
     matrix.setflags(write=False)
     return matrix
+
+
+def axes(frame: str, frames: Frames) -> np.ndarray:
+    """Return R_WF (3, 3), the orientation of a frame."""
+    return np.eye(3) if frame == WORLD else frames[frame].rotation().matrix()
 
 
 def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
@@ -63,12 +62,8 @@ def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
 
 def pose_in(frame: str, X_WE: RigidTransform, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
     """Return R_FE (3, 3) and p_FE (3,) [m], the end effector's pose in the frame F called `frame`."""
-    R_WE = X_WE.rotation().matrix()
-    if frame == WORLD:
-        return R_WE, X_WE.translation()
-    X_WF = frames[frame]
-    R_FW = X_WF.rotation().matrix().T
-    return R_FW @ R_WE, R_FW @ (X_WE.translation() - X_WF.translation())
+    R_WE, p_FE = X_WE.rotation().matrix(), position_in(frame, X_WE, frames)
+    return R_WE if frame == WORLD else frames[frame].rotation().matrix().T @ R_WE, p_FE
 
 
 def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> RigidTransform:

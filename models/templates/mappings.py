@@ -7,7 +7,7 @@ import numpy as np
 from typing_extensions import override
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, axis_angle_rotation
-from guiderail.models.templates.geometry import WORLD, Frames, StatePart, bearing, position_in, tilt_axis
+from guiderail.models.templates.geometry import WORLD, Frames, StatePart, axes, bearing, position_in, tilt_axis
 from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
 
 TOOL = "tool"
@@ -35,9 +35,7 @@ class InputMapping(StatePart, ABC):
 
 def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
     """Return R_WF (3, 3), whose columns are the axes of `frame`: `world`, `tool` or that of an object."""
-    if frame == WORLD:
-        return np.eye(3)
-    return (X_WE if frame == TOOL else frames[frame]).rotation().matrix()
+    return X_WE.rotation().matrix() if frame == TOOL else axes(frame, frames)
 
 
 def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) -> None:

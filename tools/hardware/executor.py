@@ -249,7 +249,9 @@ class SkillExecutor:
     def write(self, folder: Path, metadata: Mapping[str, Any]) -> Path:
         """Write the control steps with joint signals as Parquet, the metadata as JSON; return the Parquet path."""
         folder.mkdir(parents=True, exist_ok=True)
-        number = _next_number(folder)
+        # The number is above all existing ones, even if only one of a pair of files is left.
+        matches = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
+        number = max((int(match.group(1)) for match in matches if match), default=-1) + 1
         steps = table(self.trace, number)
         num_joints = self._station.controller_plant.plant.num_positions()
         for name, values in self._joints.items():
@@ -260,12 +262,6 @@ class SkillExecutor:
         write_step_log(path, steps)
         write_atomically(path.with_suffix(".json"), json.dumps(dict(metadata), indent=2).encode() + b"\n")
         return path
-
-
-def _next_number(folder: Path) -> int:
-    """Return the number of the next recording: above all existing ones, even if only one of a pair of files is left."""
-    matches = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
-    return max((int(match.group(1)) for match in matches if match), default=-1) + 1
 
 
 def deploy(

@@ -88,7 +88,12 @@ def read_parts(
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
     first, second = (part.transform(to_target, np.zeros(3)) for part in (first, second))
-    _refuse_separate(first, second)
+    gaps = np.maximum(first.bounds[0] - second.bounds[1], second.bounds[0] - first.bounds[1])
+    if not gaps.max() <= MAX_GAP:
+        raise InputError(
+            f"the parts are {1e3 * gaps.max():.4g} mm apart: draw them assembled in one frame, or place the plug with "
+            "--plug-pose"
+        )
     origin = np.array([*compute_center_of_mass(first)[:2], first.bounds[0, 2]])
     if center is not None:
         on_axis = (to_target @ (np.asarray(center, dtype=float) * scale))[:2]
@@ -96,16 +101,6 @@ def read_parts(
             raise InputError(f"--center {list(center)} is not near the plug: give a point on the axis of insertion")
         origin[:2] = on_axis
     return first.transform(np.eye(3), -origin), second.transform(np.eye(3), -origin)
-
-
-def _refuse_separate(plug: Part, socket: Part) -> None:
-    """Raise InputError if the bounding boxes of the assembled parts are apart."""
-    gaps = np.maximum(plug.bounds[0] - socket.bounds[1], socket.bounds[0] - plug.bounds[1])
-    if not gaps.max() <= MAX_GAP:
-        raise InputError(
-            f"the parts are {1e3 * gaps.max():.4g} mm apart: draw them assembled in one frame, or place the plug with "
-            "--plug-pose"
-        )
 
 
 def create_task(

@@ -22,7 +22,7 @@ def random_pose(rng, spread=0.5):
 @given(st.tuples(*[st.floats(-180, 180)] * 3))
 def test_rotation_deg_is_roll_pitch_yaw_about_fixed_axes(rpy):
     expected = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()
-    np.testing.assert_allclose(g.rotation_deg(rpy).matrix(), expected, atol=1e-12)
+    np.testing.assert_allclose(g.matrix_deg(rpy), expected, atol=1e-12)
 
 
 @given(SEEDS)
