@@ -53,10 +53,7 @@ TARGETS = {
         "tests/models/control/test_keep_out.py",
         "tests/models/control/test_keep_out_properties.py",
     ],
-    "models/control/cartesian_impedance.py": [
-        "tests/models/control/test_cartesian_impedance.py",
-        "tests/models/control/test_reachable_inertia.py",
-    ],
+    "models/control/cartesian_impedance.py": ["tests/models/control/test_cartesian_impedance.py"],
     "models/control/joint_status.py": ["tests/models/control/test_joint_status.py"],
     "models/control/message_sequence.py": ["tests/models/control/test_message_sequence.py"],
     "models/control/state_estimator.py": ["tests/models/control/test_state_estimator.py"],

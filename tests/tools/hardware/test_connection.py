@@ -1,6 +1,9 @@
 """The simulated driver imports the modules of the run."""
 
 import os
+import signal
+import subprocess
+import sys
 from contextlib import contextmanager
 from ipaddress import ip_address
 from pathlib import Path
@@ -11,7 +14,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.cli.main import main
-from guiderail.tools.hardware.connection import SIMULATED, RobotConnection, _loopback_address
+from guiderail.tools.hardware.connection import SIMULATED, RobotConnection, _loopback_address, subprocess_tied_to_parent
 from guiderail.tools.hardware.executor import recordings_folder
 
 MINE = """
@@ -87,3 +90,46 @@ def test_processes_have_different_addresses():
     addresses = {_loopback_address(pid) for pid in numbers}
     assert len(addresses) == len(numbers)
     assert all(ip_address(address).is_loopback for address in addresses)
+
+
+SLEEPS = """
+from guiderail.tools.hardware.connection import subprocess_tied_to_parent
+
+started = subprocess_tied_to_parent("import time; time.sleep(60)")
+"""
+
+
+SERVES = """
+from guiderail.tools.hardware.connection import RobotConnection
+
+started = RobotConnection(sim=True, synchronous=True).simulated_driver("BncConnector", "memq://")
+"""
+
+
+WAITS = """
+with started:
+    print("started", flush=True)
+    input()
+"""
+
+
+@pytest.mark.parametrize(
+    ("starts", "ends"),
+    [(SLEEPS, signal.SIGTERM), (SLEEPS, signal.SIGINT), (SERVES, signal.SIGKILL)],
+    ids=["terminated", "interrupted", "killed"],
+)
+def test_child_exits_when_its_parent_ends(starts, ends):
+    with subprocess.Popen(
+        [sys.executable, "-c", starts + WAITS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as parent:
+        assert parent.stdout.readline() == b"started\n"
+        parent.send_signal(ends)
+        # Both processes write there, so it is closed when neither is left.
+        assert parent.communicate(timeout=50)[0] == b""
+
+
+def test_pipe_to_the_child_is_closed():
+    with subprocess_tied_to_parent("import time; time.sleep(60)") as process:
+        assert process.poll() is None
+    assert process.poll() is not None
+    assert process.stdin.closed

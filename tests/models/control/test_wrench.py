@@ -8,11 +8,13 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import (
     WrenchBound,
+    admissible_change,
     approach_impedance,
     bounded_wrench,
     clip_wrench,
     damping_share,
     governed_error,
+    spring_energy,
 )
 
 AXES = np.array([9.0, 9.0, 15.0, 3.0, 3.0, 3.0])
@@ -116,3 +118,35 @@ def test_governed_error_leaves_room_for_an_implicit_damper():
     np.testing.assert_allclose(
         governed_error(stiffness, damping, np.full(6, 1e-3), np.zeros(6), MASS, step, BOUND), 1e-3, atol=1e-15
     )
+
+
+STIFFNESS, SPRING_LIMITS = np.array([1500.0, 30.0]), np.array([15.0, 3.0])
+
+
+def test_force_is_the_gradient_of_the_energy():
+    for error in np.random.default_rng(0).normal(scale=0.05, size=(50, 2)):
+        step = 1e-7 * np.eye(2)
+        gradient = [
+            (spring_energy(STIFFNESS, SPRING_LIMITS, error + d) - spring_energy(STIFFNESS, SPRING_LIMITS, error - d))
+            / 2e-7
+            for d in step
+        ]
+        np.testing.assert_allclose(gradient, np.clip(STIFFNESS * error, -SPRING_LIMITS, SPRING_LIMITS), atol=1e-5)
+
+
+def test_change_stores_no_more_than_the_energy():
+    rng = np.random.default_rng(1)
+    shares = []
+    for _ in range(300):
+        errors = tuple(rng.normal(scale=0.05, size=(2, 2)))
+        limits = SPRING_LIMITS * rng.uniform(0.2, 1.0), SPRING_LIMITS
+        before = spring_energy(STIFFNESS, limits[0], errors[0])
+        energy = before + 10.0 ** rng.uniform(-4, 0)
+        share, stored = admissible_change(STIFFNESS, limits, errors, energy)
+        after = [first + share * (second - first) for first, second in (limits, errors)]
+        assert stored == pytest.approx(spring_energy(STIFFNESS, *after), rel=1e-12)
+        assert stored <= energy
+        if share < 1.0:
+            assert stored - before == pytest.approx(energy - before, rel=1e-6)
+        shares.append(share)
+    assert 0.2 < np.mean(np.array(shares) == 1.0) < 0.95
