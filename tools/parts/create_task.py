@@ -27,6 +27,7 @@ from guiderail.models.parts.assembly_check import (
     check_target,
     compute_center_of_mass,
     find_obstructions,
+    find_symmetries,
     measure_side_clearance,
     plan_motion,
 )
@@ -34,7 +35,6 @@ from guiderail.models.parts.assembly_check import shrink as shrink_part
 from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS
 from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
 from guiderail.models.parts.preparation import MIN_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
-from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact, cpu_time
 

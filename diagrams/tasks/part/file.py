@@ -21,8 +21,8 @@ from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.common.yaml import load_yaml
+from guiderail.models.parts.assembly_check import SYMMETRIES
 from guiderail.models.parts.demonstrator import TOUCH, plan_search, plan_straight_insertion
-from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
 FILE_NAME = "task.yaml"
@@ -267,7 +267,7 @@ class PartTaskFile(Options):
     stiction_tolerance: Number = Field(1e-5, gt=0, description="largest slip speed of a sticking contact [m/s]")
     demonstrations: DemonstrationFile = DemonstrationFile.model_validate({})
     action_dims: tuple[int, ...] | None = Field((0, 1), description="indices of the outputs that an action moves")
-    sides: tuple[str, ...] = Field((), description="symmetries of both parts: see models/parts/symmetry.py")
+    sides: tuple[str, ...] = Field((), description="symmetries of both parts: see models/parts/assembly_check.py")
     rim_sides: tuple[str, ...] = Field((), description="symmetries that nearly hold for a plug on the rim")
     recommended: Recommended = Recommended.model_validate({})
     search: SearchNumbers = SearchNumbers.model_validate({})

@@ -45,8 +45,8 @@ from guiderail.models.common.parsing import add_models
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
+from guiderail.models.parts.assembly_check import SYMMETRIES
 from guiderail.models.parts.mesh_file import part_sdf
-from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 

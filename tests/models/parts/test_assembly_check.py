@@ -6,23 +6,26 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import DEGREE
 from guiderail.models.parts.assembly_check import (
+    SYMMETRIES,
     OverlapError,
     check_target,
     find_obstructions,
+    find_symmetries,
     make_solids,
     measure_side_clearance,
     plan_motion,
     shrink,
 )
 from guiderail.models.parts.mesh_file import Part, load_part
-from oracles.parts import PARTS
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 pytest.importorskip("igl")
 
-from oracles.parts import screw
+from guiderail.tools.parts.create_task import read_parts
+from oracles.parts import PARTS, screw
 
 
 def load(name, folder):
@@ -100,3 +103,21 @@ def test_shrink_moves_every_face_inwards(name, tmp_path):
     normals = normals[large] / np.linalg.norm(normals[large], axis=1, keepdims=True)
     inwards = -np.einsum("tij,tj->ti", (moved - vertices)[triangles][large], normals)
     np.testing.assert_allclose(inwards, 5e-5, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "turn", "same", "on_the_rim"),
+    [
+        ("square_peg", 0.0, set(SYMMETRIES), set()),
+        ("keyed_peg", 0.0, {"mirrored across x"}, set(SYMMETRIES) - {"mirrored across x"}),
+        ("snap_fit", 0.0, {"half turn", "mirrored across x", "mirrored across y"}, None),
+        ("dovetail", 0.0, {"mirrored across y"}, set()),
+        ("bayonet", 40.0, set(), None),  # a turn in one direction is not its own mirror image
+    ],
+)
+def test_find_symmetries_returns_those_of_the_drawing(name, turn, same, on_the_rim, tmp_path):
+    parts = read_parts(*PARTS[name]().write(tmp_path), "mm", (0.0,) * 6, "+z", None)
+    exact, approximate = find_symmetries(*parts, plan_motion(*parts, turn * DEGREE))
+    assert set(exact) == same
+    assert on_the_rim is None or set(approximate) == on_the_rim
+    assert not set(exact) & set(approximate)
