@@ -17,30 +17,21 @@ DWELLS = (1, 1, 2, 3, 5, 10, 20, 50, 100)  # steps between two changes of sign
 
 @dataclass
 class AttackResult:
-    """Worst values that an adversary reached.
+    """Worst values that an adversary reached; excess and residue at one step, and in total over a sequence."""
 
-    Attributes:
-        largest: Largest value of each quantity at every step (N, O): distance from the motion without actions, speed
-            and acceleration in the outputs' units per s and s².
-        lower: Least commands (N, O).
-        upper: Greatest commands (N, O).
-        excess: (2, A), excess over ±1 of the actions that are equivalent to corrected commands: at one step, and in
-            total over a sequence.
-        residue: (2, O), difference between corrected commands and the commands of the equivalent actions, in outputs
-            that no action moves: at one step, and in total over a sequence.
-        steps: Number of executed steps.
-        corrected: Number of steps with a correction.
-        worst: Worst value with its actions (N, A) and start (O,), by quantity, output and kind of step: True for the
-            steps at which a constraint can be active, False for the others.
-    """
-
+    # Largest value of each quantity at every step (N, O): distance from the motion without actions, speed and
+    # acceleration in the outputs' units per s and s².
     largest: dict[str, np.ndarray]
-    lower: np.ndarray
-    upper: np.ndarray
-    excess: np.ndarray
+    lower: np.ndarray  # least commands (N, O)
+    upper: np.ndarray  # greatest commands (N, O)
+    excess: np.ndarray  # (2, A), excess over ±1 of the actions that are equivalent to corrected commands
+    # (2, O), difference between corrected commands and the commands of the equivalent actions, in outputs that no
+    # action moves.
     residue: np.ndarray
-    steps: int = 0
-    corrected: int = 0
+    steps: int = 0  # number of executed steps
+    corrected: int = 0  # number of steps with a correction
+    # Worst value with its actions (N, A) and start (O,), by quantity, output and kind of step: True for the steps at
+    # which a constraint can be active, False for the others.
     worst: dict[tuple[str, int, bool], tuple[float, np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 

@@ -112,34 +112,20 @@ MALFORMED_STATUS = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
 
 @dataclass(frozen=True)
 class StatusLimits:
-    """Plausibility limits of status messages.
+    """Plausibility limits of status messages; all are positive, settling time and drift of the clock may be zero."""
 
-    Args:
-        velocity: Velocity limit of each joint, which bounds the change of its position (n,) [rad/s], positive.
-        max_age: Age above which a status is stale [s], positive. During this time messages may be lost or reordered.
-        max_lead: Largest time by which a status may be ahead of the local clock [s], positive.
-        position_jump: Largest position change beyond `velocity` times the time between two messages [rad], positive.
-        velocity_jump: Largest velocity change between two messages [rad/s], positive; a collision causes changes up
-            to 1 rad/s.
-        position_tolerance: Largest difference between positions and integrated velocities [rad], positive.
-        velocity_noise: Largest error of a velocity [rad/s], positive.
-        settling_time: Time for which messages must have been valid before they are used [s], not negative. A driver
-            that has just started accepts no commands during this time.
-        clock_drift: Largest drift between the two clocks [s/s], not negative; a slower drift is no fault.
-        max_check_interval: Largest wall-clock time between two checks before a missed deadline is reported [s],
-            positive.
-    """
-
-    velocity: tuple[float, ...]
-    max_age: float = 0.03
-    max_lead: float = 0.03
-    position_jump: float = 0.02
-    velocity_jump: float = 1.5
-    position_tolerance: float = 1e-3
-    velocity_noise: float = 0.02
+    velocity: tuple[float, ...]  # velocity limit of each joint, which bounds the change of its position (n,) [rad/s]
+    max_age: float = 0.03  # age above which a status is stale [s]; until then messages may be lost or reordered
+    max_lead: float = 0.03  # largest time by which a status may be ahead of the local clock [s]
+    position_jump: float = 0.02  # largest position change beyond `velocity` times the time between two messages [rad]
+    velocity_jump: float = 1.5  # largest velocity change between two messages [rad/s]; a collision causes up to 1 rad/s
+    position_tolerance: float = 1e-3  # largest difference between positions and integrated velocities [rad]
+    velocity_noise: float = 0.02  # largest error of a velocity [rad/s]
+    # Time for which messages must have been valid before they are used [s]. A driver that has just started accepts no
+    # commands during this time.
     settling_time: float = 0.25
-    clock_drift: float = 1e-3
-    max_check_interval: float = 0.03
+    clock_drift: float = 1e-3  # largest drift between the two clocks [s/s]; a slower drift is no fault
+    max_check_interval: float = 0.03  # largest wall-clock time between two checks, above it a deadline is missed [s]
 
     def __post_init__(self) -> None:
         positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)

@@ -49,24 +49,16 @@ class Violations(NamedTuple):
 class MotionConstraints:
     """Constraints of a commanded motion.
 
-    Attributes:
-        linear: G y ≥ c on every command (O,), the same at every step.
-        outside: Convex shapes that the commanded positions, the first D outputs, stay outside of.
-        inside: Convex shapes that the commanded positions stay inside of.
-        max_speed: Largest speed of each output, (O,) [unit/s]; infinite by default.
-        max_acceleration: Largest acceleration of each output, (O,) [unit/s²]; infinite by default.
-        state: Further constraints, such as joint limits.
-
     Raises:
         InputError: If sizes do not match, a limit is not positive, or `linear` differs from step to step.
     """
 
-    linear: LinearConstraints
-    outside: Sequence[ConvexShape] = ()
-    inside: Sequence[ConvexShape] = ()
-    max_speed: ArrayLike | None = None
-    max_acceleration: ArrayLike | None = None
-    state: Sequence[StateConstraints] = ()
+    linear: LinearConstraints  # G y ≥ c on every command (O,), the same at every step
+    outside: Sequence[ConvexShape] = ()  # shapes that the commanded positions, the first D outputs, stay outside of
+    inside: Sequence[ConvexShape] = ()  # shapes that the commanded positions stay inside of
+    max_speed: ArrayLike | None = None  # largest speed of each output, (O,) [unit/s]; infinite by default
+    max_acceleration: ArrayLike | None = None  # largest acceleration, (O,) [unit/s²]; infinite by default
+    state: Sequence[StateConstraints] = ()  # further constraints, such as joint limits
 
     def __post_init__(self) -> None:
         if self.linear.num_steps is not None:

@@ -255,20 +255,13 @@ def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tup
 
 @dataclass(frozen=True)
 class DemonstratedBounds:
-    """Lower and upper bounds of each output in each phase.
+    """Lower and upper bounds of each output in each phase."""
 
-    Attributes:
-        names: Names of the outputs (O,).
-        phases: Start of each phase (K,), from 0 to 1.
-        lower, upper: Bounds (K, O), infinite where an output is free.
-        max_rates: Largest demonstrated rate of each output (O,) [unit of the output/s].
-    """
-
-    names: tuple[str, ...]
-    phases: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    max_rates: np.ndarray
+    names: tuple[str, ...]  # names of the outputs (O,)
+    phases: np.ndarray  # start of each phase (K,), from 0 to 1
+    lower: np.ndarray  # lower bounds (K, O), infinite where an output is free
+    upper: np.ndarray  # upper bounds (K, O), infinite where an output is free
+    max_rates: np.ndarray  # largest demonstrated rate of each output (O,) [unit of the output/s]
 
     def contains(self, outputs: np.ndarray) -> np.ndarray:
         """Return a mask (N,), true where a sample is within the bounds; `outputs` (N, O) cover the whole motion."""

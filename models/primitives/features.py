@@ -20,14 +20,10 @@ class WindowFeatures:
     """Prior of the outputs y_j in a window given the history h: y_j = W_j h + (F_j ⊗ I) w.
 
     The weights w are standard normal. W and F depend on the inputs of history and window, and not on any outputs.
-
-    Attributes:
-        history_map: W (H+1, P), the map from the history to the prior mean of the future.
-        features: F (H+1, r), where F Fᵀ is the kernel of the future given the history and r its numerical rank.
     """
 
-    history_map: np.ndarray
-    features: np.ndarray
+    history_map: np.ndarray  # W (H+1, P), the map from the history to the prior mean of the future
+    features: np.ndarray  # F (H+1, r), where F Fᵀ is the kernel of the future given the history, of numerical rank r
 
 
 def window_features(

@@ -47,28 +47,19 @@ class Candidate:
 class Selection:
     """Selected mixture, kernel and regularization.
 
-    Attributes:
-        reference: Reference of all demonstrations.
-        components: Number of components C of its mixture.
-        kernel: For this λ, the widest kernel within a standard error of the best error.
-        length_scale: ℓ of the kernel [input].
-        lambda_, beta: λ = β, the strongest regularization within a standard error of the best error.
-        share: Share of the steps at which the motion without actions is within one standard deviation of the mean.
-        criteria: Bayesian information criterion by number of components.
-        candidates: All candidates.
-        why: Reason for the selection in a few sentences.
+    The regularization is the strongest one within a standard error of the best error, and the kernel the widest one.
     """
 
-    reference: ReferenceTrajectory
-    components: int
+    reference: ReferenceTrajectory  # reference of all demonstrations
+    components: int  # number of components C of its mixture
     kernel: Kernel
-    length_scale: float
-    lambda_: float
+    length_scale: float  # ℓ of the kernel [input]
+    lambda_: float  # λ = β
     beta: float
-    share: float
-    criteria: dict[int, float]
-    candidates: tuple[Candidate, ...]
-    why: str
+    share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
+    criteria: dict[int, float]  # Bayesian information criterion by number of components
+    candidates: tuple[Candidate, ...]  # all candidates
+    why: str  # reason for the selection in a few sentences
 
     @property
     def is_within_spread(self) -> bool:

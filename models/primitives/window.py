@@ -19,18 +19,12 @@ _OPPOSITE = 4 * float(np.finfo(float).eps)  # largest entry of the sum of two un
 
 @dataclass(frozen=True)
 class Window:
-    """Reference and constraints at the executed point, which comes first, and at the horizon after it.
+    """Reference and constraints G y ≥ c at the executed point, which comes first, and at the horizon after it."""
 
-    Attributes:
-        means: Reference means (H+1, O).
-        covariances: Reference covariances (H+1, O, O), positive definite.
-        G, c: Constraints G y ≥ c, (H+1, F, O) and (H+1, F).
-    """
-
-    means: np.ndarray
-    covariances: np.ndarray
-    G: np.ndarray
-    c: np.ndarray
+    means: np.ndarray  # reference means (H+1, O)
+    covariances: np.ndarray  # reference covariances (H+1, O, O), positive definite
+    G: np.ndarray  # (H+1, F, O)
+    c: np.ndarray  # (H+1, F)
 
     @classmethod
     def checked(cls, means: ArrayLike, covariances: ArrayLike, G: np.ndarray, c: np.ndarray) -> "Window":

@@ -19,14 +19,10 @@ from guiderail.models.common.registry import Registry
 
 @dataclass(frozen=True)
 class JointDrives:
-    """Position control of joints by springs and dampers.
+    """Position control of joints by springs and dampers."""
 
-    Attributes:
-        stiffness: Stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic one.
-        inertia: Typical inertia of each joint including its rotor, (n,) [kg m²] or [kg], for critical damping.
-    """
-
-    stiffness: tuple[float, ...]
+    stiffness: tuple[float, ...]  # stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic one
+    # Typical inertia of each joint including its rotor, (n,) [kg m²] or [kg], for critical damping.
     inertia: tuple[float, ...]
 
     def __post_init__(self) -> None:
@@ -98,34 +94,22 @@ class Robot:
 
 @dataclass(frozen=True)
 class EndEffector:
-    """End effector: a rigid tool or a gripper.
+    """End effector: a rigid tool or a gripper."""
 
-    Attributes:
-        name: Name in the registry.
-        title: Name for users.
-        model: URDF or SDF file.
-        mount_frame: Frame that is mounted to the flange.
-        tool_center: Name of the frame P that a station commands: the center of compliance, z towards the flange, fixed
-            to the mount.
-        bodies: Names of all bodies, the mount first.
-        X_FlangeMount: Pose of the mount in the flange frame, after a rotation of that frame by the robot's `tool_turn`.
-        joints: Names of the actuated joints of a gripper, without mimic joints; empty for a rigid tool.
-        opening: Positions of all joints by name, including mimic joints, at the start of an episode [rad] or [m].
-        drives: Drives of the actuated joints.
-        source: Source of the model's numbers.
-    """
-
-    name: str
-    title: str
-    model: Path
-    mount_frame: str
+    name: str  # name in the registry
+    title: str  # name for users
+    model: Path  # URDF or SDF file
+    mount_frame: str  # frame that is mounted to the flange
+    # Name of the frame P that a station commands: the center of compliance, z towards the flange, fixed to the mount.
     tool_center: str
-    bodies: tuple[str, ...]
+    bodies: tuple[str, ...]  # names of all bodies, the mount first
+    # Pose of the mount in the flange frame, after a rotation of that frame by the robot's `tool_turn`.
     X_FlangeMount: RigidTransform = field(default_factory=RigidTransform)
-    joints: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()  # names of the actuated joints of a gripper, without mimic joints; empty for a tool
+    # Positions of all joints by name, including mimic joints, at the start of an episode [rad] or [m].
     opening: Mapping[str, float] = field(default_factory=dict)
-    drives: JointDrives | None = None
-    source: str = ""
+    drives: JointDrives | None = None  # drives of the actuated joints
+    source: str = ""  # source of the model's numbers
 
     def __post_init__(self) -> None:
         if not self.bodies:

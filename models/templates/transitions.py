@@ -15,13 +15,9 @@ from guiderail.models.templates.kinds import TRANSITION_DISTANCES, register, req
 
 
 class TransitionDistance(StatePart, ABC):
-    """Transition distance d_t, which decreases as the task progresses.
+    """Transition distance d_t, which decreases as the task progresses."""
 
-    Attributes:
-        unit: "m" or "deg", the unit of thresholds in a file; values are in meters or radians.
-    """
-
-    unit: str = "m"
+    unit: str = "m"  # unit of thresholds in a file, "m" or "deg"; values are in meters or radians
 
     @abstractmethod
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:

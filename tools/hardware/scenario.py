@@ -32,18 +32,14 @@ class PandaDriver:
 
 @dataclass
 class Scenario:
-    """Robot, its bus and its surroundings, with the fields of Drake's `hardware_sim`.
+    """Robot, its bus and its surroundings, with the fields of Drake's `hardware_sim`."""
 
-    Attributes:
-        station: "simulation" for a simulated driver, or "hardware".
-        directives: Model directives of the surroundings, for a simulated driver.
-        lcm_buses: LCM buses by name.
-        model_drivers: Driver by the name of the robot; exactly one.
-    """
-
-    station: str = SIMULATION
+    station: str = SIMULATION  # "simulation" for a simulated driver, or "hardware"
+    # Model directives of the surroundings, for a simulated driver.
     directives: list[ModelDirective] = field(default_factory=list)
+    # LCM buses by name.
     lcm_buses: dict[str, DrakeLcmParams] = field(default_factory=lambda: {"default": DrakeLcmParams()})
+    # Driver by the name of the robot; exactly one.
     model_drivers: dict[str, IiwaDriver | PandaDriver] = field(default_factory=dict)
 
     @property

@@ -13,34 +13,23 @@ from guiderail.models.primitives import LinearConstraints
 class PassageGeometry:
     """Positions and sizes in meters; the walls bound the position of the robot's center.
 
-    Attributes:
-        start, goal: Start and goal (x, y) of the robot.
-        goal_radius: Distance within which the goal is reached.
-        wall_y: Lower and upper face of the two walls.
-        gap_x: Left and right side of the gap between the walls.
-        wall_length: Length of each wall, beyond the reach of the robot.
-        zone_x: Lower bound of x in the restricted zone.
-        obstacle, obstacle_radius: Disc on the path of the demonstrations, which were recorded without it. It has a
-            cost, and the robot can pass through it.
-        second_obstacle: Position of a second such disc, or None.
-        obstacles_move: True if the positions of the discs are sampled in every episode.
-        obstacle_margin: Distance from a disc within which it has a cost.
-        robot_radius: Radius of the robot; the visible walls are smaller by this radius than those for its center.
+    The obstacles are discs on the path of the demonstrations, which were recorded without them. They have a cost, and
+    the robot can pass through them.
     """
 
-    start: tuple[float, float] = (0.30, 0.05)
-    goal: tuple[float, float] = (0.40, 0.95)
-    goal_radius: float = 0.05
-    wall_y: tuple[float, float] = (0.50, 0.60)
-    gap_x: tuple[float, float] = (0.32, 0.38)
-    wall_length: float = 5.0
-    zone_x: float = 0.60
-    obstacle: tuple[float, float] = (0.56, 0.27)
+    start: tuple[float, float] = (0.30, 0.05)  # start (x, y) of the robot
+    goal: tuple[float, float] = (0.40, 0.95)  # goal (x, y) of the robot
+    goal_radius: float = 0.05  # distance within which the goal is reached
+    wall_y: tuple[float, float] = (0.50, 0.60)  # lower and upper face of the two walls
+    gap_x: tuple[float, float] = (0.32, 0.38)  # left and right side of the gap between the walls
+    wall_length: float = 5.0  # length of each wall, beyond the reach of the robot
+    zone_x: float = 0.60  # lower bound of x in the restricted zone
+    obstacle: tuple[float, float] = (0.56, 0.27)  # center of the obstacle
     obstacle_radius: float = 0.03
-    second_obstacle: tuple[float, float] | None = None
-    obstacles_move: bool = False
-    obstacle_margin: float = 0.04
-    robot_radius: float = 0.015
+    second_obstacle: tuple[float, float] | None = None  # center of a second obstacle, or None
+    obstacles_move: bool = False  # True if the positions of the obstacles are sampled in every episode
+    obstacle_margin: float = 0.04  # distance from an obstacle within which it has a cost
+    robot_radius: float = 0.015  # radius of the robot; the visible walls are smaller by it than those for its center
 
     @property
     def obstacles(self) -> np.ndarray:
