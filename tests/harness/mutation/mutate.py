@@ -49,10 +49,7 @@ TARGETS = {
     "models/templates/constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
     "models/templates/geometry.py": TEMPLATES,
-    "models/control/keep_out.py": [
-        "tests/models/control/test_keep_out.py",
-        "tests/models/control/test_keep_out_properties.py",
-    ],
+    "models/control/keep_out.py": ["tests/models/control/test_keep_out.py"],
     "models/control/cartesian_impedance.py": ["tests/models/control/test_cartesian_impedance.py"],
     "models/control/joint_status.py": ["tests/models/control/test_joint_status.py"],
     "models/control/message_sequence.py": ["tests/models/control/test_message_sequence.py"],
