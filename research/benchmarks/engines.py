@@ -13,7 +13,7 @@ from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import poses

@@ -26,7 +26,7 @@ from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.policy import FORMAT, Policy
 from research.benchmarks import with_progress
 

@@ -19,8 +19,7 @@ from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock

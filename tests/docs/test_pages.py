@@ -117,7 +117,7 @@ def test_robot_page_has_the_limits_of_the_code():
 
     from guiderail.diagrams.hardware.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE
     from guiderail.diagrams.hardware.station import HardwareStation
-    from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+    from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
     from guiderail.diagrams.tasks.options import COLLISION_FORCE
     from guiderail.models.common.transforms import MM
     from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES

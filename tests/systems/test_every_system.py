@@ -24,7 +24,7 @@ import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.mujoco import MujocoStation
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.joint_status import StatusLimits

@@ -8,7 +8,7 @@ pytest.importorskip("mujoco")
 
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM

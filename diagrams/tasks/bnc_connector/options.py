@@ -24,7 +24,7 @@ from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 
 if TYPE_CHECKING:
-    from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+    from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 
 # Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {
@@ -154,7 +154,7 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
 
     def workcell(self) -> BncWorkcell:
         """Return the workcell with these options."""
-        from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell  # imports Drake
+        from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell  # imports Drake
 
         dimensions = replace(
             NOMINAL.with_bore_clearance(self.bore_clearance),

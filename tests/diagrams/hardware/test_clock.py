@@ -18,7 +18,7 @@ from guiderail.diagrams.hardware.lcm_simulated import (
     serve_in_lockstep,
     serve_in_real_time,
 )
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
 

@@ -9,7 +9,7 @@ from guiderail.diagrams.hardware.driver import DRIVERS, Driver, find_driver, reg
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import JointStatus
 from guiderail.systems.torque_safety_limiter import ArmState

@@ -19,7 +19,7 @@ from guiderail.diagrams.hardware.fci import (
 from guiderail.diagrams.hardware.station import HardwareStation, make_robot_impedance
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.control.motion_constraints import FRANKA_LIMITS

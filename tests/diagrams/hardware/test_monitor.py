@@ -11,7 +11,7 @@ from guiderail.diagrams.hardware.driver import safety_limits, torque_tolerance
 from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.hardware.monitor import MAX_REPEATS, MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault, damping_torque
 from guiderail.systems.support.drake_multibody import JointDynamics

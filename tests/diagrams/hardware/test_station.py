@@ -22,7 +22,7 @@ from guiderail.diagrams.hardware.station import HardwareStation, tool_jacobian
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, StatusLimits
 from guiderail.systems.torque_safety_limiter import ArmState

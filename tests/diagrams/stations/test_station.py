@@ -6,7 +6,7 @@ from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.mujoco import MujocoStation
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 
 PLACES = [

@@ -17,7 +17,7 @@ from guiderail.diagrams.hardware.fci import FciDriver
 from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.joint_status import STATUS_FAULTS, Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.connection import LOCKSTEP_TIMEOUT, subprocess_tied_to_parent

@@ -17,7 +17,7 @@ from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.hardware.station import HardwareStation
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.systems.torque_safety_limiter import ArmState

@@ -25,7 +25,7 @@ from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.driver import safety_limits
 from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.joint_status import MAX_SENDERS
 
 STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] of the robot's clock

@@ -4,7 +4,7 @@ import pytest
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
-from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
 from guiderail.tools.hardware.connection import RobotConnection
