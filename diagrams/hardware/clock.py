@@ -5,36 +5,50 @@ from __future__ import annotations
 import gc
 import os
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context
 
 from guiderail.diagrams.hardware.driver import Driver
 from guiderail.models.common.errors import InputError
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.hardware.station import HardwareStation
 
 REALTIME_PRIORITY = 20  # priority under SCHED_FIFO
 BIN_WIDTH = 1e-4  # width of a histogram's bin [s]
 
 
-class ReceivingStation(Protocol):
-    """Station that reads the robot's newest status before each step."""
+class Clock(ABC):
+    """Clock that advances a hardware station together with its robot.
 
-    def receive(self, context: Context, clock: float | None = None) -> None:
-        """Read the newest status at the wall clock time `clock` [s]; `context` is the root context."""
+    A subclass sets `_period`, the status period of the station [s].
+    """
 
+    _period: float
 
-class Clock(Protocol):
-    """Clock that advances a hardware station together with its robot."""
-
+    @abstractmethod
     def begin(self) -> None:
         """Prepare to advance a simulator that has just been initialized with the newest status."""
 
-    def advance(self, simulator: Simulator, station: ReceivingStation, steps: int) -> None:
+    def advance(self, simulator: Simulator, station: HardwareStation, steps: int) -> None:
         """Advance the simulator by `steps` status periods."""
+        context = simulator.get_mutable_context()
+        start = context.get_time()
+        for step in range(steps):
+            time_of_status = self._wait_for_step()
+            # Events of this instant are still pending in Drake, and belong to the previous status.
+            simulator.AdvancePendingEvents()
+            station.receive(context, time_of_status)
+            simulator.AdvanceTo(start + (step + 1) * self._period)
+
+    @abstractmethod
+    def _wait_for_step(self) -> float | None:
+        """Wait until the next step is due; return its time [s], or None to count it as one period."""
 
 
 def check_rate(rate: float) -> None:
@@ -94,7 +108,7 @@ def garbage_collection_disabled() -> Iterator[None]:
         gc.unfreeze()
 
 
-class WallClock:
+class WallClock(Clock):
     """Clock that advances a hardware station in real time: one step when a status arrives.
 
     A step is made without a status if none arrives for one and a half periods; the station's watchdog detects this.
@@ -127,22 +141,7 @@ class WallClock:
         self._num_used, self._last_step = self._driver.num_statuses, time.monotonic()
         self._due = self._last_step + self._period / self._rate
 
-    def advance(self, simulator: Simulator, station: ReceivingStation, steps: int) -> None:
-        """Advance the simulator by `steps` status periods."""
-        context = simulator.get_mutable_context()
-        start = context.get_time()
-        for step in range(steps):
-            self._wait()
-            self._num_used, now = self._driver.num_statuses, time.monotonic()
-            self.intervals.add(now - self._last_step)
-            self._last_step = now
-            self._due = max(self._due, now) + self._period / self._rate
-            # Events of this instant are still pending in Drake, and belong to the previous status.
-            simulator.AdvancePendingEvents()
-            station.receive(context, now * self._rate)
-            simulator.AdvanceTo(start + (step + 1) * self._period)
-
-    def _wait(self) -> None:
+    def _wait_for_step(self) -> float:
         # Sleep first, so that a driver that sends too often does not set the pace.
         period = self._period / self._rate
         time.sleep(max(self._due - 0.5 * period - time.monotonic(), 0.0))
@@ -150,3 +149,8 @@ class WallClock:
         while self._driver.num_statuses == self._num_used and (left := end - time.monotonic()) > 0.0:
             self._driver.receive(left)
         self._driver.receive()
+        self._num_used, now = self._driver.num_statuses, time.monotonic()
+        self.intervals.add(now - self._last_step)
+        self._last_step = now
+        self._due = max(self._due, now) + period
+        return now * self._rate

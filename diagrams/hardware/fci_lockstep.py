@@ -13,14 +13,13 @@ import socket
 from typing import Any
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.clock import ReceivingStation
+from guiderail.diagrams.hardware.clock import Clock
 
 LOCKSTEP_PORT = 1339  # the robot's own ports are 1337 and 1338
 
 
-class FciLockstepClock:
+class FciLockstepClock(Clock):
     """Clock that advances a hardware station in lockstep with a simulated Franka.
 
     The station's time base advances with the robot's clock, so that a delay of either process does not make a status
@@ -43,15 +42,9 @@ class FciLockstepClock:
         """Prepare to advance a simulator that has just been initialized with the newest status."""
         self._follow(0.0)
 
-    def advance(self, simulator: Simulator, station: ReceivingStation, steps: int) -> None:
-        """Advance the simulator by `steps` status periods."""
-        context = simulator.get_mutable_context()
-        start = context.get_time()
-        for step in range(steps):
-            self._follow(self._period)
-            simulator.AdvancePendingEvents()
-            station.receive(context, self._time)
-            simulator.AdvanceTo(start + (step + 1) * self._period)
+    def _wait_for_step(self) -> float:
+        self._follow(self._period)
+        return self._time
 
     def move_parts(self, offsets: list[list[float]]) -> None:
         """Move the task's fixture and workpiece by their offsets, as `InsertionTask.part_offsets` defines them."""

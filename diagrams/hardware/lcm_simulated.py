@@ -17,7 +17,7 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem
 
-from guiderail.diagrams.hardware.clock import ReceivingStation
+from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.lcm import (
     HEAD_FORMAT,
     HEAD_SIZE,
@@ -105,7 +105,7 @@ class SimulatedIiwa(Diagram):
         self.controller_plant.place(self.plant, self.arm.model, context, pose)
 
 
-class LockstepClock:
+class LockstepClock(Clock):
     """Clock that advances a hardware station in lockstep with a simulated driver: one step per new status.
 
     Before each step the status of the previous step is acknowledged. `serve_in_lockstep` waits for this
@@ -133,20 +133,9 @@ class LockstepClock:
         self._driver.receive()
         self._used = self._driver.statuses.head
 
-    def advance(self, simulator: Simulator, station: ReceivingStation, steps: int) -> None:
-        """Advance the simulator by `steps` status periods."""
-        context = simulator.get_mutable_context()
-        start = context.get_time()
-        for step in range(steps):
-            # Wait for the full timeout only once if the robot is silent, not in every step.
-            self._wait(self._period if self._has_timed_out else self._timeout)
-            self._has_timed_out = self._driver.statuses.head == self._used
-            self._used = self._driver.statuses.head
-            simulator.AdvancePendingEvents()
-            station.receive(context)
-            simulator.AdvanceTo(start + (step + 1) * self._period)
-
-    def _wait(self, timeout: float) -> None:
+    def _wait_for_step(self) -> None:
+        # Wait for the full timeout only once if the robot is silent, not in every step.
+        timeout = self._period if self._has_timed_out else self._timeout
         statuses, end = self._driver.statuses, time.monotonic() + timeout
         self._acknowledge()
         while statuses.head == self._used and (left := end - time.monotonic()) > 0.0:
@@ -154,6 +143,8 @@ class LockstepClock:
             self._driver.receive(left)
             if statuses.head == self._used and statuses.repeats > repeats:
                 self._acknowledge()  # the acknowledgement may have been lost
+        self._has_timed_out = statuses.head == self._used
+        self._used = statuses.head
 
     def _acknowledge(self) -> None:
         self._driver.lcm.Publish(self._channel, self._used)
