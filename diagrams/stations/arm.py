@@ -13,9 +13,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, InputPort, Output
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.stations.impedance_control import add_impedance_control
-from guiderail.diagrams.stations.options import ArmOptions
+from guiderail.diagrams.stations.options import ArmOptions, JointTorqueAccuracy
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.sensing import JointTorqueAccuracy
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,

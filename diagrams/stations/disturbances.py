@@ -11,8 +11,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, ConstantVectorSource
 
-from guiderail.diagrams.stations.options import Disturbances
-from guiderail.diagrams.stations.sensing import SENSING, SensorErrors
+from guiderail.diagrams.stations.options import SENSING, Disturbances, SensorErrors
 from guiderail.diagrams.stations.station import (
     OUTPUTS,
     PLANT_PERIOD,

@@ -44,6 +44,7 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
 from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
+from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -142,8 +143,6 @@ def command_timeout(period: float) -> float:
 
 def tare_steps(period: float) -> tuple[int, int]:
     """Return the numbers of steps of `period` [s] before and during a tare."""
-    from guiderail.diagrams.stations.sensing import TARE_AVERAGED, TARE_SKIPPED
-
     skipped, averaged = (max(round(n * CONTROL_PERIOD / period), 1) for n in (TARE_SKIPPED, TARE_AVERAGED))
     return skipped, averaged
 

@@ -7,7 +7,7 @@ from guiderail import InputError, make_env
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
-from guiderail.diagrams.stations.sensing import SENSING, TARE_AVERAGED, TARE_SKIPPED
+from guiderail.diagrams.stations.options import SENSING, TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.transforms import MM
 
 HARD = {"difficulty": "hard", "guidance": "kgrl", "action_repeat": 1}
