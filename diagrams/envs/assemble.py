@@ -12,7 +12,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
-from guiderail.diagrams.envs.cameras import Camera, add_meshcat, add_observation_camera, add_picture, scene_of
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import (
     CLOCKS,
@@ -23,6 +22,7 @@ from guiderail.diagrams.envs.observation import (
     affine,
 )
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
+from guiderail.diagrams.envs.scene import Camera, add_meshcat, add_observation_camera, add_picture, scene_of
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output

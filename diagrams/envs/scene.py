@@ -1,17 +1,224 @@
-"""Drawing of a task: the browser view, viewpoints, and the lines that a picture shows in addition to the robot."""
+"""Drawing of a task: cameras, the browser view, viewpoints, and the lines that a picture shows next to the robot."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import Meshcat
-from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, EventStatus, OutputPort
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    Role,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, OutputPort
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
-from guiderail.diagrams.envs.cameras import PUBLISH_PERIOD, open_meshcat
+from guiderail.diagrams.envs.meshcat_page import MeshcatPage
+from guiderail.diagrams.wiring import add_system
+from guiderail.models.common.errors import InputError
+
+_OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
+PUBLISH_PERIOD = 1 / 50  # period of a browser view [s]
+
+
+# Observations have Drake's default light, from the camera. Pictures have a white background and light from above, which
+# shows edges better.
+_LIGHTS = [
+    LightParameter(type="directional", frame="camera", direction=[0.3, 0.2, 1.0], intensity=0.7),
+    LightParameter(type="directional", frame="world", direction=[-0.2, 0.3, -1.0], intensity=0.5),
+]
+_PARAMETERS = {
+    _OBSERVATION_RENDERER: RenderEngineVtkParams(),
+    _PICTURE_RENDERER: RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=_LIGHTS),
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Camera that is fixed in the world or in a frame of the plant, such as a wrist camera."""
+
+    size: tuple[int, int]  # width and height of its image [pixels]
+    vertical_fov: float  # vertical field of view [rad]
+    # Pose of the camera in the world, or in `frame`; C has x to the right, y down and z into the picture.
+    X_WC: RigidTransform
+    frame: str | None = None  # name of the frame of the plant that carries the camera; None: the world
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return the pixel coordinates (n, 2), from the upper left corner, of points (n, 3) in the world [m].
+
+        Raises:
+            InputError: If the camera is not fixed in the world.
+        """
+        if self.frame is not None:
+            raise InputError(
+                f"a camera that moves with the frame {self.frame!r} has no fixed pose to project points of the world "
+                "with: use a camera that is fixed in the world"
+            )
+        p_C = self.X_WC.inverse() @ np.asarray(points, float).T
+        focal = 0.5 * self.size[1] / np.tan(0.5 * self.vertical_fov)
+        return (focal * p_C[:2] / p_C[2]).T + 0.5 * np.array(self.size)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
+    """Return the pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), with a level horizon.
+
+    Raises:
+        InputError: If the camera looks straight up or down, where no horizon is level, or the two points are equal.
+    """
+    if not np.hypot(target[0] - eye[0], target[1] - eye[1]) > 0.0:
+        raise InputError(f"a camera at {eye} cannot look at {target} with a level horizon: write its pose instead")
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return RigidTransform(RotationMatrix(np.stack([right, np.cross(forward, right), forward], axis=1)), eye)
+
+
+def front_camera(target: np.ndarray, distance: float, height: float) -> Camera:
+    """Return a camera that looks slightly down at `target` (3,) from the side away from the arm; lengths in m."""
+    X_WC = look_at(target + np.array([0.8 * distance, -0.6 * distance, height]), target)
+    return Camera((640, 480), np.deg2rad(30.0), X_WC)
+
+
+def add_camera(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    query: OutputPort,
+    name: str,
+    camera: Camera,
+    *,
+    plant: MultibodyPlant | None = None,
+    is_picture: bool = False,
+) -> OutputPort:
+    """Add a camera and return the port of its color image, an `ImageRgba8U`.
+
+    `plant` has the frame of a camera that is not fixed in the world. With `is_picture` the scene is lit for a picture
+    instead of an observation. An image is rendered only when the port is evaluated.
+
+    Raises:
+        InputError: If this machine lacks the library that renders without a display, or the station's plant lacks the
+            camera's frame.
+    """
+    check_rendering()
+    parent, X_PC = scene_graph.world_frame_id(), camera.X_WC
+    if camera.frame is not None:
+        if plant is None or not plant.HasFrameNamed(camera.frame):
+            raise InputError(f"this station has no frame {camera.frame!r} for a camera: choose another observation")
+        carrier = plant.GetFrameByName(camera.frame)
+        parent = plant.GetBodyFrameIdOrThrow(carrier.body().index())
+        X_PC = carrier.GetFixedPoseInBodyFrame() @ camera.X_WC
+    # Mesa and Triton, a dependency of PyTorch with CUDA, load different versions of LLVM. If Triton's is loaded second,
+    # the process ends with a segmentation fault. PyTorch imports Triton late, with its compiler.
+    with suppress(ImportError):
+        import_module("triton")
+    renderer = _PICTURE_RENDERER if is_picture else _OBSERVATION_RENDERER
+    if not scene_graph.HasRenderer(renderer):
+        scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(_PARAMETERS[renderer]))
+    clipping = ClippingRange(0.01, 10.0)
+    info = CameraInfo(*camera.size, camera.vertical_fov)
+    core = RenderCameraCore(renderer, info, clipping, RigidTransform())
+    sensor = RgbdSensor(
+        parent_id=parent,
+        X_PB=X_PC,
+        color_camera=ColorRenderCamera(core, show_window=False),
+        depth_camera=DepthRenderCamera(core, DepthRange(0.02, 9.0)),
+    )
+    return add_system(builder, name, sensor, query).color_image_output_port()
+
+
+def add_observation_camera(builder: DiagramBuilder, station: Any, camera: Camera) -> OutputPort:
+    """Add the camera of an observation in a station's scene; return the port of its image.
+
+    Raises:
+        InputError: If the station renders no images, or as `add_camera`.
+    """
+    if not station.HasOutputPort("query"):
+        raise InputError("this station renders no images: choose another observation")
+    query, plant = station.GetOutputPort("query"), getattr(station, "plant", None)
+    return add_camera(builder, station.scene_graph, query, "observation_camera", camera, plant=plant)
+
+
+def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, task: str) -> None:
+    """Add the camera for pictures of a task and export its image; `task` is the name of the task.
+
+    Raises:
+        InputError: If the task has no camera, the station has no scene, or as `add_camera`.
+    """
+    if camera is None:
+        raise InputError(f"{task} has no camera: leave out render_mode='rgb_array' or --image, or write its camera()")
+    query = scene_of(station)
+    picture = add_camera(builder, station.scene_graph, query, "picture", camera, is_picture=True)
+    builder.ExportOutput(picture, "rgb_image")
+
+
+def scene_of(station: Any) -> OutputPort:
+    """Return the query port of a station's scene.
+
+    Raises:
+        InputError: If the station has no scene, because it is a real robot.
+    """
+    if not station.HasOutputPort("query"):
+        raise InputError("this station has no scene to draw: choose a simulated one, or leave render_mode out")
+    return station.GetOutputPort("query")
+
+
+def check_rendering() -> None:
+    """Check that EGL is installed, because without it Drake would abort the process.
+
+    Raises:
+        InputError: If EGL is missing; the message names the package to install.
+    """
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        raise InputError(
+            "images need libEGL.so.1, which this machine lacks: install it (Debian, Ubuntu: apt install libegl1), or "
+            "use observation='state' without render_mode='rgb_array'"
+        ) from None
+
+
+def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
+    """Open a browser view on this machine, by default on a new page; return its page and its visualizer.
+
+    Raises:
+        InputError: If the environment forbids Drake to open a network port.
+    """
+    try:
+        meshcat = meshcat or MeshcatPage()
+    except RuntimeError as error:
+        raise InputError(
+            f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"
+        ) from error
+    parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=PUBLISH_PERIOD)
+    return meshcat, MeshcatVisualizer(meshcat, parameters)
+
+
+def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> Meshcat:
+    """Add a browser view to a diagram and return its page.
+
+    Raises:
+        InputError: As `open_meshcat`.
+    """
+    meshcat, visualizer = open_meshcat()
+    add_system(builder, "meshcat", visualizer, query)
+    return meshcat
 
 
 class View:

@@ -13,9 +13,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.envs import options as option_models
-from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.envs.scene import Camera, Scene, in_plane
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach

@@ -20,10 +20,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from guiderail.diagrams.envs.cameras import add_meshcat
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
-from guiderail.diagrams.envs.scene import Viewpoint
+from guiderail.diagrams.envs.scene import Viewpoint, add_meshcat
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE

@@ -10,8 +10,7 @@ from typing import Any, Protocol, cast
 import gymnasium
 import numpy as np
 
-from guiderail.diagrams.envs.cameras import open_meshcat
-from guiderail.diagrams.envs.scene import View, Viewpoint
+from guiderail.diagrams.envs.scene import View, Viewpoint, open_meshcat
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.interventions import Supervisor
 

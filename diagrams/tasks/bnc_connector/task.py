@@ -13,10 +13,18 @@ from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD
-from guiderail.diagrams.envs.scene import ARM_VIEW, TOOL_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.envs.scene import (
+    ARM_VIEW,
+    TOOL_VIEW,
+    Camera,
+    Scene,
+    box_edges,
+    front_camera,
+    in_frame,
+    viewpoint,
+)
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
@@ -306,8 +314,7 @@ class BncConnector(DemonstratedInsertion):
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the jack."""
-        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
-        return Camera((640, 480), np.deg2rad(30.0), X_WC)
+        return front_camera(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
 
     def scene(self) -> Scene:
         """Return the demonstrations and the box of the alignment constraint."""

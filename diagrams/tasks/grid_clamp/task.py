@@ -12,10 +12,9 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD
-from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
@@ -344,8 +343,7 @@ class GridClamp(InsertionTask):
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the holes."""
-        target = np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01]
-        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.17, height=0.075))
+        return front_camera(np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01], distance=0.17, height=0.075)
 
     def scene(self) -> Scene:
         """Return the drawing of the cuboid that bounds commands, up to the start height."""

@@ -12,10 +12,9 @@ from pydantic import Field
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
-from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Pair, ResetOptions
-from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.envs.scene import Camera, Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
 from guiderail.diagrams.stations.station import Station

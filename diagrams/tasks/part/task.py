@@ -14,10 +14,9 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Number
-from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell
@@ -343,7 +342,7 @@ class PartInsertion(DemonstratedInsertion):
         """Return a camera that looks slightly down at the socket."""
         size = self.file.motion.travel
         target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
-        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
+        return front_camera(target, distance=6 * size, height=3 * size)
 
     def scene(self) -> Scene:
         """Return the demonstrations and the box of the bounds of each phase."""

@@ -10,10 +10,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from scipy.spatial.transform import Rotation
 
-from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD
-from guiderail.diagrams.envs.scene import Scene, in_frame, viewpoint
+from guiderail.diagrams.envs.scene import Camera, Scene, in_frame, look_at, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PlacedTemplate
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, make_mug

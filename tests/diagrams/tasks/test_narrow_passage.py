@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import guiderail
-from guiderail.diagrams.envs import cameras
+from guiderail.diagrams.envs import scene
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage as Task
 from guiderail.models.common.errors import InputError
@@ -342,14 +342,14 @@ def test_the_browser_view_is_local(monkeypatch):
 
 
 def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
-    load = cameras.ctypes.CDLL
+    load = scene.ctypes.CDLL
 
     def missing(name, *arguments, **named):
         if "EGL" in str(name):
             raise OSError(f"{name}: cannot open shared object file")
         return load(name, *arguments, **named)
 
-    monkeypatch.setattr(cameras.ctypes, "CDLL", missing)
+    monkeypatch.setattr(scene.ctypes, "CDLL", missing)
     for arguments in ({"observation": "image"}, {"render_mode": "rgb_array"}):
         with pytest.raises(InputError, match=r"libEGL\.so\.1.*libegl1"):
             make("kmp", horizon=17, **arguments)  # of which no diagram is there yet

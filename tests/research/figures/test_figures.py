@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.cameras import Camera, look_at
+from guiderail.diagrams.envs.scene import Camera, look_at
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.experiments.declaration import load_study

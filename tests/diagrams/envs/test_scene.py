@@ -8,7 +8,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.envs.cameras import Camera, add_camera, look_at
+from guiderail.diagrams.envs.scene import Camera, add_camera, look_at
 from guiderail.models.common.errors import InputError
 
 RENDERS = """
