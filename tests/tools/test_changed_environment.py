@@ -10,11 +10,11 @@ from guiderail.tools.environments import changed_environment, check_environment,
 from guiderail.tools.evaluation import evaluate
 from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.robustness import robustness
+from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.job import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.report_data import command
 
 HARD = {"difficulty": "hard"}

@@ -10,9 +10,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import check_seed
+from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.files import LOCK, atomic_folder, check_page, check_picture, check_writable, remove_partial_files
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
 
 def test_check_refuses_a_path_below_a_file(tmp_path):

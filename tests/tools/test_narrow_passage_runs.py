@@ -15,11 +15,11 @@ from guiderail.tools.datasets.validate import validate_demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import reset_held_out
+from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.visualization import camera
-from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.replay import default_page, tube, write_page
 
 SETTINGS = {"net_arch": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}

@@ -35,10 +35,10 @@ def visualize(
     constraints, and plots of force, violation, action and phase. It is self-contained. "Before" is the demonstration
     alone where the guidance has one, and random actions otherwise.
     """
+    from guiderail.tools.evaluation.subject import EpisodeSpec
     from guiderail.tools.files import check_picture, check_video
     from guiderail.tools.visualization.camera import write_image, write_video
     from guiderail.tools.visualization.curves import plot_run
-    from guiderail.tools.visualization.episode_spec import EpisodeSpec
     from guiderail.tools.visualization.replay import default_page, write_page
 
     environment = cli.parse_environment(env, station=station)

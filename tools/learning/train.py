@@ -237,8 +237,8 @@ def draw_pictures(out: Path) -> dict[str, str]:
 
     If the replay page cannot be drawn on this machine, the reason is returned in place of its path.
     """
+    from guiderail.tools.evaluation.subject import EpisodeSpec
     from guiderail.tools.visualization.curves import plot_run
-    from guiderail.tools.visualization.episode_spec import EpisodeSpec
     from guiderail.tools.visualization.replay import default_page, write_page
 
     curve = str(plot_run(out))

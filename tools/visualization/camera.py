@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import EnvCallback, Transition, rollout
+from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_picture, check_video, write_atomically
-from guiderail.tools.visualization.episode_spec import EpisodeSpec, outcome
 from guiderail.tools.visualization.style import new_figure, save_figure
 
 ROWS, COLUMNS = 2, 3

@@ -26,8 +26,8 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
+from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_page, write_atomically
-from guiderail.tools.visualization.episode_spec import EpisodeSpec, outcome
 from guiderail.tools.visualization.style import is_demonstrated
 
 POINTS = 400  # largest number of samples of an episode, about the width of a page in pixels

@@ -7,7 +7,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.visualization.episode_spec import EpisodeSpec
+from guiderail.tools.evaluation.subject import EpisodeSpec
 from research.figures.chapter_5 import _first
 
 

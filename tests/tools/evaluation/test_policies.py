@@ -23,9 +23,9 @@ from guiderail.tools.evaluation.policies import (
     load_policy,
 )
 from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.imports import trust_imports
 from guiderail.tools.pretrained import find_run
-from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
 OBSERVATION = np.array([0.1, -0.2, 0.3], np.float32)
 

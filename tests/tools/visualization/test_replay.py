@@ -12,8 +12,8 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, constant_policy, uniform_random
 from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.visualization import replay
-from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.replay import DRAWN, Motion, find_report, violation_unit, write_page
 
 ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
