@@ -19,8 +19,8 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Callback, Transition, rollout
 from guiderail.tools.learning.learner import described_observation, learner_arguments
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner

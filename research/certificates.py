@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.certify import certify_skill
-from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.tables import write_table
 from research.command import Parser, print_result, run_program
 

@@ -18,8 +18,8 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, chunk_samples, find_base_policy
 from guiderail.tools.environments import beyond_defaults, make_environment
-from guiderail.tools.evaluation.cache import load_or_compute, policy_digest
 from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.evaluation import load_or_compute, policy_digest
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
@@ -143,7 +143,7 @@ def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> 
     Policy.load(teacher)
     folder, rows = RunFolder(teacher), []
     runs = [RunFolder(one) for one in (teacher, student) if (one / "policy.safetensors").is_file()]
-    policies = "-".join([teacher.name, student.name, *map(policy_digest, runs)])
+    policies = "-".join([teacher.name, student.name, *(policy_digest(run.path) for run in runs)])
     for number, variant in enumerate(VARIANTS):
         tables = []
         for first in range(0, episodes, BLOCK):

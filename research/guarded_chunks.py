@@ -14,10 +14,9 @@ import pandas as pd
 import research.base_policies  # noqa: F401 (registers the base policy)
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.cache import load_or_compute, policy_digest
 from guiderail.tools.evaluation.evaluate import evaluate_policies
+from guiderail.tools.evaluation.evaluation import load_or_compute, policy_digest
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
-from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
 from research.command import Parser, print_result, run_program
 
@@ -105,7 +104,7 @@ def compare_guards(out: Path, *, base_policy: str = BASE_POLICY, episodes: int =
         raise InputError(f"give at least one episode, not {episodes}")
     rows, name = [], Path(base_policy).name
     if (Path(base_policy) / "policy.safetensors").is_file():
-        name += f"-{policy_digest(RunFolder(Path(base_policy)))}"
+        name += f"-{policy_digest(Path(base_policy))}"
     tables: dict[str, list[pd.DataFrame]] = {guard: [] for guard in GUARDS}
     for first in range(0, episodes, BLOCK):
         number = min(BLOCK, episodes - first)

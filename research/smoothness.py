@@ -24,7 +24,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
-from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.evaluation.metrics import jerk, summary
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.tables import write_table

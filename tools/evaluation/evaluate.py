@@ -16,14 +16,18 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
-from guiderail.tools.evaluation.cache import (
+from guiderail.tools.evaluation.evaluation import (
     BASELINES_FOLDER,
+    COLLISIONS,
+    LABELS,
     POLICY,
     POLICY_FOLDER,
+    Evaluation,
+    compare,
     episodes_file,
     load_or_compute,
+    statistics,
 )
-from guiderail.tools.evaluation.evaluation import COLLISIONS, LABELS, Evaluation, compare, statistics
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.rollout import (

@@ -1,18 +1,76 @@
-"""Result of an evaluation: episodes and statistics of a policy and of baseline policies, and their comparison."""
+"""Results of an evaluation: stored episodes, statistics of a policy and of baseline policies, and their comparison."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from scipy import stats
+import scipy  # `scipy.stats` is imported on first use
 
-from guiderail.tools.evaluation.cache import POLICY
+from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
+from guiderail.tools.tables import read_table, table_text
+
+POLICY = "policy"  # name of the run's own policy
+POLICY_FOLDER = "held_out"  # folder of the policy's episodes, in the run
+BASELINES_FOLDER = "baselines"  # folder of the baseline policies' episodes, in the run
+
+
+def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of a file; if it does not exist, compute and write them. Empty tables are not written."""
+    if not file.exists():
+        rows = compute()
+        if not len(rows):
+            return rows
+        write_atomically(file, table_text(rows).encode())
+    return read_table(file)
+
+
+def episodes_file(
+    folder: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
+) -> Path:
+    """Return the path of a policy's evaluated episodes, with its `name` and a digest of all that they depend on.
+
+    The digest covers the environment, the run's seed, the task's files, package versions, and the arguments `how` of
+    `evaluate_policy` except `label` and `processes`. `about` is anything else, such as the digest of the policy.
+    """
+    how = {key: value for key, value in how.items() if key not in ("label", "processes")}
+    content = task_content(config.task, environment, config.imports)
+    more = [*([] if about is None else [about]), *filter(None, [content])]
+    key = json.dumps([environment, how, config.seed, installed_versions(), *more], sort_keys=True, default=str)
+    return folder / f"{name}-{hashlib.blake2b(key.encode(), digest_size=6).hexdigest()}.csv"
+
+
+def policy_digest(source: Path) -> str:
+    """Return the digest of a policy's folder or file; a unique value for module:function, which may use other files."""
+    file = source / "policy.safetensors" if source.is_dir() else source
+    if not file.is_file():
+        return str(time.time_ns())
+    return hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
+
+
+def stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the name of each policy and its stored episodes in the run's own environment that begin at `seed`."""
+    digest = policy_digest(folder.path)
+    for file in sorted(
+        path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")
+    ):
+        name, rows = file.stem.rpartition("-")[0], read_table(file)
+        about = digest if file.parent.name == POLICY_FOLDER else None
+        how = {"episodes": len(rows), "seed": seed}
+        if file == episodes_file(file.parent, name, config, config.environment, about=about, **how):
+            yield name, rows
+
 
 COMPARED = (
     "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "max_commanded_violation",
@@ -124,7 +182,7 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
 
 def _mcnemar(won: Any, other: Any) -> float:
     wins, losses = int((won > other).sum()), int((won < other).sum())
-    return float(stats.binomtest(wins, wins + losses, alternative="greater").pvalue) if wins + losses else 1.0
+    return float(scipy.stats.binomtest(wins, wins + losses, alternative="greater").pvalue) if wins + losses else 1.0
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:

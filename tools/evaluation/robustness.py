@@ -18,8 +18,8 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import MM
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
-from guiderail.tools.evaluation.cache import POLICY
 from guiderail.tools.evaluation.evaluate import evaluate_once
+from guiderail.tools.evaluation.evaluation import POLICY
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import wilson
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED

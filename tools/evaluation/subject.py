@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
-from guiderail.tools.evaluation.cache import policy_digest
+from guiderail.tools.evaluation.evaluation import policy_digest
 from guiderail.tools.evaluation.metrics import COLLISION
 from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_seed, is_compatible
@@ -130,7 +129,7 @@ def find_subject(
         # The policy is checked against the environment, which is not necessarily that of the run.
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
-        return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder))
+        return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder.path))
     from guiderail.tools.learning.train import configure
 
     config = None if isinstance(env, gymnasium.Env) else configure(env, environment or {})
@@ -143,7 +142,7 @@ def find_subject(
     source = find_run(policy)
     if is_policy_file(policy) or source.is_dir():
         make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
-        return Subject(source.name.replace(":", "."), config, make_policy, digest=_digest(source))
+        return Subject(source.name.replace(":", "."), config, make_policy, digest=policy_digest(source))
     name = str(policy)
     return Subject(name, config, partial(_make_compatible, name, make_baselines(config, {}, [name])[name]))
 
@@ -156,14 +155,6 @@ def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> 
             "the options that it is written for, such as difficulty=hard"
         )
     return make_policy(env)
-
-
-def _digest(source: Path) -> str:
-    """Return the digest of a policy's folder or file; a unique value for module:function, which may use other files."""
-    file = source / "policy.safetensors" if source.is_dir() else source
-    if not file.is_file():
-        return str(time.time_ns())
-    return hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
 
 
 def make_baselines(

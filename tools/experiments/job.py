@@ -28,8 +28,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
-from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.evaluate import evaluate_run
+from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout

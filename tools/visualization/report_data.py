@@ -15,8 +15,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults
 from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.evaluation.cache import BASELINES_FOLDER, POLICY, POLICY_FOLDER, policy_digest, stored_episodes
 from guiderail.tools.evaluation.evaluate import evaluate_once
+from guiderail.tools.evaluation.evaluation import (
+    BASELINES_FOLDER,
+    POLICY,
+    POLICY_FOLDER,
+    policy_digest,
+    stored_episodes,
+)
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.step_log import read_step_log
@@ -226,7 +232,7 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
 
 def _evaluate(run: Run, episodes: int) -> None:
     """Evaluate a run's policy and baseline policies on held-out episodes, unless they are stored in its folder."""
-    folder, environment = RunFolder(run.path), run.config.environment
+    environment = run.config.environment
     policy = Policy.load(run.path)
     evaluation: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
     evaluate_once(
@@ -235,7 +241,7 @@ def _evaluate(run: Run, episodes: int) -> None:
         run.config,
         lambda env: policy,
         environment,
-        about=policy_digest(folder),
+        about=policy_digest(run.path),
         **evaluation,
     )
     is_demonstration = is_demonstrated(environment.get("guidance"))

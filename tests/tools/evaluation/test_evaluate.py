@@ -9,12 +9,11 @@ from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
-from guiderail.tools.evaluation.cache import load_or_compute, stored_episodes
 from guiderail.tools.evaluation.evaluate import (
     evaluate,
     evaluate_policy,
 )
-from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare
+from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute, stored_episodes
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.subject import evaluation_scope, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder

@@ -12,7 +12,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation import robustness as module
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
-from guiderail.tools.evaluation.cache import episodes_file
+from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.robustness import (
     AXES,
     Axis,

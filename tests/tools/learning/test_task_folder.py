@@ -14,7 +14,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import task_content
-from guiderail.tools.evaluation.cache import episodes_file
+from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.job import Job, digest
 from guiderail.tools.imports import import_modules

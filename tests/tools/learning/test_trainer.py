@@ -16,7 +16,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.cache import episodes_file
+from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
