@@ -142,8 +142,8 @@ def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> 
     find_base_policy(str(student))
     Policy.load(teacher)
     folder, rows = RunFolder(teacher), []
-    runs = [RunFolder(one) for one in (teacher, student) if (one / "policy.safetensors").is_file()]
-    policies = "-".join([teacher.name, student.name, *(policy_digest(run.path) for run in runs)])
+    runs = [one for one in (teacher, student) if (one / "policy.safetensors").is_file()]
+    policies = "-".join([teacher.name, student.name, *map(policy_digest, runs)])
     for number, variant in enumerate(VARIANTS):
         tables = []
         for first in range(0, episodes, BLOCK):

@@ -1,5 +1,7 @@
 """Environments by name: tasks, their options, and `make_environment`."""
 
+from __future__ import annotations
+
 import hashlib
 import inspect
 import re
@@ -11,8 +13,18 @@ import gymnasium
 from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
-from guiderail.diagrams.envs.options import Options, validate_options
-from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.envs.options import (
+    KERNEL_OPTIONS,
+    CommonOptions,
+    Options,
+    PrimitiveOptions,
+    TemplateOptions,
+    check_choice,
+    validate_options,
+)
+from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.stations.options import Disturbances
+from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.tasks.registry import (
     TASKS,
     check_task_name,
@@ -111,6 +123,53 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
     given = {name: arguments.get(name, default) for name, default in options.items()}
     return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+
+
+def declared_models(task: str) -> list[type[Options]]:
+    """Return the models of all options that a task of this package may have, with any guidance and on any station."""
+    declared: list[type[Options] | None] = [CommonOptions, TASKS.declared(task, "Options")]
+    declared += [PrimitiveOptions, TemplateOptions]
+    workcell_kind = TASKS.declared(task, "workcell_kind") if TASKS.declares(task, "workcell_kind") else "insertion"
+    declared += [Disturbances] if workcell_kind == "insertion" else []
+    stations = stations_for(workcell_kind)
+    declared += [STATIONS.declared(name, "options") for name in stations if STATIONS.declares(name, "options")]
+    declared += [GUIDANCE.declared(name, "options") for name in GUIDANCE.names() if GUIDANCE.declares(name, "options")]
+    return list(dict.fromkeys(model for model in declared if model is not None))
+
+
+def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
+    """Refuse an unknown option, and a value that every model with this option refuses.
+
+    This is a quick check of single options; `EnvConfig.resolve` checks all of them. Nothing is checked if the task,
+    a guidance or a station is not of this package, because it may have options of its own.
+
+    Raises:
+        InputError: If an option is unknown or its value is out of range.
+    """
+    registered = ((TASKS, [task]), (GUIDANCE, GUIDANCE.names()), (STATIONS, STATIONS.names()))
+    if not all(registry.is_packaged(name) for registry, names in registered for name in names):
+        return
+    if not TASKS.declares(task, "Options"):
+        return
+    for option, choices in (("reward", "rewards"), ("observation", "observations")):
+        if option in options and TASKS.declares(task, choices):
+            check_choice(option, options[option], list(TASKS.declared(task, choices)), task)
+    models = declared_models(task)
+    for option in options:
+        holders = [model for model in models if option in model.model_fields]
+        if not holders:
+            known = {name for model in models for name in model.model_fields}
+            raise InputError(f"{task} has no option {brief(option)} here: {did_you_mean(option, known)}")
+        checked = [option, *(KERNEL_OPTIONS if option in KERNEL_OPTIONS else ())]  # validated together
+        values = {name: options[name] for name in checked if name in options}
+        errors = []
+        for model in holders:
+            try:
+                validate_options(model, values, task)
+            except InputError as error:
+                errors.append(error)
+        if len(errors) == len(holders):
+            raise errors[0]
 
 
 def check_reset(task: str, options: Mapping[str, Any]) -> None:

@@ -113,7 +113,7 @@ def train(
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
     if task is not None and not modules and not resume:
-        from guiderail.diagrams.envs.declared import check_declared_options
+        from guiderail.tools.environments import check_declared_options
         from guiderail.tools.files import refuse_existing_run
         from guiderail.tools.learning.config import check_choices
         from guiderail.tools.learning.learner import check_log_formats

@@ -6,12 +6,12 @@ import sys
 import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig, option_models
-from guiderail.diagrams.envs.declared import check_declared_options, declared_models
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
+from guiderail.tools.environments import check_declared_options, declared_models
 
 TASKS_WITH_OPTIONS = [name for name in TASKS.names() if TASKS.is_packaged(name) and TASKS.declares(name, "Options")]
 
@@ -54,7 +54,7 @@ def test_check_refuses_what_an_environment_refuses(options):
 def test_models_of_options_import_no_drake():
     code = """
 import sys
-from guiderail.diagrams.envs.declared import declared_models
+from guiderail.tools.environments import declared_models
 for name in ("BncConnector", "GridClamp", "NarrowPassage"):
     declared_models(name)
 sys.exit(", ".join({"pydrake", "torch", "pandas"} & set(sys.modules)))
