@@ -100,7 +100,7 @@ def train(
     from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
     from guiderail.tools.learning.fast_sb3 import FastTqc
-    from guiderail.tools.learning.sb3_state import DemonstrationReplayBuffer
+    from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
     rows: list[Row] = []
 

@@ -18,7 +18,7 @@ from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, h
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
-from guiderail.tools.learning.sb3_state import load_module
+from guiderail.tools.learning.sb3 import load_module
 
 Weights = dict[str, dict[str, np.ndarray]]
 

@@ -15,7 +15,7 @@ from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.config import BcConfig
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.networks import export_layers
-from guiderail.tools.learning.sb3_state import load_module
+from guiderail.tools.learning.sb3 import load_module
 
 
 class BcLearner(Learner):

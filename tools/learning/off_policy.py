@@ -46,7 +46,7 @@ from guiderail.tools.learning.networks import (
     with_privileged,
 )
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.sb3_state import (
+from guiderail.tools.learning.sb3 import (
     DemonstrationReplayBuffer,
     module_arrays,
     random_state,

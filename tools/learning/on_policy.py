@@ -21,7 +21,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
 from guiderail.tools.learning.learner import Learner, divergence_error
 from guiderail.tools.learning.networks import export_layers
-from guiderail.tools.learning.sb3_state import module_arrays, random_state, restore_modules, restore_random
+from guiderail.tools.learning.sb3 import module_arrays, random_state, restore_modules, restore_random
 
 _BUFFER_ARRAYS = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
 

@@ -111,7 +111,7 @@ def run_training(
         closed_first.callback(learning_log.close)
         callbacks = None
         if sb3_callbacks is not None:
-            from guiderail.tools.learning.sb3_callbacks import Sb3Callbacks
+            from guiderail.tools.learning.sb3 import Sb3Callbacks
 
             if config.learner.pipelined or config.learner.num_envs:
                 raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
