@@ -22,20 +22,13 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 class DrivenStation:
     """Station and recorder; the desired pose (6,) is the output of a system, sampled once per control period."""
 
-    def __init__(
-        self,
-        station: Station,
-        source: System,
-        num_samples: int,
-        add_to_builder: Callable[[DiagramBuilder, Station], None] | None = None,
-    ):
+    def __init__(self, station: Station, source: System, num_samples: int):
         """Construct the diagram and its simulator.
 
         Args:
             station: Station; it becomes part of the diagram.
             source: System with the desired pose as first output, such as a trajectory, an input device or a policy.
             num_samples: Largest number of control periods to record.
-            add_to_builder: Function that adds further systems, such as a camera, before the diagram is built.
         """
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
@@ -46,8 +39,6 @@ class DrivenStation:
         recorder = Recorder(SIGNALS, num_samples, CONTROL_PERIOD)
         measured = {name: station.GetOutputPort(name) for name in SIGNALS if name != "desired_pose"}
         self.recorder = add_system(builder, "recorder", recorder, desired_pose=desired_pose, **measured)
-        if add_to_builder is not None:
-            add_to_builder(builder, station)
         self.diagram: Diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         self._num_samples = num_samples

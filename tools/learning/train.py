@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
-from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline
+from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import own_episodes, summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress, check_seed
 from guiderail.tools.imports import import_modules
@@ -33,7 +32,6 @@ SUMMARY = (
     "max_commanded_violation", "peak_force", "collisions", "wall_time",
 )  # fmt: skip
 
-_find_scripted = partial(make_baseline, name="scripted")
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -145,7 +143,6 @@ def start_or_resume(
     pictures: bool = True,
     sb3_callbacks: Any = None,
     make_supervisor: Callable[[], Supervisor] | None = None,
-    find_demonstrator: Callable[[str], MakePolicy] = _find_scripted,
 ) -> Run:
     """Train with a progress bar and draw the learning curve and the replay page; None stands for a default.
 
@@ -157,8 +154,8 @@ def start_or_resume(
     - `step_log`: whether every control step is written to the step log.
     - `sb3_callbacks`: callbacks of Stable-Baselines3.
     - `make_supervisor`: constructs the supervisor of a run with a human in the loop.
-    - `find_demonstrator`: returns the policy of the learner's `demonstration_episodes` for a task's name, or raises an
-      InputError if there is none; by default it returns the scripted policy of the task.
+
+    The task's scripted policy acts in the learner's `demonstration_episodes`.
     """
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
@@ -177,7 +174,7 @@ def start_or_resume(
         config = configure(task, environment, imports=imports, **with_defaults(task, given))
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
-    demonstrator = find_demonstrator(config.task) if config.learner.demonstration_episodes else None
+    demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
     supervisor = make_supervisor() if config.human_in_the_loop and make_supervisor is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
         run_training(
