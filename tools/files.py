@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError, brief
@@ -52,25 +53,16 @@ def _is_abandoned(name: str) -> bool:
     return False
 
 
-def check_picture(path: Path) -> None:
-    """Raise an InputError if the ending is none of `PICTURES`, or the file cannot be written."""
-    _check_ending(path, "picture", PICTURES)
-
-
-def check_video(path: Path) -> None:
-    """Raise an InputError if the ending is none of `VIDEOS`, or the file cannot be written."""
-    _check_ending(path, "video", VIDEOS)
-
-
-def check_page(path: Path) -> None:
-    """Raise an InputError if the ending is none of `PAGES`, or the file cannot be written."""
-    _check_ending(path, "page", PAGES)
-
-
-def _check_ending(path: Path, kind: str, endings: tuple[str, ...]) -> None:
+def _check_output(kind: str, endings: tuple[str, ...], path: Path) -> None:
+    """Raise an InputError if the ending of a path is none of `endings`, or the file cannot be written."""
     if path.suffix.lower() not in endings:
         raise InputError(f"{path} has the ending {path.suffix!r}: a {kind} is {', '.join(endings)}")
     check_writable(path)
+
+
+check_picture = partial(_check_output, "picture", PICTURES)
+check_video = partial(_check_output, "video", VIDEOS)
+check_page = partial(_check_output, "page", PAGES)
 
 
 def check_writable(path: Path) -> None:

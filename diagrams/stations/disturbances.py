@@ -151,17 +151,12 @@ class DisturbedStation(Station):
         # A seed of its own: with the same seed both systems would use the same random numbers.
         self._commands.set_seed(commands, int(np.random.SeedSequence(seed).generate_state(1)[0]))
         sampled = {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
-        if self._has_further_errors:
+        further = (*e.calibration_error, *e.wrench_gradient, e.wrench_delay[1] - e.wrench_delay[0])
+        if any(further) or e.joint_torque is not None:
             sampled |= self._disturb_further(context, np.random.default_rng([int(rng.integers(2**31)), seed]))
         if d.payload:  # after the inner station has sampled its own errors of the tool
             self._inner.set_payload(context, d.payload)
         return sampled
-
-    @property
-    def _has_further_errors(self) -> bool:
-        e = self._errors
-        further = (*e.calibration_error, *e.wrench_gradient, e.wrench_delay[1] - e.wrench_delay[0])
-        return any(further) or e.joint_torque is not None
 
     def _disturb_further(self, context: Context, rng: np.random.Generator) -> dict[str, Any]:
         """Sample wrench delay, wrench gradient, calibration and the inner station's errors; return them by name."""

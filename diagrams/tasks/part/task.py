@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, cast
 
@@ -297,11 +297,8 @@ class PartInsertion(DemonstratedInsertion):
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted search by the center of pressure."""
-        return {"scripted_search": ScriptedSearch(cls.file, cls._reference_duration)}
-
-    @classmethod
-    def _reference_duration(cls) -> float:
-        return cls.file.demonstrations.reference(cls.folder).num_steps * CONTROL_PERIOD
+        reference = partial(cls.file.demonstrations.reference, cls.folder)
+        return {"scripted_search": ScriptedSearch(cls.file, lambda: reference().num_steps * CONTROL_PERIOD)}
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:

@@ -189,17 +189,13 @@ class Pouring(Task):
             substeps=round(self.control_period / PouringConfig.plant_period),
         )
         self.num_steps = round(self.options.time_limit / self.control_period)
-        speed = self._input_speed()
+        is_sparse_sct = (config.guidance, config.reward) == ("sct", "sparse")
+        speed = self.options.input_speed or (SPARSE_INPUT_SPEED if is_sparse_sct else 1.0)
         self._template = make_template(self._scene_config, speed)
         if self.options.aim:
             self._template = make_aimed_template(
                 self._scene_config, speed, self.options.aim_speed, self.options.pour_speed
             )
-
-    def _input_speed(self) -> float:
-        if self.options.input_speed is not None:
-            return self.options.input_speed
-        return SPARSE_INPUT_SPEED if (self.config.guidance, self.config.reward) == ("sct", "sparse") else 1.0
 
     def workcell(self) -> PouringConfig:
         """Return the vessels and their poses."""
