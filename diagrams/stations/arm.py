@@ -108,9 +108,6 @@ class ArmControllerPlant(ControllerPlant):
     """Model of an arm for its controller.
 
     The posture is half way through the workpiece's quarter turn, equally far from both ends of the turn.
-
-    Attributes:
-        arm: The arm in the plant.
     """
 
     def __init__(

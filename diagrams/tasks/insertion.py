@@ -61,15 +61,10 @@ class InsertionReset(ResetOptions):
 
 @dataclass(frozen=True)
 class HoldTest:
-    """Push on an inserted workpiece that confirms a success on hardware, where the workpiece's pose is not measured.
+    """Push on an inserted workpiece that confirms a success on hardware, where the workpiece's pose is not measured."""
 
-    Attributes:
-        displacement: Displacement of the command, (3,) [m].
-        max_motion: Largest measured motion in its direction [m].
-    """
-
-    displacement: tuple[float, float, float]
-    max_motion: float
+    displacement: tuple[float, float, float]  # displacement of the command, (3,) [m]
+    max_motion: float  # largest measured motion in its direction [m]
 
 
 HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM

@@ -22,11 +22,6 @@ class BcLearner(Learner):
     """Learner of behavior cloning (Pomerleau, 1988), with the mean squared error to the demonstrator's actions.
 
     The learner trains once, by Adam, after the last demonstration, and acts by the trained policy from then on.
-
-    Attributes:
-        config: The settings.
-        network: Network of the policy.
-        episodes: Number of episodes so far.
     """
 
     Config = BcConfig

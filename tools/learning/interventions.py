@@ -168,11 +168,7 @@ class ViaPointCorrections:
 
 
 class SupervisedTraining:
-    """Episodes of a run with a supervisor, each in an environment with the via-points of the episodes before.
-
-    Attributes:
-        env: The current environment.
-    """
+    """Episodes of a run with a supervisor, each in an environment with the via-points of the episodes before."""
 
     def __init__(self, config: RunConfig, supervisor: Supervisor, state: Mapping[str, Any]):
         """Construct the environment of the first episode; `state` are the values of a checkpoint, empty for a new run.

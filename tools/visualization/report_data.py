@@ -60,19 +60,12 @@ def _extremes(rows: pd.DataFrame, prefix: str, force: str) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """Run with its episodes.
+    """Run with its episodes."""
 
-    Attributes:
-        path: Folder of the run.
-        config: Configuration.
-        episodes: Table of the training episodes.
-        method: Name of the run's method in the report.
-    """
-
-    path: Path
-    config: RunConfig
-    episodes: pd.DataFrame
-    method: str = ""
+    path: Path  # folder of the run
+    config: RunConfig  # configuration
+    episodes: pd.DataFrame  # table of the training episodes
+    method: str = ""  # name of the run's method in the report
 
     @property
     def safety(self) -> dict[str, Any]:

@@ -222,10 +222,6 @@ class PartInsertion(DemonstratedInsertion):
 
     Rewards: "sparse" has costs of action and force and a terminal reward, "shaped" adds the depth gained, and "aligned"
     also the distance gained towards the socket's axis.
-
-    Attributes:
-        folder: Folder of the task.
-        file: Content of `task.yaml`.
     """
 
     Options = PartOptions
@@ -234,8 +230,8 @@ class PartInsertion(DemonstratedInsertion):
     simulated_rewards = ("aligned",)
     rewards = REWARDS
     observations = OBSERVATIONS
-    folder: ClassVar[Path]
-    file: ClassVar[PartTaskFile]
+    folder: ClassVar[Path]  # folder of the task
+    file: ClassVar[PartTaskFile]  # content of `task.yaml`
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
