@@ -1,8 +1,9 @@
-"""Option models of environments and resets: each option has a type, a range and a description."""
+"""Option models of environments, guidance and resets: each option has a type, a range and a description."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
@@ -21,6 +22,7 @@ from pydantic.fields import FieldInfo
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.policy import BASE_POLICIES, find_base_policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, DEFAULT_LENGTH_SCALE, Kernel, make_kernel
 
 STANDARD = "standard"
@@ -168,6 +170,63 @@ class TemplateOptions(Options):
 
     active_constraints: bool | None = Field(
         None, description="keep commands inside the template's active constraints; default: with sct only"
+    )
+
+
+class BasePolicyOptions(Options):
+    """Options of guidance around a base policy."""
+
+    base_policy: str = Field(
+        "",
+        description="base policy: folder of a run of the learner chunk, or a registered name; default: the "
+        "demonstrations, as without a base policy",
+    )
+    replan_steps: Integer = Field(5, ge=1, le=1000, description="control steps between two chunks")
+    covariance_floor: Number = Field(
+        1.0, gt=0, description="share of the demonstrations' covariance that is added to the spread of the chunks"
+    )
+
+    @field_validator("base_policy")
+    @classmethod
+    def _check_source(cls, value: str) -> str:
+        if not value:
+            return value
+        find_base_policy(value)
+        # A relative path would be wrong if the run is resumed from another folder.
+        return value if value in BASE_POLICIES.names() else str(Path(value).resolve())
+
+
+class GuardOptions(BasePolicyOptions):
+    """Options of guidance of the kind `base_policy`, which executes the chunks."""
+
+    guard: Literal["none", "projection", "slowdown"] = Field(
+        "projection",
+        description="filter that keeps chunks within the bounds, max_speed and max_jerk: projection to the nearest "
+        "chunk, slowdown on the same path, or none",
+    )
+    max_jerk: PositiveNumbers = Field(
+        (),
+        description="largest jerk of a guarded command, in the form of max_speed; default of max_jerk and "
+        "max_speed: twice the largest value in the demonstrations",
+    )
+
+
+class BarrierOptions(Options):
+    """Options of `residual_cbf`."""
+
+    barrier_decay: Number = Field(
+        0.2, gt=0, le=1, description="γ, largest fraction of the distance to a constraint that one step may cover"
+    )
+
+
+class TangentOptions(Options):
+    """Options of `residual_tangent`."""
+
+    slack_width: Number = Field(
+        0.5,
+        gt=0,
+        description="distance to a constraint at which motion towards it is halved, as a multiple of the "
+        "displacement by an action of 1",
     )
 
 

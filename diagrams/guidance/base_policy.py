@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from guiderail.diagrams.guidance.options import BasePolicyOptions, GuardOptions
+from guiderail.diagrams.envs.options import BasePolicyOptions, GuardOptions
 from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import register_guidance

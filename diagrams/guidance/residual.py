@@ -10,8 +10,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
+from guiderail.diagrams.envs.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, primitive_config_of
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
