@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -22,9 +21,6 @@ from guiderail.diagrams.tasks.options import (
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 
 # Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {
@@ -151,17 +147,6 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
         if not path.is_file():
             raise ValueError(f"it is {', '.join(SHIPPED)}, or the path of an existing file, .npz or .csv")
         return str(path.resolve())  # so that a run can be resumed from another folder
-
-    def workcell(self) -> BncWorkcell:
-        """Return the workcell with these options."""
-        from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell  # imports Drake
-
-        dimensions = replace(
-            NOMINAL.with_bore_clearance(self.bore_clearance),
-            mouth_chamfer=self.mouth_chamfer,
-            slot_clearance=self.slot_clearance,
-        )
-        return BncWorkcell(dimensions, friction=self.friction, margin=self.contact_margin, equal_area=self.equal_area)
 
 
 HARD: dict[str, Any] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -28,7 +28,7 @@ from guiderail.diagrams.envs.scene import (
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
-from guiderail.diagrams.tasks.bnc_connector.options import HARD, BncOptions, BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.options import HARD, NOMINAL, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
 from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.options import (
@@ -248,7 +248,9 @@ class BncConnector(DemonstratedInsertion):
             o.fixture_offset, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn
         )
         self.collision = Threshold("contact_force", o.largest_force_limit)
-        self._workcell = o.workcell()
+        dimensions = NOMINAL.with_bore_clearance(o.bore_clearance)
+        dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer, slot_clearance=o.slot_clearance)
+        self._workcell = BncWorkcell(dimensions, friction=o.friction, margin=o.contact_margin, equal_area=o.equal_area)
         # The duration of the shipped demonstrations is known, so they are not fitted here, which would take seconds.
         is_shipped, period = o.demonstrations in DEMONSTRATIONS, self.control_period
         duration = NUM_STEPS * CONTROL_PERIOD * o.time_scale

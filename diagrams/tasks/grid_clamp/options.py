@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -12,10 +11,6 @@ from guiderail.diagrams.tasks.options import FORCE_LIMITS, ForceOptions
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
-
 
 # Force of a collision [N]. It is larger than the force of an impedance of 1500 N/m, because the template's cuboid keeps
 # commands at most 6 mm below the seat and 8 mm sideways.
@@ -51,15 +46,6 @@ class GridClampOptions(ForceOptions):
         description="clearance between a peg and its hole on each side [m]",
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of pegs, holes and table")
-
-    def workcell(self) -> GridClampWorkcell:
-        """Return the workcell with these options."""
-        from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell  # imports Drake
-
-        dimensions = replace(
-            NOMINAL.with_clearance(self.clearance), hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer
-        )
-        return GridClampWorkcell(dimensions, friction=self.friction)
 
 
 HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}

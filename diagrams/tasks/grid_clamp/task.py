@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,7 +18,7 @@ from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, fr
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
-from guiderail.diagrams.tasks.grid_clamp.options import HARD, REWARDS, GridClampOptions
+from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, REWARDS, GridClampOptions
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
@@ -263,7 +263,9 @@ class GridClamp(InsertionTask):
         self.collision = Threshold("contact_force", self.options.largest_force_limit)
         # The default is 100 actions at 10 Hz; the thesis's episodes have 140 actions on average.
         self.num_steps = round(self.options.seconds / self.control_period)
-        self._workcell = self.options.workcell()
+        o, dimensions = self.options, NOMINAL.with_clearance(self.options.clearance)
+        dimensions = replace(dimensions, hole_chamfer=o.hole_chamfer, peg_chamfer=o.peg_chamfer)
+        self._workcell = GridClampWorkcell(dimensions, friction=o.friction)
 
     def workcell(self) -> GridClampWorkcell:
         """Return the table with holes and the clamp in the tool."""
