@@ -21,26 +21,18 @@ FULL_TILT = 0.8  # tilting speed at an input of 1 [rad/s]
 SPARSE_INPUT_SPEED = 1.7  # default input_speed of "sct" with the sparse reward: random inputs must succeed sometimes
 
 
-def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
-    """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`."""
-    return _load("pouring", config, input_speed)
+def make_template(config: PouringConfig, input_speed: float = 1.0, **aiming: float) -> SharedControlTemplate:
+    """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`.
 
-
-def make_aimed_template(
-    config: PouringConfig, input_speed: float, aim_speed: float, pour_speed: float
-) -> SharedControlTemplate:
-    """Return the template with aiming in the state Pour; `aim_speed` and `pour_speed` are fractions of full speeds."""
-    return _load("pouring_aimed", config, input_speed, aim_speed=aim_speed, pour_speed=pour_speed)
-
-
-def _load(name: str, config: PouringConfig, input_speed: float, **others: float) -> SharedControlTemplate:
+    With `aim_speed` and `pour_speed`, fractions of full speeds, the template has aiming in the state Pour.
+    """
     return load_template(
-        name,
+        "pouring_aimed" if aiming else "pouring",
         full_speed_m_per_s=input_speed * FULL_SPEED,
         full_tilt_rad_per_s=input_speed * FULL_TILT,
         mug_radius_m=config.mug.outer_radius,
         thermos_radius_m=config.thermos.outer_radius,
-        **others,
+        **aiming,
     )
 
 

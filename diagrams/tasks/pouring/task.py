@@ -27,7 +27,6 @@ from guiderail.diagrams.tasks.pouring.options import (
     PouringOptions,
     PouringReset,
     frames_of,
-    make_aimed_template,
     make_template,
 )
 from guiderail.diagrams.tasks.registry import register_task
@@ -191,11 +190,8 @@ class Pouring(Task):
         self.num_steps = round(self.options.time_limit / self.control_period)
         is_sparse_sct = (config.guidance, config.reward) == ("sct", "sparse")
         speed = self.options.input_speed or (SPARSE_INPUT_SPEED if is_sparse_sct else 1.0)
-        self._template = make_template(self._scene_config, speed)
-        if self.options.aim:
-            self._template = make_aimed_template(
-                self._scene_config, speed, self.options.aim_speed, self.options.pour_speed
-            )
+        aiming = {"aim_speed": self.options.aim_speed, "pour_speed": self.options.pour_speed}
+        self._template = make_template(self._scene_config, speed, **(aiming if self.options.aim else {}))
 
     def workcell(self) -> PouringConfig:
         """Return the vessels and their poses."""

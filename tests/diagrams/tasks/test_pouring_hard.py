@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.options import HARD, MAX_MUG_ERROR, frames_of, make_aimed_template
+from guiderail.diagrams.tasks.pouring.options import HARD, MAX_MUG_ERROR, frames_of, make_template
 from guiderail.diagrams.tasks.pouring.task import scripted_pour_aimed, scripted_pour_blind
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
@@ -54,7 +54,7 @@ def guided(template, frames, actions, X_TP):
 @pytest.mark.parametrize("name", ["uniform_random", "random_hold", "bang_bang", "random_corner"])
 def test_no_command_ever_leaves_the_constraints(env, name):
     """Through all three states and along every edge: without the arm, hundreds of control steps take no time."""
-    template = make_aimed_template(env.task.declaration.workcell(), 1.0, 1.0, 0.3)
+    template = make_template(env.task.declaration.workcell(), aim_speed=1.0, pour_speed=0.3)
     frames = frames_of(template, RigidTransform([0.02, -0.01, 0.0]))
     start = template.project(template.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
     worst, reached = 0.0, set()
@@ -77,7 +77,7 @@ def test_recomputed_commands_are_inside_the_constraints(env):
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)
     corners.on_episode_start()
     task = stepwise.task.declaration
-    template = make_aimed_template(task.workcell(), 1.0, 1.0, 0.3)
+    template = make_template(task.workcell(), aim_speed=1.0, pour_speed=0.3)
     _, info = stepwise.reset(seed=3)
     frames = frames_of(template, RigidTransform([*(info["mug_position"] + info["mug_error"]), 0.0]))
     for _ in range(60):
