@@ -255,11 +255,7 @@ def validate_options(model: type[Model], values: Mapping[str, Any], context: str
 
 
 def check_choice(name: str, value: Any, choices: list[str], context: str) -> str:
-    """Return `value` if it is one of `choices`.
-
-    Raises:
-        InputError: If `value` is not one of `choices`.
-    """
+    """Return `value`; raise an InputError if it is not one of `choices`."""
     if value not in choices:
         raise InputError(f"{context} has no {name} {brief(value)}: {did_you_mean(value, choices)}")
     return str(value)

@@ -195,11 +195,7 @@ def describe_stop(fault: Fault, driver: Driver) -> str:
 
 
 def find_driver(robot: Robot | str) -> type[Driver]:
-    """Return the driver class of a robot.
-
-    Raises:
-        InputError: If no driver is registered for it.
-    """
+    """Return the driver class of a robot; raise an InputError if no driver is registered for it."""
     return DRIVERS.get(robot if isinstance(robot, str) else robot.name)
 
 

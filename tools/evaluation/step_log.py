@@ -96,11 +96,7 @@ def _numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def write_step_log(path: Path, rows: pa.Table) -> None:
-    """Write an episode's control steps atomically.
-
-    Raises:
-        InputError: If the file cannot be written.
-    """
+    """Write an episode's control steps atomically; raise an InputError if the file cannot be written."""
     file = io.BytesIO()
     # Uncompressed: sensor noise does not compress and compression costs time.
     pq.write_table(rows, file, compression="NONE", use_dictionary=False)
