@@ -27,7 +27,7 @@ from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.grid_clamp.geometry import CLAMP_SDF, TABLE_SDF, GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION, clamp_surfaces, folder_of, table_surfaces
 from guiderail.models.objects.surfaces import Surface
-from guiderail.models.templates import SharedControlTemplate, load_template
+from guiderail.models.templates import load_template
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
@@ -169,11 +169,6 @@ MAX_TRACKING_ERROR = 8.0 * MM  # the impedance then pushes with 12 N, twice the 
 START_OFFSET = 0.2 * MM  # largest offset of the start along x and y
 
 
-def make_template() -> SharedControlTemplate:
-    """Return the template of the thesis, section 3.4.2."""
-    return load_template("grid_clamp")
-
-
 # Center and scale of the observation [position, force].
 CENTER = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
@@ -188,9 +183,9 @@ PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
 SNAP_FORCE = 12.0  # largest force while the clamp snaps in [N]
 GENTLE_SNAP_FORCE = 8.5  # largest force while the clamp snaps in, for a force limit of 10 N [N]
 HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N], [m/s/N] and [1/s]
-_PARAMETERS = load_template("grid_clamp").parameters
-SPEED = _PARAMETERS["speed_m_per_s"]  # speed at an input of 1
-LIFT = _PARAMETERS["lift"]  # fraction of `SPEED` at an upward input of 1
+TEMPLATE = load_template("grid_clamp")  # template of the thesis, section 3.4.2
+SPEED = TEMPLATE.parameters["speed_m_per_s"]  # speed at an input of 1
+LIFT = TEMPLATE.parameters["lift"]  # fraction of `SPEED` at an upward input of 1
 STIFFNESS = Impedance().stiffness[0]
 
 
@@ -274,18 +269,12 @@ class GridClamp(InsertionTask):
     def template(self) -> PlacedTemplate:
         """Return the template with one state: an upright clamp in a cuboid above the hole."""
         active = self.config.options["active_constraints"]
-        return PlacedTemplate(
-            make_template(),
-            {"hole": RigidTransform()},
-            active_constraints=active,
-            max_tracking_error=MAX_TRACKING_ERROR,
-        )
+        return PlacedTemplate(TEMPLATE, {"hole": RigidTransform()}, active, MAX_TRACKING_ERROR)
 
     def approach(self) -> ScriptedApproach:
         """Return a straight descent into the hole."""
-        parameters = make_template().parameters
-        heights = (max(self.options.start_height), -parameters["push_m"])
-        return ScriptedApproach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
+        heights = (max(self.options.start_height), -TEMPLATE.parameters["push_m"])
+        return ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimate of the height; the lateral offset cannot be measured, and is checked by pulling."""
@@ -349,7 +338,7 @@ class GridClamp(InsertionTask):
 
     def scene(self) -> Scene:
         """Return the drawing of the cuboid that bounds commands, up to the start height."""
-        to_world, parameters = in_frame(self._workcell.X_WT), make_template().parameters
+        to_world, parameters = in_frame(self._workcell.X_WT), TEMPLATE.parameters
         half = 0.5 * parameters["width_m"]
         edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))
         near = viewpoint(*to_world(np.array([[0.045, -0.065, 0.045], [0.0, 0.0, 0.008]])))

@@ -14,8 +14,8 @@ from guiderail.diagrams.tasks.grid_clamp.task import (
     MAX_TRACKING_ERROR,
     SCALE,
     STIFFNESS,
+    TEMPLATE,
     GridClampUncertainty,
-    make_template,
     scripted_search,
     straight_descent,
 )
@@ -114,7 +114,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
         return held
 
     info, _, _ = play(env, adversary, seed=5)
-    parameters = make_template().parameters
+    parameters = TEMPLATE.parameters
     commanded = env.trace.commanded
     assert np.abs(commanded[:, :2]).max() <= parameters["width_m"] / 2 + 1e-9
     assert commanded[:, 2].min() >= -parameters["push_m"] - 1e-9
@@ -197,7 +197,7 @@ class TestUncertainty:
         fixture_offset, rng = GridClampUncertainty(kind), np.random.default_rng(1)
         draws = [fixture_offset.draw(rng, InsertionReset(new_run=True)) for _ in range(500)]
         worst = max(np.abs(table - grasp).max() for table, grasp in draws)
-        assert worst < make_template().parameters["width_m"] / 2 - 0.2 * MM
+        assert worst < TEMPLATE.parameters["width_m"] / 2 - 0.2 * MM
 
     def test_held_out_keeps_the_run_and_draws_apart(self):
         fixture_offset = GridClampUncertainty("per_run")
