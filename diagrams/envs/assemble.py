@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -36,13 +36,11 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.reference import pass_through
+from guiderail.models.primitives.stepper import StateProgress
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
 from guiderail.systems.image_observation import ImageObservation
 from guiderail.systems.reward_system import RewardSystem
-
-if TYPE_CHECKING:
-    from guiderail.models.primitives.stepper import StateProgress
 
 HALF_TURN_MARGIN = 0.1  # margin of demonstrated angles to ±180° [rad]: actions and contact turn the tool further
 
@@ -99,8 +97,6 @@ def _state_progress(task: Task, period: float) -> StateProgress | None:
     options = task.config.part("primitive")
     if options.get("progress", "clock") == "clock":
         return None
-    from guiderail.models.primitives.stepper import StateProgress
-
     return StateProgress(options["progress_tolerance"], round(options["max_lag"] / period))
 
 

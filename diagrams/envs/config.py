@@ -17,6 +17,7 @@ from guiderail.diagrams.envs.options import (
     validate_options,
 )
 from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, check_guidance, possible_guidance
+from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS, StationKind
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import Task
@@ -101,11 +102,6 @@ def option_models(task: type[Task], guidance: str, station: str) -> dict[str, ty
         InputError: If the guidance or the station is unknown, or the task lacks what the guidance requires.
     """
     kind = check_guidance(guidance, task.provides(), task.name)
-    disturbances: type[Options] = Options
-    if task.workcell_kind == "insertion":
-        from guiderail.diagrams.stations.options import Disturbances
-
-        disturbances = Disturbances
     return {
         "common": CommonOptions,
         "task": task.Options,
@@ -113,7 +109,7 @@ def option_models(task: type[Task], guidance: str, station: str) -> dict[str, ty
         "primitive": PrimitiveOptions if "demonstrations" in task.provides() else Options,
         "template": TemplateOptions if "template" in task.provides() else Options,
         "guidance": kind.options or Options,
-        "disturbances": disturbances,
+        "disturbances": Disturbances if task.workcell_kind == "insertion" else Options,
     }
 
 

@@ -27,6 +27,8 @@ from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
+from guiderail.diagrams.stations.disturbances import disturbed
+from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
@@ -54,9 +56,6 @@ def make_station(task: Task) -> Station:
         arguments["control_period"] = task.control_period
     build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
     if task.workcell_kind == "insertion":
-        from guiderail.diagrams.stations.disturbances import disturbed
-        from guiderail.diagrams.stations.options import Disturbances
-
         assert isinstance(disturbances, Disturbances)
         station = disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
     else:

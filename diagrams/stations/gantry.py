@@ -49,6 +49,7 @@ GANTRY_JOINTS = (
 )
 # Mass [kg] and moment of inertia [kg m²] of the moving tool, as an arm with inertia shaping has at its tool.
 CARRIAGE_MASS, CARRIAGE_INERTIA = 1.5, 2e-3
+MASSES = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)  # those of each joint
 # Mass [kg] and radius [m] of a link between two joints; massless links would make the plant's mass matrix singular.
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
@@ -60,8 +61,7 @@ CARTESIAN_PLANT_PERIOD = PLANT_PERIOD / 2
 
 def joint_damping(impedance: Impedance) -> np.ndarray:
     """Return the damping of the joints for an impedance, (6,) [N s/m, Nm s/rad]."""
-    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
-    return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
+    return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * MASSES)
 
 
 @register_station("gantry", workcell_kind="insertion", options=GantryOptions)
@@ -161,8 +161,7 @@ def max_stable_time_step(impedance: Impedance) -> float:
     For a force K e − D v that is constant within a time step h and semi-implicit Euler integration, a mode with natural
     frequency ω and damping ratio ζ is stable if h ω < 2 (√(1 + ζ²) − ζ).
     """
-    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
-    fastest = float(np.sqrt(np.max(np.array(impedance.stiffness) / masses)))  # [rad/s]
+    fastest = float(np.sqrt(np.max(np.array(impedance.stiffness) / MASSES)))  # [rad/s]
     ratio = impedance.damping_ratio
     return 2.0 * float(np.hypot(1.0, ratio) - ratio) / fastest
 

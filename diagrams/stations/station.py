@@ -47,13 +47,13 @@ from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
 from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
+from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
 if TYPE_CHECKING:
     from guiderail.diagrams.stations.workcell import Workcell
     from guiderail.models.control.motion_constraints import StateConstraints
-    from guiderail.models.control.wrench import WrenchBound
 
 Robot = TypeVar("Robot")
 
@@ -96,8 +96,6 @@ class Impedance:
         No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed is
         limited for contacts of `CONTACT_STIFFNESS`.
         """
-        from guiderail.models.control.wrench import WrenchBound
-
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))
         axes = to_wrench_order(limits.tolist())

@@ -19,6 +19,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from guiderail.diagrams.guidance.registry import possible_guidance
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
@@ -337,9 +339,6 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
 
     Guidance, observation and difficulty are varied, because they decide the sizes of observation and action.
     """
-    from guiderail.diagrams.guidance.registry import possible_guidance
-    from guiderail.diagrams.tasks.registry import TASKS
-
     kind = TASKS.get(task)
     values = {
         "guidance": possible_guidance(kind.provides()),
