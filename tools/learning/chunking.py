@@ -16,10 +16,12 @@ from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.cloning import BcLearner, perceptron
 from guiderail.tools.learning.config import ChunkConfig
+from guiderail.tools.learning.learner import register_learner
 
 MIN_SCALE = 1e-6  # smallest scale of an output, because the standard deviation of a constant output is zero
 
 
+@register_learner("chunk")
 class ChunkLearner(BcLearner):
     """Learner of a base policy that maps an observation to the next K commanded poses (mean squared error, Adam).
 

@@ -13,11 +13,12 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.config import BcConfig
-from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.learner import Learner, register_learner
 from guiderail.tools.learning.networks import export_layers
 from guiderail.tools.learning.sb3 import load_module
 
 
+@register_learner("bc")
 class BcLearner(Learner):
     """Learner of behavior cloning (Pomerleau, 1988), with the mean squared error to the demonstrator's actions.
 

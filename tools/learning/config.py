@@ -21,11 +21,9 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.learning.learner import (
     LEARNERS,
-    DeferredLearner,
     LearnerConfig,
     NonNegative,
     Positive,
-    register_learner,
     reject_bool,
 )
 
@@ -210,19 +208,6 @@ class DistillationConfig(ChunkConfig):
             raise InputError("distillation learns from its teacher: leave demonstration_episodes out")
 
 
-register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
-register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
-register_learner("td3", DeferredLearner("guiderail.tools.learning.off_policy", "Td3Learner", Td3Config))
-register_learner("crossq", DeferredLearner("guiderail.tools.learning.off_policy", "CrossQLearner", CrossQConfig))
-register_learner("ppo", DeferredLearner("guiderail.tools.learning.on_policy", "PpoLearner", PpoConfig))
-register_learner("trpo", DeferredLearner("guiderail.tools.learning.on_policy", "TrpoLearner", TrpoConfig))
-register_learner("chunk", DeferredLearner("guiderail.tools.learning.chunking", "ChunkLearner", ChunkConfig))
-register_learner(
-    "distillation",
-    DeferredLearner("guiderail.tools.learning.distillation", "DistillationLearner", DistillationConfig),
-)
-register_learner("bc", DeferredLearner("guiderail.tools.learning.cloning", "BcLearner", BcConfig))
-
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
 )  # table 4.1 states no batch and buffer size: they are from table 3.2
@@ -295,7 +280,7 @@ def resolve_preset(
     if preset is not None and preset not in PRESETS:
         raise InputError(f"there is no preset {brief(preset)}: {did_you_mean(preset, PRESETS)}")
     algorithm = algorithm or PRESETS[preset or DEFAULT_PRESET].algorithm
-    kind = LEARNERS.get(algorithm).Config
+    kind = LEARNERS.declared(algorithm, "Config")
     if preset is None:
         preset = default_preset(algorithm)
     elif not issubclass(kind, OffPolicyConfig):
@@ -306,7 +291,7 @@ def resolve_preset(
 
 def default_preset(algorithm: str) -> str | None:
     """Return the preset used if none is chosen; None for a learner that is not off-policy."""
-    return DEFAULT_PRESET if issubclass(LEARNERS.get(algorithm).Config, OffPolicyConfig) else None
+    return DEFAULT_PRESET if issubclass(LEARNERS.declared(algorithm, "Config"), OffPolicyConfig) else None
 
 
 def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
@@ -315,7 +300,7 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
     Raises:
         InputError: If there is no such learner or setting, or a value is out of range.
     """
-    kind = LEARNERS.get(algorithm).Config
+    kind = LEARNERS.declared(algorithm, "Config")
     names = {field.name for field in fields(kind)}
     values = {**settings, "algorithm": algorithm}
     for name in values:
@@ -357,7 +342,7 @@ def check_choices(
             registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
-    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.get(learner).Config)}
+    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.declared(learner, "Config"))}
     known.remove("algorithm")
     for name in settings:
         if name not in known:

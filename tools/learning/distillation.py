@@ -13,11 +13,13 @@ from guiderail.models.primitives import UnsolvableError
 from guiderail.tools.evaluation.rollout import Transition, is_compatible
 from guiderail.tools.learning.chunking import ChunkLearner
 from guiderail.tools.learning.config import DistillationConfig
+from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.pretrained import find_run
 
 CLOCK_SPREAD = 1e-6  # an observation entry that varies less than this between episodes depends on the step only
 
 
+@register_learner("distillation")
 class DistillationLearner(ChunkLearner):
     """Learner of a student that maps the teacher's observation directly to the next K commands.
 

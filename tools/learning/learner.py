@@ -10,9 +10,8 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
@@ -147,22 +146,8 @@ class Learner(Callback, ABC):
         """
 
 
-class DeferredLearner(NamedTuple):
-    """Registry entry of a learner whose module is imported when the learner is constructed.
-
-    PyTorch takes seconds to import; configurations and lists of names do not need it.
-    """
-
-    module: str  # import name of the module
-    name: str  # name of the class
-    Config: type[LearnerConfig]  # configuration class
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Learner:
-        """Import the module and construct the learner."""
-        return getattr(import_module(self.module), self.name)(*args, **kwargs)
-
-
-# An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`.
+# An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
+# takes seconds to import: `LEARNERS.declared(name, "Config")` imports no learner that shows its `Config` in its source.
 LEARNERS: Registry[Any] = Registry(
     "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners"
 )

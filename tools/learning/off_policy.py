@@ -31,7 +31,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import CheckpointSelection, entries_of, load_checkpoint
 from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
-from guiderail.tools.learning.learner import Learner, divergence_error
+from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
 from guiderail.tools.learning.networks import (
     ImageFeatures,
     NormalizedReLU,
@@ -449,20 +449,25 @@ def _checkpoint_of(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, values["learner"]
 
 
+@register_learner("sac")
 class SacLearner(OffPolicyLearner):
     """Learner of soft actor-critic (SAC; Haarnoja et al., 2018)."""
 
+    Config = OffPolicyConfig
     algorithm = SAC
     fast_algorithm = FastSac
 
 
+@register_learner("tqc")
 class TqcLearner(OffPolicyLearner):
     """Learner of truncated quantile critics (TQC; Kuznetsov et al., 2020)."""
 
+    Config = OffPolicyConfig
     algorithm = TQC
     fast_algorithm = FastTqc
 
 
+@register_learner("td3")
 class Td3Learner(OffPolicyLearner):
     """Learner of twin delayed DDPG (TD3; Fujimoto, van Hoof and Meger, 2018), which explores with Gaussian noise."""
 
@@ -482,6 +487,7 @@ class Td3Learner(OffPolicyLearner):
         return np.clip(self.random.normal(action, deviation), space.low, space.high).astype(space.dtype)
 
 
+@register_learner("crossq")
 class CrossQLearner(OffPolicyLearner):
     """Learner of CrossQ (Bhatt et al., 2024): batch normalization in place of target critics."""
 

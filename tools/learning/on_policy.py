@@ -19,7 +19,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
-from guiderail.tools.learning.learner import Learner, divergence_error
+from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
 from guiderail.tools.learning.networks import export_layers
 from guiderail.tools.learning.sb3 import module_arrays, random_state, restore_modules, restore_random
 
@@ -155,6 +155,7 @@ class OnPolicyLearner(Learner):
         restore_random(arrays, values)
 
 
+@register_learner("ppo")
 class PpoLearner(OnPolicyLearner):
     """Learner of proximal policy optimization (PPO; Schulman et al., 2017)."""
 
@@ -163,6 +164,7 @@ class PpoLearner(OnPolicyLearner):
     own_settings = ("n_epochs", "clip_range", "ent_coef")
 
 
+@register_learner("trpo")
 class TrpoLearner(OnPolicyLearner):
     """Learner of trust region policy optimization (TRPO; Schulman et al., 2015)."""
 
