@@ -21,7 +21,7 @@ from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_once
 from guiderail.tools.evaluation.evaluation import POLICY
 from guiderail.tools.evaluation.forks import check_processes
-from guiderail.tools.evaluation.metrics import wilson
+from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.subject import (
     Subject,
@@ -371,8 +371,6 @@ def _table_name(axes: str | None, given: Mapping[str, Any], policies: Sequence[s
 
 
 def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
-    successes = int(rows["success"].sum())
-    low, high = wilson(successes, len(rows))
     return {
         "axis": point.axis.name,
         "value": float(point.value),
@@ -380,14 +378,10 @@ def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
         "label": point.axis.label,
         "policy": policy,
         "episodes": len(rows),
-        "successes": successes,
-        "success_rate": successes / len(rows),
-        "success_low": low,
-        "success_high": high,
+        "successes": int(rows["success"].sum()),
+        **summary(rows, ("success_rate", "success_low", "success_high")),
         "peak_force_mean": float(rows["peak_force"].mean()),
-        "peak_force": float(rows["peak_force"].max(skipna=False)),
-        "mean_steps": float(rows["steps"].mean()),
-        "max_commanded_violation": float(rows["max_commanded_violation"].max(skipna=False)),
+        **summary(rows, ("peak_force", "mean_steps", "max_commanded_violation")),
     }
 
 
