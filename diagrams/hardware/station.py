@@ -81,12 +81,8 @@ class HardwareStation(Station):
     =====================  =====  =====================================================================================
 
     Attributes:
-        driver: Connection to the robot.
-        period: Period of a command [s].
+        driver, period, limits, status_limits, impedance: As given to the constructor, or by default.
         controller_plant: The arm as the controller models it.
-        limits: Limits of measurements and torques.
-        status_limits: Limits of a status.
-        impedance: Impedance at the tool center.
     """
 
     wraps_angles = True

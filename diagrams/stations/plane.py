@@ -99,7 +99,7 @@ class PlaneStation(Station):
             exact = whole_multiple(control_period, config.plant_period)
             config = replace(config, substeps=round(exact / config.plant_period))
         builder = DiagramBuilder()
-        self.passage, self.config = passage, config
+        self.config = config
         self.control_period = config.control_period
         self.plant, self.scene_graph = add_plant(builder, config.plant_period, contact_model="point")
         self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
