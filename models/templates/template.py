@@ -10,9 +10,10 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
-from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, Outside, group_constraints
+from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
+from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]

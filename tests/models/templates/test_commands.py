@@ -12,6 +12,7 @@ from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import mappings as im
+from guiderail.models.templates import shape_constraints as sc
 from guiderail.models.templates import transitions as td
 from guiderail.models.templates.geometry import angle_between, between
 
@@ -213,9 +214,9 @@ def test_state_needs_the_frames_of_all_its_parts():
 
 
 OUTSIDE = [
-    ac.OutsideSphere(frame="f", radius_m=0.02),
-    ac.OutsideCylinder(frame="f", radius_m=0.01, min_m=-0.05, max_m=0.05, margin_m=0.002),
-    ac.OutsideBox(frame="f", lower_m=(-0.02, -0.01, -0.03), upper_m=(0.02, 0.02, 0.01)),
+    sc.OutsideSphere(frame="f", radius_m=0.02),
+    sc.OutsideCylinder(frame="f", radius_m=0.01, min_m=-0.05, max_m=0.05, margin_m=0.002),
+    sc.OutsideBox(frame="f", lower_m=(-0.02, -0.01, -0.03), upper_m=(0.02, 0.02, 0.01)),
 ]
 
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform
 from guiderail.models.templates import constraints as ac
+from guiderail.models.templates import shape_constraints as sc
 from guiderail.models.templates.geometry import angle_between, largest, position_in
 
 F = "object"
@@ -22,10 +23,10 @@ CONSTRAINTS = [
     ac.TiltLimits(frame=F, min_deg=60.0, max_deg=122.0),
     ac.TiltByDistance(frame=F, distance_m=(0.07, 0.25), tilt_deg=(65.0, 0.0), rpy_deg=(0.0, 0.0, 15.0)),
     ac.TiltLimits(frame=F, min_deg=0.0, max_deg=90.0, rpy_deg=(5.0, 0.0, -90.0), turns_along=True),
-    ac.OutsideSphere(frame=F, radius_m=0.4, center_m=(0.1, 0.0, -0.1)),
-    ac.OutsideCylinder(frame=F, radius_m=0.3, min_m=-0.2, max_m=0.4, margin_m=0.01),
-    ac.OutsideBox(frame=F, lower_m=(-0.3, -0.25, -0.4), upper_m=(0.3, 0.4, 0.2), margin_m=0.02),
-    ac.InsideSphere(frame=F, radius_m=0.2, center_m=(0.1, 0.0, -0.1)),
+    sc.OutsideSphere(frame=F, radius_m=0.4, center_m=(0.1, 0.0, -0.1)),
+    sc.OutsideCylinder(frame=F, radius_m=0.3, min_m=-0.2, max_m=0.4, margin_m=0.01),
+    sc.OutsideBox(frame=F, lower_m=(-0.3, -0.25, -0.4), upper_m=(0.3, 0.4, 0.2), margin_m=0.02),
+    sc.InsideSphere(frame=F, radius_m=0.2, center_m=(0.1, 0.0, -0.1)),
     ac.Arc(frame=F, radius_m=0.3, height_m=0.1, min_deg=0.0, max_deg=80.0, rpy_deg=(90.0, 0.0, 0.0)),
 ]
 IDS = [f"{type(c).__name__}_{i}" for i, c in enumerate(CONSTRAINTS)]
@@ -133,14 +134,14 @@ def test_keep_above_lifts_the_lowest_point():
         lambda: ac.TiltByDistance(frame=F, distance_m=(0.2, 0.1), tilt_deg=(0.0, 1.0)),
         lambda: ac.TiltLimits(frame=F, min_deg=10.0, max_deg=-10.0),
         lambda: ac.Arc(frame=F, radius_m=0.0),
-        lambda: ac.OutsideSphere(radius_m=0.0),
-        lambda: ac.OutsideSphere(radius_m=0.1, center_m=(0.0, 0.0)),
-        lambda: ac.OutsideCylinder(frame=F, radius_m=0.0, min_m=0.0, max_m=1.0),
-        lambda: ac.OutsideCylinder(frame=F, radius_m=0.1, min_m=1.0, max_m=1.0),
-        lambda: ac.OutsideCylinder(frame=F, radius_m=0.1, min_m=0.0, max_m=1.0, margin_m=-0.1),
-        lambda: ac.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 0.0, 1.0)),
-        lambda: ac.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 1.0, 1.0), margin_m=-0.1),
-        lambda: ac.InsideSphere(radius_m=-0.1),
+        lambda: sc.OutsideSphere(radius_m=0.0),
+        lambda: sc.OutsideSphere(radius_m=0.1, center_m=(0.0, 0.0)),
+        lambda: sc.OutsideCylinder(frame=F, radius_m=0.0, min_m=0.0, max_m=1.0),
+        lambda: sc.OutsideCylinder(frame=F, radius_m=0.1, min_m=1.0, max_m=1.0),
+        lambda: sc.OutsideCylinder(frame=F, radius_m=0.1, min_m=0.0, max_m=1.0, margin_m=-0.1),
+        lambda: sc.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 0.0, 1.0)),
+        lambda: sc.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 1.0, 1.0), margin_m=-0.1),
+        lambda: sc.InsideSphere(radius_m=-0.1),
     ],
 )
 def test_constraint_refuses_an_empty_set(make):
