@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.models.common.arrays import norm
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -37,9 +38,10 @@ class ImpedanceMonitor(LeafSystem):
 
     def __init__(self, limits: np.ndarray):
         super().__init__()
-        self._limits = np.array(limits, dtype=float)
-        if self._limits.shape != (6,) or not (self._limits > 0.0).all():
+        checked = np.array(limits, dtype=float)
+        if checked.shape != (6,) or not (checked > 0.0).all():
             raise InputError(f"an impedance monitor needs six positive limits, not {limits}")
+        self._saturated = 0.999 * checked  # magnitudes from which a component counts as saturated
         self._impedance_wrench_port = self.DeclareVectorInputPort("impedance_wrench", 6)
         sources = [self._impedance_wrench_port]
         self._contact_force_port = declare.scalar_output(self, "contact_force", self._contact_force, sources)
@@ -50,7 +52,7 @@ class ImpedanceMonitor(LeafSystem):
     get_saturation_output_port = output_getter("saturation", "flag that a component is at its limit, (1,)")
 
     def _contact_force(self, context: Context) -> float:
-        return float(np.linalg.norm(self._impedance_wrench_port.Eval(context)[:3]))
+        return norm(self._impedance_wrench_port.Eval(context)[:3])
 
     def _saturation(self, context: Context) -> float:
-        return float((np.abs(self._impedance_wrench_port.Eval(context)) >= 0.999 * self._limits).any())
+        return float((np.abs(self._impedance_wrench_port.Eval(context)) >= self._saturated).any())

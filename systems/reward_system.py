@@ -68,7 +68,7 @@ class RewardSystem(LeafSystem):
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
         sources = self._signals.tickets or {self.nothing_ticket()}
         self._values = declare.cache(self, "terms", self._calc_terms, sources)
-        self._reward_port = declare.part_output(self, "reward", self._values, np.sum)
+        self._reward_port = declare.part_output(self, "reward", self._values, np.add.reduce)
         self._term_ports = {
             term.name: declare.part_output(self, term.name, self._values, itemgetter(i)) for i, term in enumerate(terms)
         }

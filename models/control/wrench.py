@@ -6,12 +6,13 @@ The six limits of a bound are [translational, rotational], along and about the c
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
-from guiderail.models.common.arrays import cross
+from guiderail.models.common.arrays import cross, norm
 from guiderail.models.common.errors import InputError
 
 POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench, and vice versa
@@ -79,9 +80,9 @@ def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: floa
     """Clip a wrench (6,) to limits per axis (6,), then scale force and torque to the limits of their norms."""
     clipped = np.minimum(np.maximum(wrench, -axes), axes)
     for block, limit in ((clipped[:3], force), (clipped[3:], torque)):
-        norm = float(np.sqrt(block @ block))
-        if norm > limit:
-            block *= limit / norm
+        magnitude = norm(block)
+        if magnitude > limit:
+            block *= limit / magnitude
     return clipped
 
 
@@ -95,17 +96,17 @@ def slow_down(
     at most the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], and
     `force` is F [N].
     """
-    speed = float(np.sqrt(velocity @ velocity))
-    if speed == 0.0 or spring @ velocity <= 0.0:
+    speed = norm(velocity)
+    if speed == 0.0 or spring.dot(velocity) <= 0.0:
         return spring
-    limit = max(0.0, force - max(0.0, impedance * speed - float(damping @ velocity) / speed))
-    magnitude = float(np.sqrt(spring @ spring))
+    limit = max(0.0, force - max(0.0, impedance * speed - float(damping.dot(velocity)) / speed))
+    magnitude = norm(spring)
     return spring if magnitude <= limit else spring * (limit / magnitude)
 
 
 def approach_impedance(contact_stiffness: float, mass: float) -> float:
     """Return √(k m) [N s/m]: a mass m [kg] at speed v hits a stiffness k [N/m] with the peak force v √(k m)."""
-    return float(np.sqrt(contact_stiffness * mass))
+    return math.sqrt(contact_stiffness * mass)
 
 
 def bounded_wrench(
@@ -133,7 +134,7 @@ def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -
     """Return the largest β from 0 to 1 with s − β d inside the bound, for wrenches s (6,) inside it and d (6,)."""
     wrench = spring - damping
     f, t = wrench[:3], wrench[3:]
-    if (np.abs(wrench) <= bound.axes).all() and f @ f <= bound.force**2 and t @ t <= bound.torque**2:
+    if (np.abs(wrench) <= bound.axes).all() and f.dot(f) <= bound.force**2 and t.dot(t) <= bound.torque**2:
         return 1.0
     # Distance to the limit in the direction of −d, per axis.
     towards = np.where(damping > 0.0, bound.axes + spring, bound.axes - spring)
@@ -141,10 +142,10 @@ def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -
     share = min(1.0, float(shares.min()))
     for block, limit in ((slice(0, 3), bound.force), (slice(3, 6), bound.torque)):
         s, d = spring[block], damping[block]
-        dd, sd, slack = float(d @ d), float(s @ d), limit**2 - float(s @ s)
-        if dd > 0.0 and np.isfinite(slack):
+        dd, sd, slack = float(d.dot(d)), float(s.dot(d)), limit**2 - float(s.dot(s))
+        if dd > 0.0 and math.isfinite(slack):
             # β is the larger root of ‖s − β d‖² = limit².
-            share = min(share, (sd + float(np.sqrt(max(sd * sd + dd * slack, 0.0)))) / dd)
+            share = min(share, (sd + math.sqrt(max(sd * sd + dd * slack, 0.0))) / dd)
     return max(share, 0.0)
 
 
@@ -173,7 +174,7 @@ def governed_error(
         bound: Bound, with axes in the order of the coordinates.
     """
     implicit = (stiffness * step + damping) * np.abs(velocity)
-    force, torque = (float(np.sqrt(block @ block)) for block in (implicit[:3], implicit[3:]))
+    force, torque = norm(implicit[:3]), norm(implicit[3:])
     spring = clip_wrench(stiffness * error, bound.axes, bound.force, bound.torque)
     impedance = approach_impedance(bound.contact_stiffness, mass)
     spring[:3] = slow_down(spring[:3], damping[:3] * velocity[:3], velocity[:3], impedance, bound.force)

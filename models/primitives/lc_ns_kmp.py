@@ -9,6 +9,7 @@ the primitive of sKGRL with a history (5.1 to 5.3).
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
@@ -374,7 +375,7 @@ class LcNsKmp:
                 raise InputError(f"the history has shape {self._history_shape}, oldest output first, not {past.shape}")
             x = np.concatenate((past.ravel(), action))
         # One reduction instead of isfinite().all(): any NaN or infinity makes the product not finite.
-        if not np.isfinite(x @ x):
+        if not math.isfinite(x.dot(x)):
             raise InputError("history and null-space action must be finite")
         return x
 
