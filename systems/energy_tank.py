@@ -110,21 +110,20 @@ class EnergyTank(LeafSystem):
 
     def _calc_admitted(self, context: Context) -> _Admitted:
         pose, desired = self._pose_port.Eval(context), self._desired_pose_port.Eval(context)
-        reference, last_limits, last_pose, content = (
-            context.get_discrete_state(state).value()
-            for state in (self._last_reference, self._last_limits, self._last_pose, self._content)
-        )
+        states = context.get_discrete_state()
+        reference, last_limits = states.value(self._last_reference), states.value(self._last_limits)
+        last_pose, content = states.value(self._last_pose), states.value(self._content).item()
         if not is_finite(desired):
             desired = reference
         requested = self._requested_bound(context).in_pose_order.axes
         limits, K = np.minimum(last_limits, requested), self._stiffness
         if not is_finite(pose):  # NaN would fill the tank and remain in its state
-            return _Admitted(reference, limits, float(content[0]))
+            return _Admitted(reference, limits, content)
         moved = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
-        dissipated = float(self._damping @ moved**2) / self._period
+        dissipated = float(self._damping.dot(moved * moved)) / self._period
         error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)
         # Energy of tank and spring together.
-        energy = min(self._capacity, float(content[0]) + dissipated) + spring_energy(K, last_limits, error)
+        energy = min(self._capacity, content + dissipated) + spring_energy(K, last_limits, error)
         share, stored = admissible_change(K, (limits, requested), (error, desired_error), energy)
         if share == 1.0:
             next_reference, admitted = desired, requested
@@ -139,10 +138,8 @@ class EnergyTank(LeafSystem):
 
     def _admitted_wrench(self, context: Context) -> np.ndarray:
         bound = self._requested_bound(context)
-        numbers = np.empty(MAX_WRENCH_SIZE)
-        numbers[:POSE_SIZE] = self._admitted.Eval(context).limits[POSE_ORDER]
-        numbers[POSE_SIZE:] = bound.force, bound.torque
-        return numbers
+        limits = self._admitted.Eval(context).limits.tolist()
+        return np.array([limits[i] for i in POSE_ORDER] + [bound.force, bound.torque])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)

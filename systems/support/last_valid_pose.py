@@ -39,8 +39,8 @@ class CommandValidity:
 
     def is_valid(self, context: Context, time: float) -> bool:
         """Return True if the present command is valid at `time` [s]; `context` is the system's."""
-        if not np.abs(self._desired_pose.Eval(context)).max() <= _MAX_COORDINATE:  # False for NaN too
-            return False
+        if not all(abs(number) <= _MAX_COORDINATE for number in self._desired_pose.Eval(context).tolist()):
+            return False  # for NaN too
         if not self._command_time.HasValue(context):
             return True
         age = time - float(self._command_time.Eval(context)[0])
@@ -66,7 +66,6 @@ class LastValidPose:
 
     Attributes:
         tickets: Dependencies of `eval`.
-        timed_out_tickets: Dependencies of the validity of the present command.
 
     Raises:
         InputError: If an argument is out of range.
@@ -87,23 +86,24 @@ class LastValidPose:
         self._last_pose = system.DeclareDiscreteState(desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
         declare.update(system, period, self._update, self._reset)
-        self.timed_out_tickets = declare.tickets(system, [desired_pose, command_time, self._check_time])
-        self.tickets = self.timed_out_tickets | declare.tickets(system, [self._last_pose])
+        # The outputs and the event share one check of a command.
+        self._valid = declare.cache(system, "valid", self._check, [desired_pose, command_time, self._check_time])
+        self.tickets = declare.tickets(system, [desired_pose, self._valid, self._last_pose])
 
     def eval(self, context: Context) -> np.ndarray:
         """Return the desired pose to follow, (O,)."""
-        if self._is_valid(context):
+        if self._valid.Eval(context):
             return self._desired_pose.Eval(context)
-        return context.get_discrete_state(self._last_pose).value()
+        return context.get_discrete_state().value(self._last_pose)
 
     def declare_timed_out_output(self, system: LeafSystem) -> OutputPort:
         """Declare the output port ``command_timed_out`` (1,), 1 if the present command is not valid, otherwise 0."""
         return declare.scalar_output(
-            system, "command_timed_out", lambda context: float(not self._is_valid(context)), self.timed_out_tickets
+            system, "command_timed_out", lambda context: float(not self._valid.Eval(context)), [self._valid]
         )
 
-    def _is_valid(self, context: Context) -> bool:
-        return self._validity.is_valid(context, context.get_discrete_state(self._check_time).value().item())
+    def _check(self, context: Context) -> bool:
+        return self._validity.is_valid(context, context.get_discrete_state().value(self._check_time).item())
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._last_pose, self._measured_pose(context))
@@ -111,6 +111,6 @@ class LastValidPose:
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # Validity at the last check: the pose followed until now is stored, even if it becomes stale now.
-        if self._is_valid(context):
+        if self._valid.Eval(context):
             discrete_state.set_value(self._last_pose, self._desired_pose.Eval(context))
         discrete_state.set_value(self._check_time, [context.get_time()])
