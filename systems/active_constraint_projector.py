@@ -114,7 +114,7 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the command (6,) and, as the seventh number, the fallback flag."""
-        value = context.get_discrete_state(self._last).value()
+        value = context.get_discrete_state().value(self._last)
         last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
         if np.isfinite(requested).all() and np.isfinite(measured).all():

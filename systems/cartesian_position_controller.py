@@ -145,7 +145,7 @@ class CartesianPositionController(LeafSystem):
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
     def _joint_command(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state(self._command).value()
+        return context.get_discrete_state().value(self._command)
 
     def _X_TP(self, context: Context) -> RigidTransform:
         return self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)

@@ -80,7 +80,7 @@ class ChunkReference(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         """Advance by a control step; raise a `PolicyError` if the base policy does not return chunks."""
-        state = context.get_discrete_state(self._state).value().copy()
+        state = context.get_discrete_state().value(self._state).copy()
         state[-1] += 1.0
         if self._policy is not None and state[-1] % self._replan_steps == 0:
             observation = self._observation_port.Eval(context).astype(np.float32)
@@ -92,7 +92,7 @@ class ChunkReference(LeafSystem):
         discrete_state.set_value(self._state, state)
 
     def _window(self, context: Context) -> np.ndarray:
-        state = context.get_discrete_state(self._state).value()
+        state = context.get_discrete_state().value(self._state)
         step, outputs = int(state[-1]), self._reference.num_outputs
         at = np.minimum(max(step, 0) + np.arange(self._horizon + 1), self._reference.num_steps - 1)
         if step < 0 or self._policy is None:

@@ -84,7 +84,7 @@ class ChunkSafetyLimiter(LeafSystem):
         discrete_state.set_value(np.append(np.tile(start, 3 + self._num_steps), [1.0, 0.0, 0.0]))
 
     def _calc_plan(self, context: Context) -> _Plan:
-        *motion, rate, fallback, step = context.get_discrete_state(self._state).value()
+        *motion, rate, fallback, step = context.get_discrete_state().value(self._state)
         past, rest = np.split(np.reshape(motion, (-1, self._outputs)), [3])
         if step % self._replan_steps != 0:
             return _Plan(rest, rate, fallback)
@@ -96,7 +96,7 @@ class ChunkSafetyLimiter(LeafSystem):
 
     @after_start
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state, plan = context.get_discrete_state(self._state).value(), self._plan.Eval(context)
+        state, plan = context.get_discrete_state().value(self._state), self._plan.Eval(context)
         past = state[self._outputs : 3 * self._outputs]
         values = [past, plan.outputs.ravel(), plan.outputs[-1], [plan.rate, plan.fallback, state[-1] + 1.0]]
         discrete_state.set_value(np.concatenate(values))

@@ -76,7 +76,7 @@ class CommandDisturbance(LeafSystem):
             discrete_state.set_value(self._delay_line, np.tile(pose, self._delay))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        count = context.get_discrete_state(self._count).value()[0] + 1.0
+        count = context.get_discrete_state().value(self._count)[0] + 1.0
         discrete_state.set_value(self._count, [count])
         # At time zero no period has ended: the values from before this instant's updates are no command.
         has_ended = context.get_time() > 0
@@ -84,7 +84,7 @@ class CommandDisturbance(LeafSystem):
             discrete_state.set_value(self._last_delivered, self._delivered(context))
         if has_ended and self._delay_line is not None:
             command = self._command_port.Eval(context)
-            line = context.get_discrete_state(self._delay_line).value()
+            line = context.get_discrete_state().value(self._delay_line)
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(command) :], command]))
         if self._loss_probability > 0.0:
             seed = context.get_numeric_parameter(self._seed).value()[0]
@@ -92,9 +92,9 @@ class CommandDisturbance(LeafSystem):
             discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
 
     def _delivered(self, context: Context) -> np.ndarray:
-        last = context.get_discrete_state(self._last_delivered).value()
-        if context.get_discrete_state(self._is_lost).value()[0]:
+        last = context.get_discrete_state().value(self._last_delivered)
+        if context.get_discrete_state().value(self._is_lost)[0]:
             return last
         if self._delay_line is None:
             return self._command_port.Eval(context)
-        return context.get_discrete_state(self._delay_line).value()[: len(last)]
+        return context.get_discrete_state().value(self._delay_line)[: len(last)]

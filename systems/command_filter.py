@@ -67,7 +67,7 @@ class CommandFilter(LeafSystem):
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the next state, which begins with the safe command, and the intervention flag."""
-        last = context.get_discrete_state(self._last).value()
+        last = context.get_discrete_state().value(self._last)
         state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
         if not is_finite(state):  # NaN would remain in the state
             state, is_changed = last, True

@@ -56,7 +56,7 @@ class ConstraintViolation(LeafSystem):
         discrete_state.set_value([round(context.get_time() / self._period)])
 
     def _violation(self, context: Context) -> float:
-        step = 0 if self._step is None else int(context.get_discrete_state(self._step).value()[0])
+        step = 0 if self._step is None else int(context.get_discrete_state().value(self._step)[0])
         violation = self._constraints.violation(self._pose_port.Eval(context), step)
         # max(UNCONSTRAINED, violation) would turn NaN into "no constraint".
         return self.UNCONSTRAINED if violation < self.UNCONSTRAINED else violation

@@ -110,7 +110,7 @@ class EpisodeMonitor(LeafSystem):
 
     def _calc_next(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)
-        state = context.get_discrete_state(self._state).value().copy()
+        state = context.get_discrete_state().value(self._state).copy()
         for i, term in enumerate(self._terms):
             inputs = {name: signals[name] for name in term.inputs}
             if term.progress is not None:

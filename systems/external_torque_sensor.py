@@ -154,10 +154,10 @@ class ExternalTorqueSensor(LeafSystem):
             arm[1] = actual
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        count = context.get_discrete_state(self._count).value()[0] + 1.0
+        count = context.get_discrete_state().value(self._count)[0] + 1.0
         seed = context.get_numeric_parameter(self._seed).value()[0]
         noise, step = np.random.default_rng([int(seed), int(count)]).standard_normal((2, len(self._noise)))
-        walk = context.get_discrete_state(self._walk).value()
+        walk = context.get_discrete_state().value(self._walk)
         discrete_state.set_value(self._count, [count])
         discrete_state.set_value(self._noise_sample, self._noise * noise)
         discrete_state.set_value(self._walk, walk + self._step * self._drift * step)
@@ -170,7 +170,7 @@ class ExternalTorqueSensor(LeafSystem):
         gain, offset, friction = (
             context.get_numeric_parameter(index).value() for index in (self._gain, self._offset, self._friction)
         )
-        noise, walk = (context.get_discrete_state(index).value() for index in (self._noise_sample, self._walk))
+        noise, walk = (context.get_discrete_state().value(index) for index in (self._noise_sample, self._walk))
         return (
             contact
             + gain * (contact + gravity)

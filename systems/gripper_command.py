@@ -54,7 +54,7 @@ class GripperCommand(LeafSystem):
     get_desired_state_output_port = output_getter("desired_state", "desired positions and velocities, (2n,)")
 
     def _valid_position(self, context: Context) -> np.ndarray:
-        last = context.get_discrete_state(self._last_position).value()
+        last = context.get_discrete_state().value(self._last_position)
         if not self._position_port.HasValue(context):
             return last
         position = self._position_port.Eval(context)

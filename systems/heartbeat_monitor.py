@@ -68,7 +68,7 @@ class HeartbeatMonitor(LeafSystem):
 
     def _senders(self, context: Context) -> np.ndarray:
         """Return sender, sequence and age of each known monitor, (m, 3), updated with the newest heartbeats."""
-        senders = context.get_discrete_state(self._state).value().reshape(MAX_SENDERS, 3)
+        senders = context.get_discrete_state().value(self._state).reshape(MAX_SENDERS, 3)
         known = {sender: (sequence, age) for sender, sequence, age in senders.tolist() if not np.isnan(sender)}
         for heartbeat in self._heartbeats(context):
             if heartbeat.sender not in known or heartbeat.sequence > known[heartbeat.sender][0]:

@@ -61,5 +61,5 @@ class HistoryBuffer(LeafSystem):
 
     @after_start
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
-        remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]
+        remaining = context.get_discrete_state().value(self._state)[self._shape[1] :]
         discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))

@@ -71,7 +71,7 @@ class HistoryLengthSchedule(LeafSystem):
         self._history_length_port = declare.scalar_output(
             self,
             "history_length",
-            lambda context: self._lengths[int(context.get_discrete_state(self._state).value()[0])],
+            lambda context: self._lengths[int(context.get_discrete_state().value(self._state)[0])],
             [self._state],
         )
         declare.update(self, period, self._update, declare.reset_to_default(self))
@@ -80,7 +80,7 @@ class HistoryLengthSchedule(LeafSystem):
     get_history_length_output_port = output_getter("history_length", "history length P, (1,)")
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        index, in_contact, num_free_steps = context.get_discrete_state(self._state).value()
+        index, in_contact, num_free_steps = context.get_discrete_state().value(self._state)
         force = float(np.linalg.norm(self._wrench_port.Eval(context)[:3]))
         # `not force <=` instead of `force >`, so that NaN counts as contact.
         in_contact = not force <= (self._release_threshold if in_contact else self._contact_threshold)

@@ -87,8 +87,8 @@ class JointTorqueWrench(LeafSystem):
         # [torque, force], as the Jacobian's rows are [rotational, translational]
         F = np.linalg.solve(J @ J.T + self._damping, J @ external_torque)
         newest = np.concatenate([F[3:], F[:3]])
-        if context.get_discrete_state(self._has_sample).value()[0]:
-            last = context.get_discrete_state(self._state).value()
+        if context.get_discrete_state().value(self._has_sample)[0]:
+            last = context.get_discrete_state().value(self._state)
             newest = newest + self._decay * (last - newest)
         discrete_state.set_value(self._state, newest)
         discrete_state.set_value(self._has_sample, np.ones(1))

@@ -168,7 +168,7 @@ class LcNsKmpSystem(LeafSystem):
         discrete_state.set_value(self._step, [step])
 
     def _predict(self, context: Context) -> _Prediction:
-        step = int(context.get_discrete_state(self._step).value()[0])
+        step = int(context.get_discrete_state().value(self._step)[0])
         if self._motion_time_port.HasValue(context):
             step = round(self._motion_time_port.Eval(context)[0] / self._period)
         length = self._primitive.history
@@ -195,7 +195,7 @@ class LcNsKmpSystem(LeafSystem):
             output, fallback = prediction.output, 0.0
         except UnsolvableError:
             # The constraints may differ from those of the previous step: the last command itself might violate them.
-            last_command = context.get_discrete_state(self._last_command).value()
+            last_command = context.get_discrete_state().value(self._last_command)
             output, fallback = self._primitive.constraints.nearest(last_command, step), 1.0
         return _Prediction(step, output, fallback)
 

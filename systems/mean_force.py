@@ -55,4 +55,4 @@ class MeanForce(LeafSystem):
     get_magnitude_output_port = output_getter("magnitude", "norm of the mean force, (1,) [N]")
 
     def _mean(self, context: Context) -> np.ndarray:
-        return (self._force_sum_port.Eval(context) - context.get_discrete_state(self._last_sum).value()) * self._scale
+        return (self._force_sum_port.Eval(context) - context.get_discrete_state().value(self._last_sum)) * self._scale

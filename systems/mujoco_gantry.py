@@ -197,7 +197,7 @@ class MujocoGantry(LeafSystem):
         return state
 
     def _values(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state(self._state).value()
+        return context.get_discrete_state().value(self._state)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         model, data = self.model, self._data

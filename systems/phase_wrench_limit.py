@@ -70,7 +70,7 @@ class PhaseWrenchLimit(LeafSystem):
         return self._limits[int(state)] if 0.0 <= state < len(self._limits) else self._limits.min(axis=0)
 
     def _present(self, context: Context) -> np.ndarray:
-        bound = context.get_discrete_state(self._bound).value()
+        bound = context.get_discrete_state().value(self._bound)
         return self._limit(context) if np.isnan(bound).any() else bound
 
     def _phase_max_wrench(self, context: Context) -> np.ndarray:

@@ -75,7 +75,7 @@ class PoseMotionLimiter(LeafSystem):
     def _calc_next_state(self, context: Context) -> np.ndarray:
         if self._blend_factor_port.Eval(context)[0] <= 0.0:
             return _at_rest(self._pose_port.Eval(context))
-        state = context.get_discrete_state(self._state).value().copy()
+        state = context.get_discrete_state().value(self._state).copy()
         start = Rotation.from_quat(state[24:])
         desired = self._desired_pose_port.Eval(context)
         if np.isfinite(desired).all():

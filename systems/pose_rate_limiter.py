@@ -61,7 +61,7 @@ class PoseRateLimiter(LeafSystem):
     def _limited_pose(self, context: Context) -> np.ndarray:
         if self._blend_factor_port.Eval(context)[0] <= 0.0:
             return self._pose_port.Eval(context)
-        last = context.get_discrete_state(self._last_pose).value()
+        last = context.get_discrete_state().value(self._last_pose)
         desired = self._desired_pose_port.Eval(context)
         if not np.isfinite(desired).all():
             return last  # NaN would remain in the state for ever

@@ -70,8 +70,8 @@ class Recorder(LeafSystem):
 
     def recording(self, context: Context) -> Recording:
         """Return a copy of the samples so far; `context` is this system's."""
-        count = int(context.get_discrete_state(self._count).value()[0])
-        samples = context.get_discrete_state(self._samples).value().reshape(-1, self._width)[:count]
+        count = int(context.get_discrete_state().value(self._count)[0])
+        samples = context.get_discrete_state().value(self._samples).reshape(-1, self._width)[:count]
         ends = np.cumsum(list(self._sizes.values()))
         columns = np.split(samples, ends[:-1], axis=1)
         return Recording(
@@ -80,7 +80,7 @@ class Recorder(LeafSystem):
         )
 
     def _record(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        count = int(context.get_discrete_state(self._count).value()[0])
+        count = int(context.get_discrete_state().value(self._count)[0])
         # No step has ended at time zero. An event offset of one period cannot be used; see `declarations.after_start`.
         if context.get_time() == 0 or count == self._num_samples:
             return EventStatus.DidNothing()

@@ -59,6 +59,6 @@ class SafetyFilter(LeafSystem):
 
     def _calc_projection(self, context: Context) -> np.ndarray:
         """Return the safe pose and the intervention flag, (O + 1,)."""
-        pose = context.get_discrete_state(self._sampled_pose).value()
+        pose = context.get_discrete_state().value(self._sampled_pose)
         safe_pose, is_changed = self._keep_out.project(pose, self._desired_pose_port.Eval(context))
         return np.append(safe_pose, float(is_changed))

@@ -124,18 +124,18 @@ class SensorDisturbance(LeafSystem):
             discrete_state.set_value(self._first_configuration, self._configuration_port.Eval(context))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        count = context.get_discrete_state(self._count).value() + 1.0
+        count = context.get_discrete_state().value(self._count) + 1.0
         discrete_state.set_value(self._count, count)
         if self._has_noise or self._has_drift:
             seed = context.get_numeric_parameter(self._seed).value()[0]
             rng = np.random.default_rng([int(seed), int(count[0])])
             discrete_state.set_value(self._noise_sample, rng.standard_normal(len(self._noise)))
             if self._has_drift:
-                walk = context.get_discrete_state(self._walk).value()
+                walk = context.get_discrete_state().value(self._walk)
                 step = self._step * self._drift * rng.standard_normal(len(self._drift))
                 discrete_state.set_value(self._walk, walk + step)
         if self._delay_line is not None:
-            line = context.get_discrete_state(self._delay_line).value()
+            line = context.get_discrete_state().value(self._delay_line)
             newest = self._measurement_port.Eval(context)
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(newest) :], newest]))
 
@@ -145,15 +145,15 @@ class SensorDisturbance(LeafSystem):
         else:
             skipped = self._delay - int(context.get_numeric_parameter(self._used_delay).value()[0])
             size = len(self._noise)
-            measured = context.get_discrete_state(self._delay_line).value()[skipped * size :][:size]
+            measured = context.get_discrete_state().value(self._delay_line)[skipped * size :][:size]
         scale, bias = (context.get_numeric_parameter(index).value() for index in (self._scale, self._bias))
-        noise = self._noise * context.get_discrete_state(self._noise_sample).value()
+        noise = self._noise * context.get_discrete_state().value(self._noise_sample)
         disturbed = scale * measured + bias + noise
         if self._has_drift:
-            disturbed = disturbed + context.get_discrete_state(self._walk).value()
+            disturbed = disturbed + context.get_discrete_state().value(self._walk)
         if self._configuration_port is not None:
             moved = self._configuration_port.Eval(context)
-            moved = moved - context.get_discrete_state(self._first_configuration).value()
+            moved = moved - context.get_discrete_state().value(self._first_configuration)
             gradient = context.get_numeric_parameter(self._gradient).value().reshape(len(noise), -1)
             disturbed = disturbed + gradient @ moved
         if self._rounds_any:

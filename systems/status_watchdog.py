@@ -93,7 +93,7 @@ class StatusWatchdog(LeafSystem):
     get_age_output_port = output_getter("age", "age of the accepted status, (1,) [s]")
 
     def _state_of(self, context: Context) -> EstimatorState:
-        return EstimatorState.from_vector(context.get_discrete_state(self._state).value(), self._num_joints)
+        return EstimatorState.from_vector(context.get_discrete_state().value(self._state), self._num_joints)
 
     def _joint_state(self, context: Context) -> np.ndarray:
         state = self._state_of(context)
@@ -105,7 +105,7 @@ class StatusWatchdog(LeafSystem):
     def _evaluate(self, context: Context) -> Estimate:
         value, state, clock = self._status_port.Eval(context), self._state_of(context), self._clock(context)
         # An unchanged clock input belongs to the previous check.
-        is_new_clock = np.isfinite(clock) and clock not in context.get_discrete_state(self._last_clock).value()
+        is_new_clock = np.isfinite(clock) and clock not in context.get_discrete_state().value(self._last_clock)
         now = clock if is_new_clock else state.check_time
         status = value if isinstance(value, JointStatus) else None
         M, drag = self._dynamics.evaluate(self._plant_context.Eval(context))

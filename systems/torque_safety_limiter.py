@@ -219,7 +219,7 @@ class TorqueSafetyLimiter(LeafSystem):
         context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
     def _state_of(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state(self._state).value()
+        return context.get_discrete_state().value(self._state)
 
     def _find_fault(self, context: Context) -> Fault:
         """Return the first fault that is present now; checks have the form `not value <= limit`, so that NaN fails."""

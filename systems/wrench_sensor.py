@@ -109,7 +109,7 @@ class WrenchSensor(LeafSystem):
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         newest = self._measure(context)
-        last = context.get_discrete_state(self._state).value()
+        last = context.get_discrete_state().value(self._state)
         discrete_state.set_value(newest + self._decay * (last - newest))
 
     def _measure(self, context: Context) -> np.ndarray:

@@ -53,14 +53,14 @@ class WrenchTare(LeafSystem):
 
     def is_tared(self, context: Context) -> bool:
         """Return True if all samples of the mean have been taken; `context` is this system's."""
-        return context.get_discrete_state(self._count).value()[0] >= self._skipped + self._averaged
+        return context.get_discrete_state().value(self._count)[0] >= self._skipped + self._averaged
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self.is_tared(context):
             return
-        count = context.get_discrete_state(self._count).value()[0]
+        count = context.get_discrete_state().value(self._count)[0]
         if count >= self._skipped:
-            offset = context.get_discrete_state(self._offset).value()
+            offset = context.get_discrete_state().value(self._offset)
             sample = self._measured_wrench_port.Eval(context)
             discrete_state.set_value(self._offset, offset + (sample - offset) / (count - self._skipped + 1.0))
         discrete_state.set_value(self._count, [count + 1.0])
@@ -68,4 +68,4 @@ class WrenchTare(LeafSystem):
     def _tared_wrench(self, context: Context) -> np.ndarray:
         if not self.is_tared(context):
             return np.zeros(WRENCH_SIZE)
-        return self._measured_wrench_port.Eval(context) - context.get_discrete_state(self._offset).value()
+        return self._measured_wrench_port.Eval(context) - context.get_discrete_state().value(self._offset)

@@ -150,7 +150,7 @@ def part_output(
     """
 
     def value_of_state(context: Context) -> Any:
-        return part(context.get_discrete_state(source).value())
+        return part(context.get_discrete_state().value(source))
 
     def value_of_cache(context: Context) -> Any:
         return part(source.Eval(context))
