@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
-from guiderail.models.primitives.gains import authority_gains
+from guiderail.models.primitives.gains import authority_gains, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
 
 if TYPE_CHECKING:
@@ -169,16 +169,8 @@ class PrimitiveConfig:
         return gains
 
     def residual_gains(self) -> np.ndarray:
-        """Return the displacement of the command by an action of one, (O,), equal for all outputs of a group.
-
-        It is √3 κ times the RMS of the demonstrations' standard deviations over the motion and the group. A null-space
-        action of one displaces the command as much on average, but differently over time and direction.
-        """
-        variances = np.mean(self.reference.standard_deviations**2, axis=0)
-        gains = np.zeros(self.num_outputs)
-        for group in self.isotropic_groups or (tuple(range(self.num_outputs)),):
-            gains[list(group)] = np.sqrt(3.0) * self.action_scale * np.sqrt(variances[list(group)].mean())
-        return gains
+        """Return the displacement (O,) of a residual command by an action of one, equal in each isotropic group."""
+        return residual_gains(self.reference, self.action_scale, self.isotropic_groups or ())
 
 
 @dataclass(frozen=True)

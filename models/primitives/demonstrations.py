@@ -253,6 +253,11 @@ def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tup
     return matches
 
 
+def phases_of_steps(phases: Sequence[float] | np.ndarray, num_steps: int) -> np.ndarray:
+    """Return the phase (num_steps,) of each step of a motion; phases (K,) start at these parts of it, from 0 to 1."""
+    return np.searchsorted(phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
+
+
 @dataclass(frozen=True)
 class DemonstratedBounds:
     """Lower and upper bounds of each output in each phase."""
@@ -265,7 +270,7 @@ class DemonstratedBounds:
 
     def contains(self, outputs: np.ndarray) -> np.ndarray:
         """Return a mask (N,), true where a sample is within the bounds; `outputs` (N, O) cover the whole motion."""
-        phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, len(outputs)), side="right") - 1
+        phase = phases_of_steps(self.phases, len(outputs))
         return np.all((outputs >= self.lower[phase]) & (outputs <= self.upper[phase]), axis=1)
 
 

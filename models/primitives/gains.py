@@ -8,6 +8,8 @@ linear, and two numbers that describe a gain follow from it exactly, for the act
 - exploration RMS: root mean square of the displacement by white actions, in the same unit.
 """
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from guiderail.models.common.arrays import is_whole
@@ -94,6 +96,26 @@ def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 
 def authority(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
     """Compute the displacement (O,), in demonstration standard deviations, by a constant action of ±1 times `gains`."""
     return unit_authority(primitive) * np.asarray(gains, dtype=float) / deviation(primitive.reference)
+
+
+def residual_gains(
+    reference: ReferenceTrajectory, action_scale: float, groups: Iterable[Sequence[int]] = ()
+) -> np.ndarray:
+    """Compute the displacement (O,) of a residual command by an action of one, equal for all outputs of a group.
+
+    It is √3 κ times the RMS of the demonstrations' standard deviations over the motion and the group. A null-space
+    action of one displaces the command as much on average, but differently over time and direction.
+
+    Args:
+        reference: Reference trajectory of the demonstrations.
+        action_scale: κ.
+        groups: Indices of the outputs of each group; one group of all outputs by default.
+    """
+    variances = np.mean(reference.standard_deviations**2, axis=0)
+    gains = np.zeros(len(variances))
+    for group in map(list, groups or (range(len(variances)),)):
+        gains[group] = np.sqrt(3.0) * action_scale * np.sqrt(variances[group].mean())
+    return gains
 
 
 def deviation(reference: ReferenceTrajectory) -> np.ndarray:

@@ -15,9 +15,9 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
-from guiderail.models.primitives.demonstrations import DemonstratedBounds
+from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import Selection, fit
-from guiderail.models.primitives.gains import authority_gains, deviation
+from guiderail.models.primitives.gains import authority_gains, deviation, residual_gains
 from guiderail.models.primitives.poses import Orientation
 from guiderail.models.templates import SharedControlTemplate
 from guiderail.tools.guided.segment import Frame, Segment
@@ -122,9 +122,7 @@ class _FittedSegment:
         if given is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(given, DemonstratedBounds):
-            phase = np.searchsorted(given.phases, np.linspace(0.0, 1.0, self.num_steps), side="right") - 1
-            if len(given.phases) == 1:
-                return LinearConstraints.box(given.lower[0], given.upper[0])
+            phase = phases_of_steps(given.phases, self.num_steps) if len(given.phases) > 1 else 0
             return LinearConstraints.box(given.lower[phase], given.upper[phase])
         if isinstance(given, MotionConstraints):
             return given.linear
@@ -153,14 +151,8 @@ class _FittedSegment:
             return np.zeros(self.num_outputs)
         dims = list(range(self.num_outputs)) if self.settings.action_dims is None else list(self.settings.action_dims)
         if "residual" in self.guidance:
-            # One gain for each group of outputs, constant over time: an action of ±1 displaces them by as much as a
-            # constant null-space action of ±1 does on average (RMS).
-            gains = np.zeros(self.num_outputs)
-            sigma = deviation(self.reference)
-            groups = (range(3), range(3, 6)) if self.num_outputs == 6 else (range(self.num_outputs),)
-            for group in map(list, groups):
-                rms = np.sqrt(np.mean(sigma[group] ** 2))
-                gains[group] = np.sqrt(3.0) * self.settings.action_scale * rms
+            groups = (range(3), range(3, 6)) if self.num_outputs == 6 else ()
+            gains = residual_gains(self.reference, self.settings.action_scale, groups)
             return np.where(np.isin(np.arange(self.num_outputs), dims), gains, 0.0)
         return authority_gains(primitive, self.settings.action_scale, np.array(dims))
 

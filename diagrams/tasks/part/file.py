@@ -24,6 +24,7 @@ from guiderail.models.common.yaml import load_yaml
 from guiderail.models.parts.assembly_check import SYMMETRIES
 from guiderail.models.parts.demonstrator import TOUCH, plan_search, plan_straight_insertion
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives.demonstrations import phases_of_steps
 
 FILE_NAME = "task.yaml"
 _FILE_NAME = re.compile(r"[\w()+ -][\w.()+ /-]*")  # path of a file in the folder; it is also written into XML
@@ -176,7 +177,7 @@ class Bounds(Options):
         lower, upper = self.arrays()
         if self.phases is None:
             return LinearConstraints.box(lower, upper)
-        phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
+        phase = phases_of_steps(self.phases, num_steps)
         return LinearConstraints.box(lower[phase], upper[phase])
 
 
