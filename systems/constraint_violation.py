@@ -1,5 +1,6 @@
 """Constraint violation of a pose."""
 
+import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.control.motion_constraints import MotionConstraints
@@ -56,7 +57,6 @@ class ConstraintViolation(LeafSystem):
         discrete_state.set_value([round(context.get_time() / self._period)])
 
     def _violation(self, context: Context) -> float:
-        step = 0 if self._step is None else int(context.get_discrete_state().value(self._step)[0])
+        step = 0 if self._step is None else int(context.get_discrete_state().value(self._step).item())
         violation = self._constraints.violation(self._pose_port.Eval(context), step)
-        # max(UNCONSTRAINED, violation) would turn NaN into "no constraint".
-        return self.UNCONSTRAINED if violation < self.UNCONSTRAINED else violation
+        return float(np.maximum(violation, self.UNCONSTRAINED))  # NaN stays NaN

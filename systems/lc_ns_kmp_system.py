@@ -168,7 +168,7 @@ class LcNsKmpSystem(LeafSystem):
         discrete_state.set_value(self._step, [step])
 
     def _predict(self, context: Context) -> _Prediction:
-        step = int(context.get_discrete_state().value(self._step)[0])
+        step = int(context.get_discrete_state().value(self._step).item())
         if self._motion_time_port.HasValue(context):
             step = round(self._motion_time_port.Eval(context)[0] / self._period)
         length = self._primitive.history

@@ -69,8 +69,7 @@ class PoseRateLimiter(LeafSystem):
         distance = float(np.linalg.norm(change[:3]))
         if distance <= self._step and (np.abs(change[3:]) <= self._angular_step).all():
             return desired
-        if distance > self._step:
-            change[:3] *= self._step / distance
+        change[:3] *= self._step / max(distance, self._step)
         change[3:] = np.clip(change[3:], -self._angular_step, self._angular_step)
         return last + change
 

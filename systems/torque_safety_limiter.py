@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import STATUS_FAULTS, Fault, damping_torque
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 # Indices into the discrete state: [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
 # last change to DAMPING or OFF in s; blend factor from 0 to 1].
@@ -128,7 +128,6 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float, can_hold: bool = False):
         super().__init__()
-        check_period(period)
         num_joints = plant.num_positions()
         if len(limits.velocity) != num_joints:
             raise InputError(f"an arm of {num_joints} joints needs as many limits, not {len(limits.velocity)}")

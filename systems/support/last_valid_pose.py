@@ -7,7 +7,6 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period
 
 _TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s], far above rounding errors after days, far below any period
 _MAX_COORDINATE = 1e6  # largest number in a command [m, rad], so that no wrench overflows
@@ -31,7 +30,6 @@ class CommandValidity:
     """
 
     def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
-        check_period(period)
         if not 0.0 < timeout < np.inf:
             raise InputError(f"the timeout of commands must be positive and finite, not {timeout} s")
         self._desired_pose, self._command_time = desired_pose, command_time

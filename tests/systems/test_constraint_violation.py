@@ -21,9 +21,10 @@ def test_violation_is_the_maximum_over_all_constraints():
 
 
 def test_violation_is_unconstrained_without_constraints():
-    assert (
-        violation(ConstraintViolation(LinearConstraints.none(2), 0.1), [1.0, 2.0]) == ConstraintViolation.UNCONSTRAINED
-    )
+    assert ConstraintViolation.UNCONSTRAINED == -1e30
+    assert violation(ConstraintViolation(LinearConstraints.none(2), 0.1), [1.0, 2.0]) == -1e30
+    far = ConstraintViolation(LinearConstraints.box([-1.0005e30], [np.inf]), 0.1)
+    assert violation(far, [0.0]) == -1e30
 
 
 def test_violation_is_nan_when_the_pose_is_nan():
@@ -31,18 +32,23 @@ def test_violation_is_nan_when_the_pose_is_nan():
 
 
 def test_violation_uses_the_constraints_of_the_control_step():
-    bounds = np.arange(4.0)[:, None]  # y <= 0, 1, 2, 3
-    system = ConstraintViolation(LinearConstraints.box(np.full((4, 1), -np.inf), bounds), 0.1)
+    bounds = np.arange(50.0)[:, None]  # y <= 0, 1, 2, ...
+    system = ConstraintViolation(LinearConstraints.box(np.full((50, 1), -np.inf), bounds), 0.1)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_pose_input_port().FixValue(context, [2.0])
     simulator.Initialize()
     violations = []
-    for n in range(6):
+    for n in range(52):
         # Before the events of an instant the constraints of the previous step apply.
         simulator.AdvanceTo((n + 1) * 0.1)
         violations.append(system.get_violation_output_port().Eval(context)[0])
-    np.testing.assert_array_equal(violations, [2.0, 1.0, 0.0, -1.0, -1.0, -1.0])
+    np.testing.assert_array_equal(violations, 2.0 - np.minimum(np.arange(52.0), 49.0))
+
+
+def test_constant_constraints_need_no_state():
+    system = ConstraintViolation(LinearConstraints.box([0.0], [1.0]), 0.1)
+    assert system.CreateDefaultContext().num_discrete_state_groups() == 0
 
 
 def test_constructor_refuses_a_period_out_of_range():

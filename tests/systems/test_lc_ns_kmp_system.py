@@ -30,6 +30,7 @@ def test_ports():
     assert names(system, "output") == ["command", "constraint_violation", "fallback"]
     assert system.get_history_input_port().size() == 6
     assert system.get_command_output_port().size() == 2
+    assert system.get_reference_window_input_port().size() == 9 * (2 + 4)
     without = LcNsKmpSystem(primitive(history=0), None, PERIOD)
     assert names(without, "input") == ["null_space_action", "motion_time", "reference_window"]
     with pytest.raises(InputError, match="history"):
@@ -45,8 +46,10 @@ def test_command_is_the_prediction_at_the_control_step():
     past = p.reference.means[2:5]
     system.get_null_space_action_input_port().FixValue(context, [0.5, -1.0])
     system.get_history_input_port().FixValue(context, past.ravel())
+    np.testing.assert_array_equal(system.gain, gain)
+    system.gain[:] = 0.0  # a copy
     simulator.Initialize()
-    for step in (0, 7, 30):
+    for step in (0, 7, 29, 30):  # 29 * PERIOD / PERIOD is less than 29
         simulator.AdvanceTo(PERIOD * (step + 0.5))
         expected = p.predict(step, gain * [0.5, -1.0], past).output
         np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
@@ -208,9 +211,64 @@ def test_initialization_restores_step_and_initial_command():
     p.predict = predict
     action.GetMutableData()
     np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(0, np.zeros(2)).output)
-    context.SetTime(7 * PERIOD)
+    context.SetTime(29 * PERIOD)  # 29 * PERIOD / PERIOD is less than 29
     simulator.Initialize()
-    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(7, np.zeros(2)).output)
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(29, np.zeros(2)).output)
+
+
+def test_initialization_at_a_later_time_keeps_the_last_command_for_fallbacks():
+    p = primitive(history=0)
+    predict = p.predict
+
+    def unsolvable(*arguments):
+        raise UnsolvableError("no")
+
+    system = LcNsKmpSystem(p, None, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    action = system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    simulator.AdvanceTo(7.5 * PERIOD)
+    simulator.Initialize()
+    p.predict = unsolvable
+    action.GetMutableData()  # invalidates the cache
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(6, np.zeros(2)).output)
+
+
+def test_fallback_of_the_second_step_is_the_first_command():
+    p = primitive(history=0)
+    predict = p.predict
+
+    def failing(step, *arguments):
+        if step == 1:
+            raise UnsolvableError("no")
+        return predict(step, *arguments)
+
+    p.predict = failing
+    system = LcNsKmpSystem(p, np.full(2, 20.0), PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    action = [0.5, -1.0]
+    system.get_null_space_action_input_port().FixValue(context, action)
+    simulator.AdvanceTo(1.5 * PERIOD)
+    expected = predict(0, 20.0 * np.array(action)).output
+    assert (expected != p.reference.means[0]).any()
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
+
+
+def test_connected_reference_window_replaces_the_reference():
+    p, action = primitive(history=0), np.array([0.5, -1.0])
+    system = LcNsKmpSystem(p, None, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_null_space_action_input_port().FixValue(context, action)
+    rng = np.random.default_rng(3)
+    means, factors = 0.1 * rng.normal(size=(9, 2)), 0.1 * rng.normal(size=(9, 2, 2))
+    covariances = factors @ np.swapaxes(factors, 1, 2) + 0.01 * np.eye(2)
+    window = np.concatenate([means.ravel(), covariances.ravel()])
+    system.get_reference_window_input_port().FixValue(context, window)
+    simulator.AdvanceTo(4.5 * PERIOD)
+    expected = p.predict_window(4, means, covariances, action).output
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
 
 
 @pytest.mark.parametrize("length", [2.0, 4.0, 0.0, 1.5, np.nan])
@@ -270,6 +328,7 @@ def test_violation_is_finite_without_constraints():
     [
         (np.ones(3), PERIOD, "gain"),
         ([np.nan, 1], PERIOD, "gain"),
+        ([np.inf, 1], PERIOD, "gain"),
         (None, 0.0, "period"),
     ],
 )
@@ -286,7 +345,7 @@ def test_connected_motion_time_determines_the_step():
     system.get_null_space_action_input_port().FixValue(context, action)
     time = system.get_motion_time_input_port().FixValue(context, [4 * PERIOD])
     simulator.AdvanceTo(7.5 * PERIOD)
-    for step in (4, 5, 2):
+    for step in (4, 5, 2, 29):  # 29 * PERIOD / PERIOD is less than 29
         time.GetMutableData().set_value([step * PERIOD])
         command = system.get_command_output_port().Eval(context)
         np.testing.assert_array_equal(command, p.predict(step, action).output)

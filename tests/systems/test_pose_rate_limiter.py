@@ -5,7 +5,8 @@ from pydrake.systems.analysis import Simulator
 from guiderail.models.common.errors import InputError
 from guiderail.systems.pose_rate_limiter import PoseRateLimiter
 
-PERIOD, SPEED, ANGULAR_SPEED = 0.125, 0.2, 0.4
+PERIOD, SPEED, ANGULAR_SPEED = 0.125, 0.25, 0.5
+STEP, TURN = PERIOD * SPEED, PERIOD * ANGULAR_SPEED  # exact in binary
 MEASURED = np.array([0.1, -0.2, 0.3, 1.0, 0.0, 0.0])
 
 
@@ -95,16 +96,64 @@ def test_pose_within_the_speed_limits_is_output_unchanged():
         rig.advance()
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"speed": 0.0}, {"angular_speed": np.inf}])
+@pytest.mark.parametrize("linear", [[0, 0, 0], [1, 0, 0], [0, 0, 1], [0.6, 0, 0.75]])
+@pytest.mark.parametrize("angular", [[0, 0], [1, 0], [-1, 0], [0, 1], [-1, -1]])
+def test_pose_at_the_speed_limits_is_output_unchanged(linear, angular):
+    desired = [*STEP * np.array(linear), -3.125, *TURN * np.array(angular)]
+    np.testing.assert_array_equal(first_pose(desired), desired)
+
+
+@pytest.mark.parametrize(
+    ("linear", "angular", "limited_linear", "limited_angular"),
+    [
+        ([0, 0, 1.0005], [0, 0], [0, 0, 1], [0, 0]),
+        ([1.2, 0, -1.6], [1, 0.5], [0.6, 0, -0.8], [1, 0.5]),
+        ([0, 0, 0], [1.0005, 0], [0, 0, 0], [1, 0]),
+        ([0, 0, 0], [-1.0005, 0.5], [0, 0, 0], [-1, 0.5]),
+        ([1, 0, 0], [0, -1.0005], [1, 0, 0], [0, -1]),
+        ([0, 0, 1], [2, -2], [0, 0, 1], [1, -1]),
+    ],
+)
+def test_change_above_a_speed_limit_is_reduced_to_it(linear, angular, limited_linear, limited_angular):
+    pose = first_pose([*STEP * np.array(linear), -3.125, *TURN * np.array(angular)])
+    turned = 2.0 * np.pi - 6.25  # less than TURN
+    expected = [*STEP * np.array(limited_linear), 3.125 + turned, *TURN * np.array(limited_angular)]
+    np.testing.assert_allclose(pose, expected, rtol=0.0, atol=1e-12)
+
+
+def first_pose(desired):
+    """Return the first output after a start at the pose [0, 0, 0, 3.125, 0, 0]."""
+    rig = Rig(np.array(desired), blend_factor=1.0)
+    rig.pose.GetMutableData().set_value([0.0, 0.0, 0.0, 3.125, 0.0, 0.0])
+    rig.simulator.Initialize()
+    return rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context()).copy()
+
+
+def test_default_speeds_are_a_quarter_of_a_meter_and_one_and_a_half_radians_per_second():
+    system = PoseRateLimiter(period=PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_desired_pose_input_port().FixValue(context, [9.0, 0.0, 0.0, 0.0, 3.0, 0.0])
+    system.get_pose_input_port().FixValue(context, np.zeros(6))
+    system.get_blend_factor_input_port().FixValue(context, [1.0])
+    simulator.Initialize()
+    first = system.get_limited_pose_output_port().Eval(context)
+    np.testing.assert_allclose(first, [0.25 * PERIOD, 0.0, 0.0, 0.0, 1.5 * PERIOD, 0.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"period": 0.0}, *({name: value} for name in ("speed", "angular_speed") for value in (0.0, np.inf))]
+)
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         PoseRateLimiter(**({"period": PERIOD} | wrong))
 
 
-def test_desired_pose_is_ignored_when_it_is_not_finite():
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_desired_pose_is_ignored_when_it_is_not_finite(number):
     rig = Rig(MEASURED + 0.01).start_blending()
     before = rig.advance(4)[-1]
-    rig.desired.GetMutableData().set_value([np.nan, *MEASURED[1:]])
+    rig.desired.GetMutableData().set_value([number, *MEASURED[1:]])
     np.testing.assert_array_equal(rig.advance(2)[-1], before)
     rig.desired.GetMutableData().set_value(MEASURED)
     np.testing.assert_allclose(rig.advance(4)[-1], MEASURED)
