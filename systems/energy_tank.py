@@ -74,7 +74,7 @@ class EnergyTank(LeafSystem):
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
         if not 0.0 < capacity < np.inf:
             raise InputError(f"an energy tank's capacity must be positive, not {capacity} J")
-        if not is_finite(np.asarray(bound.axes)):
+        if not is_finite(bound.axes):
             raise InputError(f"an energy tank needs finite limits of the wrench per axis, not {bound.axes}")
         self._bound, self._capacity, self._period = bound, capacity, period
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
@@ -136,10 +136,10 @@ class EnergyTank(LeafSystem):
         desired = self._desired_pose_port.Eval(context)
         return self._admitted.Eval(context).reference if is_finite(desired) else desired
 
-    def _admitted_wrench(self, context: Context) -> np.ndarray:
+    def _admitted_wrench(self, context: Context) -> list[float]:
         bound = self._requested_bound(context)
         limits = self._admitted.Eval(context).limits.tolist()
-        return np.array([limits[i] for i in POSE_ORDER] + [bound.force, bound.torque])
+        return [*(limits[i] for i in POSE_ORDER), bound.force, bound.torque]
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)

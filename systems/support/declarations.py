@@ -1,6 +1,7 @@
 """Declarations that systems share: periods, samples, cache entries, and ports with their getters."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
 from inspect import signature
 from typing import Any, TypeAlias
 
@@ -182,6 +183,7 @@ def after_start(
     every third k.
     """
 
+    @wraps(update)
     def update_after_start(self: Any, context: Context, discrete_state: DiscreteValues) -> None:
         if context.get_time() > 0:
             update(self, context, discrete_state)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import WrenchBound
@@ -19,6 +20,9 @@ class Tank:
         self.system = EnergyTank(STIFFNESS, DAMPING, BOUND, capacity=capacity, period=PERIOD)
         self.context = self.system.CreateDefaultContext()
         self.put(np.zeros(6), np.zeros(6), BOUND.numbers)
+        self.reset()
+
+    def reset(self):
         events = self.system.AllocateDiscreteVariables()
         self.system._reset(self.context, events)
         self.context.SetDiscreteState(events)
@@ -81,6 +85,48 @@ def test_lower_bound_applies_at_once_when_the_tank_is_empty():
     assert content >= 0.0
 
 
+def test_tank_that_is_too_empty_admits_the_share_of_a_motion_that_it_can_pay():
+    tank, pose = Tank(0.01), np.zeros(6)
+    tank.step(np.r_[0.002, np.zeros(5)], pose, BOUND.numbers)
+    reference, _, content = tank.step(np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
+    np.testing.assert_allclose(reference, np.r_[np.sqrt(2.0 * 0.01 / 1500.0), np.zeros(5)], rtol=1e-6)
+    assert 0.0 <= content < 1e-6
+    held, _, _ = tank.step(np.r_[-0.1, np.zeros(5)], pose, BOUND.numbers)
+    np.testing.assert_allclose(held, -reference, rtol=1e-3, atol=1e-9)  # the spring's energy is returned on the way
+
+
+def test_tank_that_is_too_empty_admits_the_share_of_a_bound_that_it_can_pay():
+    tank, pose, desired = Tank(0.004), np.zeros(6), np.r_[0.003, np.zeros(5)]
+    tank.step(desired, pose, 0.1 * BOUND.numbers)
+    reference, wrench, content = tank.step(desired, pose, BOUND.numbers)
+    np.testing.assert_allclose(reference, desired, rtol=1e-12)
+    # The energy f r − f² / 2 K of a spring that is clipped to f is the content.
+    limit = 1500.0 * 0.003 - np.sqrt((1500.0 * 0.003) ** 2 - 2.0 * 1500.0 * 0.004)
+    share = (limit - 0.9) / (9.0 - 0.9)
+    np.testing.assert_allclose(wrench[:6], (0.1 + 0.9 * share) * BOUND.axes, rtol=1e-5)
+    assert 0.0 <= content < 1e-6
+
+
+def test_initialization_fills_the_tank_and_restarts_at_the_measured_pose():
+    tank, pose = Tank(0.01), np.full(6, 0.2)
+    tank.step(np.r_[0.1, np.zeros(5)], np.zeros(6), 0.1 * BOUND.numbers)
+    tank.put(pose, pose, BOUND.numbers)
+    tank.reset()
+    assert tank.system.get_energy_output_port().Eval(tank.context)[0] == 0.01
+    reference, wrench, _ = tank.step(pose + np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
+    np.testing.assert_allclose(reference - pose, np.r_[np.sqrt(2.0 * 0.01 / 1500.0), np.zeros(5)], rtol=1e-6)
+    np.testing.assert_array_equal(wrench, BOUND.numbers)
+
+
+def test_bound_is_constant_without_an_input():
+    system = EnergyTank(STIFFNESS, DAMPING, BOUND, capacity=0.5, period=PERIOD)
+    context = system.CreateDefaultContext()
+    system.get_desired_pose_input_port().FixValue(context, np.zeros(6))
+    system.get_pose_input_port().FixValue(context, np.zeros(6))
+    Simulator(system, context).Initialize()
+    np.testing.assert_array_equal(system.get_admitted_wrench_output_port().Eval(context), BOUND.numbers)
+
+
 def test_motion_refills_the_tank_up_to_its_capacity():
     tank = Tank(0.02)
     _, _, low = tank.step(np.r_[0.005, np.zeros(5)], np.zeros(6), BOUND.numbers)
@@ -117,6 +163,7 @@ def test_content_is_kept_when_the_measured_pose_is_not_finite():
     [
         ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
         ({"capacity": 0.0}, "capacity must be positive"),
+        ({"capacity": np.inf}, "capacity must be positive"),
         ({"bound": WrenchBound(np.r_[np.inf, np.ones(5)], 20.0, 5.2)}, "finite limits"),
         ({"period": 0.0}, "period must be positive"),
     ],

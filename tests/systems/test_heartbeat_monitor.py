@@ -158,3 +158,4 @@ def test_status_fault_takes_precedence():
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         HeartbeatMonitor(**{"period": PERIOD, "timeout": TIMEOUT} | wrong)
+    HeartbeatMonitor(period=PERIOD, timeout=0.9995 * FORGET_TIME)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from ruckig import ControlInterface, Ruckig, RuckigError, Synchronization
+from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems import pose_motion_limiter
 from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
@@ -66,6 +67,48 @@ def test_motion_stays_within_the_limits_for_adversarial_commands():
     for reached, limits in zip(derivatives(np.array(poses)), (LIMITS.linear, LIMITS.angular), strict=True):
         assert (np.array(reached) <= np.array(limits) * (1 + 1e-9)).all()
         assert reached[0] > 0.5 * limits[0]  # the limits are used
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("distance", [0.02, -0.2])
+def test_each_axis_uses_a_share_of_the_limits(axis, distance):
+    """The fastest motion of one axis: its velocity, acceleration and jerk reach 1/√3 of the limits."""
+    loop, start = Loop(), np.zeros(6)
+    loop.system.get_pose_input_port().FixValue(loop.context, start)
+    desired = np.zeros(6)
+    desired[axis] = distance
+    loop.set(desired)
+    loop.simulator.Initialize()
+    motion, state = InputParameter(1), None
+    motion.target_position = [abs(distance)]
+    limits = np.transpose([LIMITS.linear, LIMITS.rotation_vector_limits()])[:, int(axis > 2)] / np.sqrt(3.0)
+    motion.max_velocity, motion.max_acceleration, motion.max_jerk = limits[:, None]
+    trajectory = Trajectory(1)
+    assert Ruckig(1).calculate(motion, trajectory) == Result.Working
+    poses = loop.run(100)
+    expected = [trajectory.at_time(PERIOD * (k + 1))[0][0] for k in range(100)]
+    np.testing.assert_allclose(poses[:, axis], np.sign(distance) * np.array(expected), atol=1e-6)
+    np.testing.assert_allclose(np.delete(poses, axis, axis=1), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("turn", "is_followed"), [(0.9 * np.pi - 1e-3, True), (0.9 * np.pi + 1e-3, False)])
+def test_orientation_far_from_the_start_is_ignored(turn, is_followed):
+    loop = Loop(FRANKA_LIMITS)
+    loop.system.get_pose_input_port().FixValue(loop.context, np.zeros(6))
+    loop.set([0.1, 0.0, 0.0, turn, 0.0, 0.0])
+    loop.simulator.Initialize()
+    expected = [0.1, 0.0, 0.0, turn, 0.0, 0.0] if is_followed else np.zeros(6)
+    assert_close(loop.run(1500)[-1], np.array(expected), 1e-6)
+
+
+def test_motion_raises_when_no_trajectory_is_found(monkeypatch):
+    class Solver(Ruckig):
+        def calculate(self, wanted, trajectory):
+            return Result.Error
+
+    monkeypatch.setattr(pose_motion_limiter, "Ruckig", Solver)
+    with pytest.raises(InputError, match="no trajectory from"):
+        Loop().run(1)
 
 
 def test_motion_reaches_the_desired_pose():

@@ -26,6 +26,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import cached_property
+from inspect import unwrap
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -121,10 +122,10 @@ def _is_numeric(value: Any) -> bool:
 
 
 def _function(value: Any) -> Any:
-    """Return the function in a property, class method or static method."""
+    """Return the function in a property, class method, static method or decorated function."""
     for name in ("fget", "__func__", "func"):
         value = getattr(value, name) if isinstance(value, WRAPPERS) and hasattr(value, name) else value
-    return value
+    return unwrap(value) if isinstance(value, FunctionType) else value
 
 
 class _Coverage:
