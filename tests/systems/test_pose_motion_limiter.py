@@ -79,7 +79,7 @@ def test_each_axis_uses_a_share_of_the_limits(axis, distance):
     desired[axis] = distance
     loop.set(desired)
     loop.simulator.Initialize()
-    motion, state = InputParameter(1), None
+    motion = InputParameter(1)
     motion.target_position = [abs(distance)]
     limits = np.transpose([LIMITS.linear, LIMITS.rotation_vector_limits()])[:, int(axis > 2)] / np.sqrt(3.0)
     motion.max_velocity, motion.max_acceleration, motion.max_jerk = limits[:, None]
