@@ -60,8 +60,11 @@ def test_commands_are_those_of_the_guard_without_a_diagram():
     assert (run(chunks)[0] == expected).all()
 
 
-def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite():
-    chunks = np.full((3 * REPLAN, STEPS, 2), np.nan)
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+@pytest.mark.parametrize("entries", [np.s_[:], np.s_[0, 0]])
+def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite(number, entries):
+    chunks = np.zeros((3 * REPLAN, STEPS, 2))
+    chunks[(slice(REPLAN, None), *np.atleast_1d(entries))] = number
     chunks[:REPLAN] = [0.03, 0.01]
     commands, rate, fallback = run(chunks)
     expected = guard().guard(chunks[0]).outputs
@@ -85,6 +88,7 @@ def test_argument_is_refused_when_it_is_out_of_range():
     with pytest.raises(InputError, match="period"):
         ChunkSafetyLimiter(guard(), 4, 4, 0.0)
     ChunkSafetyLimiter(guard(), 4, 4, PERIOD)
+    ChunkSafetyLimiter(guard(), 4, 1, PERIOD)
 
 
 def test_measured_pose_at_initialization_must_be_finite():
