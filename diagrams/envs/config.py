@@ -45,8 +45,7 @@ class EnvConfig:
     def resolve(cls, task: str, options: Mapping[str, Any] | None = None) -> EnvConfig:
         """Validate the options of a task's environment and fill in the defaults.
 
-        The same options are resolved once in a process. Resolving the `options` of a configuration gives an equal
-        configuration.
+        Results are cached. Resolving the `options` of a configuration gives an equal configuration.
 
         Args:
             task: Name of the task, or path of a task folder.
@@ -76,7 +75,7 @@ class EnvConfig:
         return common | {name: value for part in self.parts for name, value in self.part(part).items()}
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return the options of one part by name."""
+        """Return the options of a part, a key of `parts`, as a dictionary from name to value."""
         model = self.parts[name]
         return {option: getattr(model, option) for option in type(model).model_fields}
 
@@ -96,7 +95,7 @@ class EnvConfig:
 
 
 def option_models(task: type[Task], guidance: str, station: str) -> dict[str, type[Options]]:
-    """Return the models of all options of an environment by part; "common" are those of every environment.
+    """Return the models of an environment's options by part; the part "common" has the options of every environment.
 
     Raises:
         InputError: If the guidance or the station is unknown, or the task lacks what the guidance requires.

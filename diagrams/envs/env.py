@@ -414,4 +414,4 @@ def _check_view(task: TaskDiagram, render_mode: str | None) -> None:
     if render_mode == "human" and task.query is None:
         raise InputError("this environment has no scene for Meshcat to show: leave render_mode out")
     if render_mode == "rgb_array" and not task.diagram.HasOutputPort("rgb_image"):
-        raise InputError("this environment has no camera: make it with render_mode='rgb_array'")
+        raise InputError("the diagram of this environment has no camera: build it with render_mode='rgb_array'")

@@ -145,14 +145,14 @@ class Observation(Diagram):
 
 
 def _unused(name: str, signals: Collection[str]) -> str:
-    """Return the name of a system that no signal has: `name`, with underscores at its end if needed."""
+    """Return `name`, with underscores appended until no signal has this name."""
     while name in signals:
         name += "_"
     return name
 
 
 def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:
-    """Return the system y = D u + y0, which is evaluated in C++."""
+    """Return the system y = D u + y0 with D (n, m) and y0 (n,), which is evaluated in C++."""
     outputs, inputs = D.shape
     return AffineSystem(
         A=np.zeros((0, 0)), B=np.zeros((0, inputs)), f0=np.zeros(0), C=np.zeros((outputs, 0)), D=D, y0=np.asarray(y0)
@@ -188,7 +188,7 @@ def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, n
         is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(center / scale).all()
     if not is_usable:
         raise InputError(
-            f"the scale of the observed signal {term.signal!r}{of_task} divides it, so it cannot be {brief(term.scale)}"
+            f"the observed signal {term.signal!r}{of_task} is divided by its scale, which cannot be {brief(term.scale)}"
         )
     return selection, center, scale
 

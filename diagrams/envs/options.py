@@ -80,9 +80,9 @@ class CommonOptions(Options):
     """Options of every environment. `EnvConfig.resolve` replaces an empty default by the task's own default."""
 
     guidance: str = Field("", description="guidance between the policy and the robot")
-    station: str = Field("", description="station that the task is done on")
-    reward: str = Field("", description="reward")
-    observation: str = Field("", description="observation of the policy")
+    station: str = Field("", description="name of the station, a simulated or a real robot")
+    reward: str = Field("", description="one of the rewards that the task declares")
+    observation: str = Field("", description="one of the observations that the task declares")
     difficulty: str = Field(STANDARD, description="one of the difficulties that the task declares")
     action_repeat: Integer = Field(1, ge=1, description="control steps per action")
     control_period: Number | None = Field(
@@ -101,12 +101,12 @@ class PrimitiveOptions(Options):
     )
     # The factorization of a step takes O(P² + H³) time. The limits of P and H keep a task with six outputs below half a
     # minute and 1 GB.
-    history: Integer = Field(10, ge=1, le=200, description="P, past outputs that sKGRL's motion passes through")
+    history: Integer = Field(10, ge=1, le=200, description="P, number of past outputs through which sKGRL moves")
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], variance of the past outputs")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="poses that form the history")
     adaptive_history: bool = Field(False, description="shorten the history during contact")
     gains: Numbers | None = Field(None, description="raw null-space units per action; default: computed from κ")
-    horizon: Integer = Field(40, ge=0, le=200, description="H, future points at which constraints are satisfied")
+    horizon: Integer = Field(40, ge=0, le=200, description="H, number of future points with constraints")
     lambda_: Number = Field(6.0, ge=0, description="λ of the thesis's problem 4.5")
     beta: Number = Field(6.0, gt=0, description="β of the thesis's problem 4.5")
     kernel: str = Field(DEFAULT_KERNEL, description="name of a registered kernel k(ζ, ζ')")
@@ -262,7 +262,7 @@ def check_choice(name: str, value: Any, choices: list[str], context: str) -> str
 
 
 def describe_options(model: type[BaseModel] | None) -> list[dict[str, Any]]:
-    """Return a row for each option of a model: name, type, default, range and description."""
+    """Return a row for each option of a model: name, type, default, choices, range and description."""
     if model is None:
         return []
     properties = model.model_json_schema()["properties"]

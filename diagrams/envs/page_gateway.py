@@ -35,7 +35,7 @@ HOST = "127.0.0.1"
 MAX_MESSAGE = 10_000  # largest message of a browser [bytes]; a gamepad message has a few hundred
 MAX_WAITING = 100_000  # longest queue of a slow browser [frames] before it is disconnected; it then connects again
 MAX_GAMEPAD = 64  # largest number of gamepads, and of axes and buttons of each
-ASSET_PERIOD = 3.0  # period of requests that keep the asset connection open; Meshcat closes an idle one [s]
+ASSET_PERIOD = 3.0  # period of requests on the asset connection [s]; Meshcat closes a connection without requests
 
 Controls: TypeAlias = Mapping[str, tuple[float, float] | None]
 """Range of each slider; None for a button."""
@@ -154,7 +154,7 @@ class Gateway:
     """Server of a page; it is the only client of Meshcat's server.
 
     Args:
-        port: Port of Meshcat's server. When that server has been closed, the page has this port if it is still free.
+        port: Port of Meshcat's server. After this port has been closed, the page uses it if it is still free.
         token: Secret part of the page's address.
         files: Paths of the page's files by name.
     """

@@ -20,7 +20,14 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """Station and recorder; the desired pose (6,) is the output of a system, sampled once per control period."""
+    """Station and recorder; the desired pose (6,) is the output of a system, sampled once per control period.
+
+    Attributes:
+        station: Driven station.
+        recorder: Recorder of `SIGNALS`.
+        diagram: Diagram of station, source and recorder.
+        simulator: Simulator of this diagram.
+    """
 
     def __init__(self, station: Station, source: System, num_samples: int):
         """Construct the diagram and its simulator.
@@ -54,7 +61,7 @@ class DrivenStation:
         return self.station.plant.GetMyMutableContextFromRoot(self.context)
 
     def start(self, pose: np.ndarray) -> None:
-        """Put the tool center at rest at `pose`, (6,), and initialize; call it before `run`."""
+        """Put the tool center at rest at `pose`, (6,), and initialize the simulator; required before `run`."""
         self.station.set_pose(self.context, pose)
         self.simulator.Initialize()
 
