@@ -25,12 +25,12 @@ LIMIT_FACTOR = 2.0  # default limits of a guard, relative to the largest speed a
 
 
 def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits of velocity and jerk of a guard, (O,) each.
+    """Return the limits of velocity and jerk of a guard, (O,) each, in units of the outputs per s and s³.
 
     Args:
         config: Configuration with the demonstrations, for the default limits, and the speed limits.
-        max_jerk: Jerk limits: one (positions; angles have the default), two (positions, angles), or O; () for the
-            default.
+        max_jerk: One limit for positions, two limits for positions and angles, or O limits. Angles have the default if
+            only one limit is given; () gives all outputs the default.
 
     Raises:
         InputError: If the motion has constraints other than linear bounds and speed limits, or `max_jerk` has another

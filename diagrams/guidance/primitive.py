@@ -17,7 +17,7 @@ from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
-    """Return the prior's demonstrations, which the kind of guidance requires."""
+    """Return the configuration of the prior's primitive; the kind of guidance requires demonstrations."""
     assert prior.demonstrations is not None
     return prior.demonstrations
 

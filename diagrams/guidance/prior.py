@@ -48,7 +48,8 @@ class PrimitiveConfig:
     Attributes:
         reference: Reference trajectory of the demonstrations, in steps of the control period.
         constraints: G y ≥ c on every command.
-        motion: Further constraints of the commanded motion, enforced behind the primitive; None if there are none.
+        motion: Further constraints of the commanded motion, enforced on the output of the primitive; None if there are
+            none.
         control_period: Control period [s].
         history: P, number of past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
@@ -69,6 +70,10 @@ class PrimitiveConfig:
         keep_out: Walls that safe residual learning stops at, if the task provides any.
         progress: Rule by which the motion waits for the robot; None if the clock drives the motion.
         wrench_size: W, size of a measured wrench.
+
+    Raises:
+        InputError: If an attribute is out of range, or the motion waits for the robot while constraints differ from
+            step to step.
     """
 
     reference: ReferenceTrajectory
@@ -142,7 +147,7 @@ class PrimitiveConfig:
         return replace(self, history=history).primitive(history=True)
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
-        """Return the movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""
+        """Return the movement primitive of sKGRL (with history), of KGRL (without) or of the mean (unconstrained)."""
         return get_shared_primitive(
             self.reference,
             self.constraints if constrained else LinearConstraints.none(self.num_outputs),
