@@ -78,7 +78,10 @@ class IntervalHistogram:
         self.longest = max(self.longest, seconds)
 
     def quantile(self, share: float) -> float:
-        """Return the `share` quantile of the intervals [s], with a resolution of 0.1 ms; NaN without intervals."""
+        """Return the `share` quantile of the intervals [s], with a resolution of 0.1 ms; NaN without intervals.
+
+        Intervals of more than 0.1 s count as 0.1 s.
+        """
         total = self._counts.sum()
         if not total:
             return np.nan
@@ -122,8 +125,11 @@ class WallClock(Clock):
     def __init__(self, driver: Driver, period: float | None = None, rate: float = 1.0):
         """Construct the clock.
 
-        The period of a step [s] is the driver's by default. The rate of the robot's clock relative to the wall clock
-        is at most 1; it is lower for a simulated robot that is slower than real time.
+        Args:
+            driver: Driver whose statuses advance the station.
+            period: Period of a step [s]; the driver's by default.
+            rate: Rate of the robot's clock relative to the wall clock, at most 1; lower for a simulated robot that is
+                slower than real time.
 
         Raises:
             InputError: If the rate is out of range, or the driver cannot receive in this environment.
@@ -142,7 +148,7 @@ class WallClock(Clock):
         self._due = self._last_step + self._period / self._rate
 
     def _wait_for_step(self) -> float:
-        # Sleep first, so that a driver that sends too often does not set the pace.
+        # Sleep first: without this pause, a driver that sends more often than once a period would speed up the clock.
         period = self._period / self._rate
         time.sleep(max(self._due - 0.5 * period - time.monotonic(), 0.0))
         end = self._last_step + 1.5 * period

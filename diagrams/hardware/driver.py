@@ -20,7 +20,7 @@ from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.robot import Robot
 from guiderail.systems.torque_safety_limiter import SafetyLimits
 
-STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers, 5 ms [s]; a control period is an exact multiple
+STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers [s], 5 ms; a control period is an exact multiple
 POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 
 # Limits of the commanded and the external torque as shares of the driver's reflex limits, and of the joint velocity as
@@ -130,7 +130,11 @@ class Driver(ABC):
         return ()
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Send a heartbeat of the safety monitor."""
+        """Send a heartbeat of the safety monitor.
+
+        Raises:
+            InputError: If the driver transports no heartbeats.
+        """
         raise InputError(f"the driver {self.name} transports no heartbeat of a safety monitor")
 
     def __str__(self) -> str:

@@ -26,14 +26,14 @@ logger = logging.getLogger(__name__)
 # Limits of the commands: a fifth of the robot's linear and four fifths of its angular velocity, and half of its
 # accelerations and jerks. A single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
 MOTION_LIMITS = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
-NO_ERRORS = "[]"  # the client's text of a robot without errors
+NO_ERRORS = "[]"  # the client's list of errors as text, if the robot has none
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
 POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
 # Collision thresholds of the robot, relative to the impedance's largest wrench along an axis. The force threshold is at
 # least that of libfranka's examples [N], because the robot's estimate is off by some newtons. In simulation a plug that
-# drops from a rim into its hole ends with an impact of 1.9 times that wrench (28 N, where it is 15 N; eight episodes).
+# drops from a rim into its hole ends with an impact of 1.9 times that wrench (28 N instead of 15 N; eight episodes).
 FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 2.5, 20.0
 MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
@@ -53,13 +53,15 @@ class FciDriver(PoseDriver):
     name = "panda"
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
-    hold_off = 0.25  # not needed by the robot; statuses are checked before the arm is controlled
+    hold_off = 0.25  # statuses are checked for this time before the first command [s]; the robot needs no pause
     motion_limits = MOTION_LIMITS
 
     def __init__(self, url: str = "", *, client: Any = None):
-        """Construct the driver of the robot at a host or address; the first `read` connects to it.
+        """Construct the driver; the first `read` connects to the robot.
 
-        The client is the module franky, or a test double of it.
+        Args:
+            url: Host name or address of the robot.
+            client: The module franky, or a test double of it; imported by default.
 
         Raises:
             InputError: If franky is not installed, or `url` is empty.

@@ -53,7 +53,7 @@ class FciLockstepClock(Clock):
     def _follow(self, seconds: float) -> None:
         """Let the robot advance by `seconds`; add its progress to the time base, or `seconds` if it is unknown."""
         answer = self._request({"advance": seconds})
-        if answer is None or answer < self._robot_time:  # no answer, or the first one of a robot
+        if answer is None or answer < self._robot_time:  # no answer, or the first answer of a robot
             self._time += seconds
         else:
             self._time += answer - self._robot_time

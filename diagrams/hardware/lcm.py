@@ -28,7 +28,7 @@ HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time 
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
 HEARTBEAT_FORMAT = struct.Struct(">q?q")
 # A safety monitor has ended if this many heartbeats of others arrived after its last one. `MAX_SENDERS` monitors send
-# them in `FORGET_TIME`.
+# this number of heartbeats in `FORGET_TIME`.
 MAX_HEARTBEATS_MISSED = MAX_SENDERS * round(FORGET_TIME / STATUS_PERIOD)
 
 
@@ -85,7 +85,7 @@ def check_handlers() -> None:
 
 
 class MessageCounter:
-    """Counter of the messages of a channel; messages of the same type and time count once, even with other torques.
+    """Counter of the messages of a channel; messages of the same type and time count once, whatever their torques.
 
     Attributes:
         count: Number of different messages.
@@ -132,7 +132,8 @@ class LcmDriver(Driver):
         self._status: JointStatus | None = None  # newest status
         self._sequence = StatusSequence(self.period)
         self._num_contested = 0  # foreign commands after the first command of this program
-        # Newest heartbeat, number of its channel, and its place among all heartbeats, by sender; latest sender last.
+        # By sender: newest heartbeat, number of its channel, and number of heartbeats of all senders up to it. The last
+        # entry is the sender that was received last.
         self._heartbeats: dict[int, tuple[Heartbeat, int, int]] = {}
         self._num_heartbeats = 0
         self._number = 0  # number of the channel of this program's heartbeat
@@ -251,7 +252,8 @@ class LcmDriver(Driver):
             is_older = heartbeat.sequence < newest.sequence
             self._num_heartbeats += 1
             self._heartbeats[heartbeat.sender] = (newest if is_older else heartbeat), number, self._num_heartbeats
-            # A monitor that ended during a stop must not excuse the commands of other programs forever.
+            # While a monitor stops the arm, commands do not count as foreign. A monitor that ended during a stop is
+            # therefore removed.
             while len(self._heartbeats) > MAX_SENDERS or self._num_missed() > MAX_HEARTBEATS_MISSED:
                 self._heartbeats.pop(next(iter(self._heartbeats)))
 

@@ -116,8 +116,11 @@ class LockstepClock(Clock):
     def __init__(self, driver: LcmDriver, command_timeout: float, period: float | None = None):
         """Construct the clock.
 
-        A step waits at most `command_timeout` [s of wall clock time] for its status. After that the step is made
-        without a status, which the station's watchdog detects. The period of a step [s] is the driver's by default.
+        Args:
+            driver: Driver whose statuses advance the station.
+            command_timeout: Longest wait of a step for its status [s of wall clock time]. After that the step is made
+                without a status, which the station's watchdog detects.
+            period: Period of a step [s]; the driver's by default.
 
         Raises:
             InputError: If the driver cannot receive in this environment.
@@ -169,7 +172,7 @@ def serve_in_lockstep(
         robot_lcm: Bus of the arm and its safety monitor, in memory.
         lcm: Bus shared with the other process.
         seconds: Simulated time to run [s].
-        command_timeout: Longest wall clock time to wait for each acknowledgement, and ten times that for the first [s].
+        command_timeout: Longest wall clock time to wait for an acknowledgement [s]; ten times as long for the first.
         after_status: Function that is called after every status, for a safety monitor.
 
     Returns:

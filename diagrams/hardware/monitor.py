@@ -30,18 +30,19 @@ class MonitorState(IntEnum):
 
 MAX_REPEATS = 2  # largest number of repetitions of the monitor's torque between two checks
 
+# Faults after which the monitor stops the arm.
 STOP_FAULTS = frozenset({*STATUS_FAULTS, Fault.SECOND_COMMANDER} - {Fault.NO_STATUS})
 
 
 class SafetyMonitor:
-    """Watch the statuses and commands of a robot, and damp the arm to rest when commands stop or a status is wrong.
+    """Monitor of a robot's statuses and commands that damps the arm to rest when commands stop or a status is wrong.
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
     lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
     `StateEstimator` as the station, by a clock of its own, and sends a heartbeat with every check, so that a commanding
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
-    (`CommandSequence`): the arm is kept without torque until only one program sends. During a stop the monitor sends
-    torques even if no status arrives, so that the driver never repeats a torque.
+    (`CommandSequence`): the arm is damped, and then has no torque until only one program sends. During a
+    stop the monitor sends torques even if no status arrives, so that the driver never repeats a torque.
 
     Attributes:
         state: Current state.

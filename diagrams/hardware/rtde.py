@@ -29,7 +29,7 @@ from guiderail.systems.support.drake_multibody import transform_to_vector
 
 logger = logging.getLogger(__name__)
 
-EXTERNAL_TORQUE_LIMITS = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # external joint torques for `torque_reflex_limits` [Nm]
+EXTERNAL_TORQUE_LIMITS = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # largest external joint torques [Nm]
 # Defaults of URScript's movel: 0.25 m/s, 1.2 m/s², 1.05 rad/s, 1.4 rad/s²; each acceleration is reached in 0.1 s.
 # Universal Robots publishes no limits of a commanded jerk.
 UR_MOTION_LIMITS = MotionLimits((0.25, 1.2, 12.0), (1.05, 1.4, 14.0))
@@ -39,7 +39,8 @@ MAX_POSE_DIFFERENCE = 0.02  # largest distance of the robot's calibrated tool ce
 NO_TRANSFORM = 2  # argument `type` of forceMode: the force frame is not transformed
 RECOVERY_TIME = 2.0  # longest wait for the status after a recovery [s]
 NUM_ATTEMPTS = 10  # attempts to read values that belong to one message
-# The controller's frame "base" is rotated by 180° about z from the model's, where the arm points along +x at zero.
+# The controller's frame "base" is rotated by 180° about z from the model's base frame. In the model's frame, the arm
+# points along +x if all joint positions are zero.
 X_ControllerBase = RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0.0, 0.0, 0.0])
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "actual_TCP_force", "actual_TCP_pose", "safety_status_bits"]
 
@@ -125,7 +126,7 @@ class RtdeDriver(PoseDriver):
         self._check(self._control.zeroFtSensor(), "zeroing of the force sensor")
 
     def read(self) -> JointStatus | None:
-        """Return the newest status, or None if none has been read yet."""
+        """Return the newest status, malformed after a stop or a lost connection; None before the robot answers."""
         if self._is_lost:
             return MALFORMED_STATUS
         if self._receiver is None:
@@ -220,7 +221,7 @@ class RtdeDriver(PoseDriver):
             self._stopping.start()
 
     def _stop_force_mode(self) -> None:
-        """Leave force mode. If the robot refuses, its watchdog is not fed any more, and ends its program."""
+        """Leave force mode; if the robot refuses, its watchdog is not reset any more, and ends its program."""
         try:
             has_stopped = bool(self._control.forceModeStop())
         except Exception:  # the client raises RuntimeError and its own types
@@ -255,7 +256,7 @@ class RtdeDriver(PoseDriver):
             raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
 
     def _keep_alive(self, time: float) -> None:
-        """Feed the controller's watchdog while no wrench is commanded."""
+        """Reset the controller's watchdog at each new status while no wrench is commanded."""
         is_new = self._status is None or time != self._status.time
         is_stopping = self._has_failed_to_stop or (self._stopping is not None and self._stopping.is_alive())
         if is_new and self._control is not None and not self._is_active and not is_stopping:

@@ -81,7 +81,7 @@ class HardwareStation(Station):
     =====================  =====  =====================================================================================
 
     Attributes:
-        driver, period, limits, status_limits, impedance: As given to the constructor, or by default.
+        driver, period, control_period, limits, status_limits, impedance: As given to the constructor, or by default.
         controller_plant: The arm as the controller models it.
     """
 
