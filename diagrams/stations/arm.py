@@ -86,7 +86,7 @@ def controller_model(
     robot: Robot | str = DEFAULT_ROBOT,
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
 ) -> tuple[MultibodyPlant, ArmModel]:
-    """Return the controller's plant: arm, tool and workpiece without fixture, offsets and joints of the tool.
+    """Return the controller's plant, with arm, tool and workpiece but no fixture, offsets or tool joints, and its arm.
 
     Raises:
         InputError: If the robot's model has other joints than those in `Robot.joints`.
@@ -125,7 +125,7 @@ class ArmControllerPlant(ControllerPlant):
 def add_gripper_control(
     builder: DiagramBuilder, plant: MultibodyPlant, arm: ArmModel, end_effector: EndEffector, period: float
 ) -> tuple[InputPort, OutputPort]:
-    """Add the drives of a gripper; return the ports of their desired positions and of their measured state."""
+    """Add the drives of a gripper, sampled with `period` [s]; return the ports of desired positions and state."""
     joints = [actuator.joint() for actuator in arm.gripper]
     lower = np.concatenate([joint.position_lower_limits() for joint in joints])
     upper = np.concatenate([joint.position_upper_limits() for joint in joints])

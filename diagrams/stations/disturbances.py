@@ -31,7 +31,7 @@ from guiderail.systems.wrench_tare import WrenchTare
 
 SIMULATION_PORTS = ("query", "body_poses")
 EXACT_WRENCH = "exact_wrench"
-"""Port of the wrench without errors of sensors, (6,)."""
+"""Port of the wrench without sensor errors, (6,)."""
 
 
 class DisturbedStation(Station):
@@ -162,7 +162,8 @@ class DisturbedStation(Station):
         """Sample wrench delay, wrench gradient, calibration and the inner station's errors; return them by name."""
         e = self._errors
         delay = int(rng.integers(e.wrench_delay[0], e.wrench_delay[1], endpoint=True))
-        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))  # position: negligible within a few centimeters
+        # Within a few centimeters, the gradient over position is negligible.
+        gradient = np.zeros((WRENCH_SIZE, POSE_SIZE))
         gradient[:, 3:] = rng.uniform(-1.0, 1.0, (WRENCH_SIZE, 3)) * np.repeat(e.wrench_gradient, 3)[:, None]
         calibration = rng.uniform(-1.0, 1.0, POSE_SIZE) * np.repeat(e.calibration_error, 3)
         if self._delay is not None:

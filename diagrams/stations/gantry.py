@@ -49,7 +49,7 @@ GANTRY_JOINTS = (
 )
 # Mass [kg] and moment of inertia [kg m²] of the moving tool, as an arm with inertia shaping has at its tool.
 CARRIAGE_MASS, CARRIAGE_INERTIA = 1.5, 2e-3
-MASSES = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)  # those of each joint
+MASSES = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)  # mass or moment of inertia that each joint moves
 # Mass [kg] and radius [m] of a link between two joints; massless links would make the plant's mass matrix singular.
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 

@@ -86,7 +86,7 @@ def add_energy_tank(
 def make_phase_wrench_limit(
     template: SharedControlTemplate, impedance: Impedance | None, period: float
 ) -> PhaseWrenchLimit | None:
-    """Return the system that limits the wrench as the template's current state demands; None if no state has a limit.
+    """Return the system that limits the wrench to the limits of the template's current state; None without any limit.
 
     Args:
         template: Shared control template.

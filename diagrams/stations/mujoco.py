@@ -40,7 +40,7 @@ FIXTURE, TOOL, WORKPIECE = "fixture", "tool", "workpiece"
 """Names of the model's bodies. The workpiece is the tool's child; the first six joints of the model are the tool's."""
 
 CENTERED: dict[str, Any] = {"ipos": [0.0, 0.0, 0.0], "explicitinertial": True}  # center of mass at a body's origin
-MAX_PAIRS = 31  # number of bits of a contact mask
+MAX_PAIRS = 31  # number of bits of a contact mask, a signed integer of 32 bits, without the sign
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Options of stations, errors of sensors, and disturbances of a simulated station; nothing here imports Drake.
 
-A station's sensors have named settings: exact, a wrist force-torque sensor, or an arm's joint torque sensors. Data
-sheets and papers that their numbers come from, by their number in docs/bibliography.md:
+A station's sensors have named settings: exact, a wrist force-torque sensor, or an arm's joint torque sensors. Sources
+of their numbers, with references to docs/bibliography.md:
 
 - An arm with joint torque sensors [25]: at the tool a noise of 0.035 N and 0.005 Nm, a repeatability of 0.15 N and
   0.05 Nm, and an accuracy of 0.8 N and 0.15 Nm.
@@ -29,10 +29,10 @@ from guiderail.models.common.arrays import round_period
 from guiderail.models.common.transforms import MM
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 
-CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
-MAX_HALVINGS = 7
+CONTROL_PERIOD = 4 * round_period(0.005)  # default time between commands [s]
+MAX_HALVINGS = 7  # largest number of halvings of `CONTROL_PERIOD` to a plant's time step
 ImpedanceControl = Literal["joint", "cartesian"]
-MAX_CALIBRATION_ERROR = 0.01  # [m], [rad]; a larger one is probably in millimeters or degrees
+MAX_CALIBRATION_ERROR = 0.01  # largest error [m], [rad]; a larger one is probably in millimeters or degrees
 MAX_FACTOR = 100.0
 """Largest factor of a disturbance; its inverse is the smallest factor of a sampled range."""
 
@@ -41,7 +41,10 @@ class ContactOptions(Options):
     """Options of a station that simulates the contact of an insertion."""
 
     time_step: Number | None = Field(
-        None, gt=0, description="time step of the plant [s]: the control period, or half, a quarter, an eighth … of it"
+        None,
+        gt=0,
+        description=f"time step of the plant [s]: {CONTROL_PERIOD:g}, or half, a quarter, an eighth … of it, "
+        "which divides control_period",
     )
 
     @field_validator("time_step")
@@ -52,8 +55,7 @@ class ContactOptions(Options):
         halvings = np.log2(CONTROL_PERIOD / value)
         if abs(halvings - round(halvings)) > 1e-6 or not 0 <= round(halvings) <= MAX_HALVINGS:
             raise ValueError(
-                f"it is the control period, {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} "
-                "times halved"
+                f"it is {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} times halved"
             )
         # Multiples of this value are exact: see `round_period`.
         return CONTROL_PERIOD / 2 ** round(halvings)
@@ -62,8 +64,8 @@ class ContactOptions(Options):
 class ArmOptions(ContactOptions):
     """Options of the arm station."""
 
-    robot: str = Field(DEFAULT_ROBOT, description="arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="tool on the flange")
+    robot: str = Field(DEFAULT_ROBOT, description="name of the arm")
+    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="name of the tool on the flange")
 
 
 class GantryOptions(ContactOptions):
@@ -79,8 +81,8 @@ class GantryOptions(ContactOptions):
 class HardwareOptions(Options):
     """Options of a station with a real arm."""
 
-    robot: str = Field(DEFAULT_ROBOT, description="arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="tool on the flange")
+    robot: str = Field(DEFAULT_ROBOT, description="name of the arm")
+    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="name of the tool on the flange")
     driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
     robot_url: str = Field("", description="LCM URL of the driver's bus, or host of the robot; default: LCM's default")
     robot_timeout: Number = Field(10.0, gt=0, description="longest wait for the robot's first status [s]")
@@ -185,8 +187,8 @@ def _sensor_error(description: str) -> Any:
 class Disturbances(Options):
     """Options of environments with a workcell: constant disturbances, and ranges that every episode samples from.
 
-    A policy can be trained with one range and evaluated with another. `sensing` names a setting of all sensor errors;
-    an error that is given as well replaces that of the setting.
+    A policy can be trained with one range and evaluated with another. `sensing` names a setting of all sensor errors.
+    An option of a single error replaces this error of the setting.
     """
 
     sensing: Sensing = Field(
@@ -232,7 +234,7 @@ class Disturbances(Options):
 
     @property
     def errors(self) -> SensorErrors:
-        """Errors of the sensors: those of `sensing`, with the given ones in their place.
+        """Errors of the sensors: the setting `sensing`, in which options of single errors replace the setting's errors.
 
         Joint torques have errors of their own. A given `wrench_scale` replaces their gain, `wrench_bias` their offset
         and the errors of the arm's model, `wrench_drift` their drift and friction, `wrench_noise` their noise.

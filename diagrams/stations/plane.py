@@ -46,13 +46,13 @@ class PlaneConfig:
     mass: float = 0.001  # mass of the robot [kg]
     max_force: float = 50.0  # largest force of each joint [N]
     max_speed: float = 10.0  # largest speed of each joint [m/s]
-    # Friction between robot and walls; high, so that a robot pressed against a wall does not slide.
+    # Friction coefficient between robot and walls; high, so that a robot pressed against a wall does not slide.
     friction: float = 10.0
     stiffness: float = 1e6  # stiffness of the contact [N/m]
 
     @property
     def control_period(self) -> float:
-        """Time of a control step [s]."""
+        """Duration of a control step [s]."""
         return self.substeps * self.plant_period
 
     @property

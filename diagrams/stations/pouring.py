@@ -134,6 +134,11 @@ class PouringStation(Station):
     wraps_angles = True
 
     def __init__(self, config: PouringConfig):
+        """Construct the station.
+
+        Raises:
+            InputError: If the data of the robot have no drives or no level posture.
+        """
         super().__init__()
         builder = DiagramBuilder()
         self.config = config
@@ -231,7 +236,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     X_PHand = config.X_FlangeP.inverse() @ RigidTransform([0.0, 0.0, length / 2])
     add_shape(plant, thermos, "hand", X_PHand, Cylinder(0.03, length), METAL)
     for model in (arm.model, thermos.model_instance()):
-        # The integrators of a position-controlled arm compensate gravity.
+        # On a real arm under position control, integral action compensates gravity.
         plant.set_gravity_enabled(model, False)
     if config.arm.drives is not None:
         add_drives(arm.actuators, config.arm.drives)

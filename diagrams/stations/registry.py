@@ -1,4 +1,4 @@
-"""Stations by name, for `station=`."""
+"""Registry of stations; the names are the values of the option `station`."""
 
 from __future__ import annotations
 

@@ -11,16 +11,16 @@ input              size   meaning
                           and norm of the torque [N, Nm]; lowers the bound of the impedance
 =================  =====  ==========================================================================================
 
-=================  =====  ==========================================================================================
-output             size   meaning
-=================  =====  ==========================================================================================
-`pose`             6      measured pose X_TP, in the same coordinates
-`wrench`           6      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
-                          N and Nm, without the tool's weight and inertia, low-pass filtered
-`contact_force`    1      magnitude of the impedance's force [N], by which collisions are detected
-`saturation`       1      1 while the controller is at a limit of force or torque, otherwise 0
-`command_timed_out`  1    1 while commands are missing or not finite, and the last safe pose is held
-=================  =====  ==========================================================================================
+===================  =====  ========================================================================================
+output               size   meaning
+===================  =====  ========================================================================================
+`pose`               6      measured pose X_TP, in the same coordinates
+`wrench`             6      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
+                            N and Nm, without the tool's weight and inertia, low-pass filtered
+`contact_force`      1      magnitude of the impedance's force [N], by which collisions are detected
+`saturation`         1      1 while the controller is at a limit of force or torque, otherwise 0
+`command_timed_out`  1      1 while commands are missing or not finite, and the last safe pose is held
+===================  =====  ========================================================================================
 
 A simulated station also has `query` (of the scene graph) and `body_poses` (of the plant), for cameras, rewards and
 terminations.
@@ -62,18 +62,22 @@ OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 """Output ports of every station; `INPUTS` are the input ports."""
 
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
-PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
+PLANT_PERIOD = CONTROL_PERIOD / 2  # default time step of a plant [s]
 TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
 COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; two control periods if that is longer
 
-# Force limits along x, y and z as fractions of the limit of the norm; the box of these limits lies inside the ball.
+# Force limits along x, y and z as fractions of the limit of the norm. The norm of the three fractions is below 1.
 FORCE_SHARES = (0.45, 0.45, 0.75)
 CONTACT_STIFFNESS = 1e5  # stiffness of workpiece, grasp and fixture in series during an impact [N/m]
 
 
 @dataclass(frozen=True)
 class Impedance:
-    """Impedance at the tool center along and about the axes of T, [x y z Rz Ry Rx]."""
+    """Impedance at the tool center along and about the axes of T, [x y z Rz Ry Rx].
+
+    Raises:
+        InputError: If stiffness or limits are not six positive numbers, or the damping ratio is not positive.
+    """
 
     stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)  # stiffness [N/m], [Nm/rad]
     damping_ratio: float = 1.0  # damping ratio of every mode
