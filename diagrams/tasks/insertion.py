@@ -40,7 +40,7 @@ LIMIT_CENTER, LIMIT_SCALE = 20.0, 10.0
 
 HIDDEN_OFFSET_SCALE = (2.0 * MM, 2.0 * MM, 0.1)
 EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
-"""Scales of a privileged critic's observation: x, y and turn of the fixture, force and torque."""
+"""Scales of a privileged critic's observation: x, y [m] and turn [rad] of the fixture, force [N] and torque [Nm]."""
 
 
 GivenOffset = Annotated[
@@ -67,6 +67,7 @@ class HoldTest:
     max_motion: float  # largest measured motion in its direction [m]
 
 
+# Displacement of the command in a hold test, and largest motion of a workpiece that resists it [m].
 HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM
 
 

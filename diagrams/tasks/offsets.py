@@ -61,11 +61,12 @@ _REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 
 
 class HiddenOffsets(ABC):
-    """Sampler of the actual offsets of fixture and workpiece at every reset, (2,) [m] in the target frame's xy.
+    """Sampler of the actual offsets of fixture and workpiece at every reset.
 
-    A run begins at the first reset, and at every reset with the option `new_run`. The option `held_out` samples the
-    episode from a random stream that training never uses; the run's hidden offset stays the same. The option `offset`
-    (x, y) [m] replaces the sample.
+    An offset is (x, y) [m] in the target frame, after which a subclass may have angles [rad]; see `part_poses`. A
+    run begins at the first reset, and at every reset with the option `new_run`. The option `held_out` samples the
+    episode from a random stream that training never uses; the run's hidden offset stays the same. The option
+    `offset` (x, y) [m] replaces the sample.
     """
 
     def __init__(self, kind: str = "per_run"):
@@ -74,7 +75,7 @@ class HiddenOffsets(ABC):
         self._run: Any = None
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the offsets (2,) [m] of fixture and workpiece; `options` is an instance of `InsertionReset`."""
+        """Return the offsets of fixture and workpiece, (2,) or longer; `options` is an instance of `InsertionReset`."""
         # Every reset takes equally many numbers from `rng`, used or not: an episode's samples depend only on its seed.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)

@@ -89,7 +89,7 @@ class BncUncertainty(HiddenOffsets):
 
 ALIGNMENT = 2.0 * MM  # largest |x| and |y| of every command: equation 4.26
 NOMINAL = BncDimensions()
-SHIPPED = ("insert", "search", "firm_search")  # demonstrations
+SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in this package
 
 
 class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):

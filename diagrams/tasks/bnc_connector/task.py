@@ -138,7 +138,8 @@ class BncWorkcell(MovableWorkcell):
     def is_locked(X_LockedPlug: RigidTransform) -> bool:
         """Return True if a plug is within 0.6 mm of the locked pose along its axis, and 4 degrees about it.
 
-        The lugs are then past the apex of the slots, and only a torque unlocks the plug.
+        `X_LockedPlug` is the pose of the plug relative to its locked pose. The lugs of a locked plug are past the apex
+        of the slots, and only a torque unlocks it.
         """
         yaw = RollPitchYaw(X_LockedPlug.rotation()).yaw_angle()
         return bool(abs(X_LockedPlug.translation()[2]) < LOCKED_HEIGHT and abs(yaw) < LOCKED_ANGLE)
@@ -189,7 +190,10 @@ MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the 
 
 
 def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
-    """Return an action (2,) in x and y along (−τ_y, τ_x) of the contact torque on the rim, towards the jack."""
+    """Return an action (2,) in x and y along (−τ_y, τ_x), with the contact torque τ, while the plug is on the rim.
+
+    On the rim this direction points towards the jack's axis. Elsewhere the action is zero.
+    """
     step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
     is_on_rim = observation[Z] > SCALED_RIM and observation[FORCE_Z] > CONTACT_FORCE
     if not (PRESSING[0] < step < PRESSING[1] and is_on_rim):

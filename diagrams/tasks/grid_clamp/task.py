@@ -104,7 +104,7 @@ class GridClampWorkcell(MovableWorkcell):
 
 
 SUCCESS_REWARD = 50.0
-SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
+SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # reward per distance descended [1/m], cost per squared force [1/N²]
 # Reward per distance gained towards the holes' axis [1/m], large because steps are fractions of a millimeter.
 # Terminal reward of a collision. It makes an early collision cost more than a long episode of gentle pressing.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
@@ -164,7 +164,9 @@ class GridClampUncertainty(HiddenOffsets):
 
 SEATED_STEPS = 3  # consecutive control steps that count as seated
 
-MAX_TRACKING_ERROR = 8.0 * MM  # the impedance then pushes with 12 N, twice the force needed to snap in
+# Largest distance between robot and command [m]. At this distance the impedance pushes with 12 N, twice the force that
+# snapping in needs.
+MAX_TRACKING_ERROR = 8.0 * MM
 
 START_OFFSET = 0.2 * MM  # largest offset of the start along x and y
 
@@ -182,7 +184,8 @@ PAST_LANES = 0.3 * MM  # overshoot along y from lane to lane; a clamp beyond the
 PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
 SNAP_FORCE = 12.0  # largest force while the clamp snaps in [N]
 GENTLE_SNAP_FORCE = 8.5  # largest force while the clamp snaps in, for a force limit of 10 N [N]
-HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N], [m/s/N] and [1/s]
+# Vertical speed per force error and lateral speed per force [m/s/N], and speed per distance from a lane [1/s].
+HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0
 TEMPLATE = load_template("grid_clamp")  # template of the thesis, section 3.4.2
 SPEED = TEMPLATE.parameters["speed_m_per_s"]  # speed at an input of 1
 LIFT = TEMPLATE.parameters["lift"]  # fraction of `SPEED` at an upward input of 1
@@ -218,7 +221,7 @@ def _lane_velocity(xy: np.ndarray) -> np.ndarray:
     forward = 1.0 if lane % 2 == 0 else -1.0
     if forward * xy[0] < LANE_ENDS - 0.1 * MM:
         return np.array([forward * SEARCH_SPEED, LANE_GAIN * (LANES[lane] - xy[1])])
-    # Slower towards the next lane: because the force is delayed, the clamp would otherwise overshoot this lane.
+    # The speed falls towards the next lane. Otherwise the clamp would overshoot it, because the force is delayed.
     return np.array([0.0, LANE_GAIN * (LANES[min(lane + 1, len(LANES) - 1)] + PAST_LANES - xy[1])])
 
 

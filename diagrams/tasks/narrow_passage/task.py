@@ -113,7 +113,7 @@ class NarrowPassage(Task):
         Metric(
             "avoids_obstacle_from",
             "episode",
-            "first of five consecutive episodes whose obstacle cost is below 1, from 1",
+            "number, from 1, of the first of five consecutive episodes whose obstacle cost is below 1",
             avoids_obstacle_from,
         ),
     )

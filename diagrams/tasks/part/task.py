@@ -104,7 +104,11 @@ class PartWorkcell(MovableWorkcell):
         return self._surfaces(SOCKET, self.convex[1])
 
     def workpiece_surfaces(self) -> list[Surface]:
-        """Return the convex pieces of the plug; raises like `fixture_surfaces`."""
+        """Return the convex pieces of the plug.
+
+        Raises:
+            InputError: If the plug has no convex pieces.
+        """
         return self._surfaces(PLUG, self.convex[0])
 
     def _surfaces(self, body: str, files: Sequence[str]) -> list[Surface]:
@@ -127,7 +131,7 @@ TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15
 IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
 MIN_PUSH = 1.5 * MM  # smallest distance beyond the play by which a push displaces the command of a seated plug [m]
-FOLLOWING = 3.0  # action rate per 2 mm of distance from the command to a plug in the socket [1/s]
+FOLLOWING = 3.0  # rate of change of the action per distance of 2 mm between the command and a plug in the socket [1/s]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 

@@ -57,7 +57,7 @@ HARD: Mapping[str, Any] = {
 """Options of difficulty="hard": the template assumes a mug position with an error, which is sampled and observed."""
 
 
-MOST_BALLS = 8
+MOST_BALLS = 8  # largest number of balls
 
 
 class PouringOptions(Options):
@@ -135,6 +135,6 @@ class PouringReset(ResetOptions):
         None, description="(x, y, z) of the upright thermos's tip in the frame of the estimated mug [m]"
     )
     mug_position: Pair | None = Field(
-        None, description="(x, y) of the estimated mug position from its nominal position [m]"
+        None, description="(x, y) of the estimated mug position relative to its nominal position [m]"
     )
     mug_error: Pair | None = Field(None, description="(x, y) from the actual to the estimated mug position [m]")

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
 
 TERMINAL = {"success": 200.0, "collision": -10.0}  # equation 3.5
-SHAPING = 200.0  # equation 3.7
-APPROACH = 15.0  # [1/m] equation 3.9
+SHAPING = 200.0  # reward per progress of the template, equation 3.7
+APPROACH = 15.0  # reward per distance gained [1/m], equation 3.9
 NEAR_BONUS = 0.2  # bonus per action within `NEAR`
-TILT = 20.0  # [1/rad] equation 3.10
+TILT = 20.0  # reward per tilt [1/rad], equation 3.10
 NEAR = 0.07  # [m] distance of the tips at which pouring begins; the rims prevent the 0.04 m of the thesis
 POUR = 2  # index of the template's state Pour
 AIM = np.array([0.0, -0.045])  # [m] position of the tip in the mug's frame from which both balls fall into the mug
@@ -94,7 +94,7 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
     return np.array(reset.mug_error)
 
 
-MAX_TRACKING_ERROR = 0.05  # [m]
+MAX_TRACKING_ERROR = 0.05  # largest distance between robot and command [m]
 POURED_STEPS = 10  # consecutive steps of the default control period that count as poured
 # Start of the thermos in the frame of the mug's tip, inside the template's workspace.
 START_AZIMUTH_DEG = (-120.0, -75.0)
