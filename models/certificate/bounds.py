@@ -211,7 +211,8 @@ def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarra
     low, high = single_output_bounds(loop)
     lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)
     upper = np.where(is_corrected, np.minimum(corrected_bounds[1], high), free.upper)
-    # Values at each step and at the two steps before it; the robot rests within the start before the first step.
+    # Values at each step and at the two steps before it. Before the first step, the robot rests at a pose within the
+    # start.
     least = np.vstack([[loop.start - loop.start_within] * 2, lower])
     greatest = np.vstack([[loop.start + loop.start_within] * 2, upper])
     recent = np.vstack([np.zeros((2, lower.shape[1]), bool), is_corrected])

@@ -1,6 +1,6 @@
 """Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0 valid, 1 rejected, 2 unreadable.
 
-The checker bounds the commands y for all actions a. W h is the window's mean and C the kernel, given the history h:
+The checker bounds the commands y for all actions a. Given the history h, the window has the mean W h and the kernel C:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim

@@ -119,7 +119,7 @@ def compare_subject(
 ) -> str | None:
     """Return the name of the first difference between a certificate and a skill, or None.
 
-    All that the checker assumes is compared, except for the budget: the skill's description, kernel, period,
+    Everything that the checker assumes is compared, except for the budget: the skill's description, kernel, period,
     impedance, primitive, gains, start and constraints. `files` has the content of each file of a certificate that the
     checker accepts; the other arguments describe the skill as in `certificate_files`.
     """
@@ -146,7 +146,11 @@ def _checked_kernel(loop: CertifiedLoop) -> str:
 
 
 def _subject_arrays(loop: CertifiedLoop) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arrays of the primitive in its loop, and those of its constraints at every step."""
+    """Return the arrays of the primitive in its loop, and those of its constraints at every step.
+
+    Raises:
+        InputError: If the primitive's time steps are not equal.
+    """
     primitive, kernel = loop.primitive, cast(Any, loop.primitive.kernel)
     reference = primitive.reference
     if not reference.uniform:

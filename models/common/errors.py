@@ -69,7 +69,7 @@ EXTRAS = {module: (name, extra) for extra, modules in _SOFTWARE.items() for modu
 
 
 class MissingExtraError(InputError, ImportError):
-    """A dependency of an extra is not installed; the message names the command that installs it."""
+    """Error for a missing dependency of an extra; the message names the command that installs it."""
 
 
 def explain_missing(error: ImportError) -> MissingExtraError | None:

@@ -54,8 +54,8 @@ class Registry(Generic[Entry]):
         """Add an entry; without a value, return a decorator that adds the decorated object.
 
         Raises:
-            InputError: If the name is already used by an object that is defined elsewhere, also in a module of the
-                package that is not imported yet.
+            InputError: If an object that is defined elsewhere has this name already, or a module of the package that
+                is not imported yet declares it.
         """
         if value is None:
             return lambda decorated: self.register(name, decorated)
@@ -64,7 +64,7 @@ class Registry(Generic[Entry]):
         is_used, place = name in self._entries and existing != origin, existing[0]
         if self._decorator is not None and name not in self._entries and name in self._declarations:
             place = self._declarations[name].module
-            # Not used by another one: the declaring module is being imported, or is run under another name.
+            # The entry is that of the declaring module, which is being imported, or is executed under another name.
             is_used = place not in sys.modules and origin[0] != _file(place)
         if is_used:
             raise InputError(f"there is a {self.noun} {name!r} already, from {place}: choose another name")
@@ -205,7 +205,7 @@ def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, An
 
 
 def _assignments(body: Iterable[ast.stmt]) -> Iterator[tuple[str, ast.expr]]:
-    """Return the names and the assigned expressions of the attributes in the body of a class."""
+    """Yield the name and the assigned expression of each attribute in the body of a class."""
     for node in body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         value = getattr(node, "value", None)

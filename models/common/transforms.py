@@ -263,5 +263,5 @@ def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarr
     return np.array([x, y, z, cos_a * along - sin_a * about_y, sin_a * along + cos_a * about_y, about_z])
 
 
-MM = 1e-3  # [m]
-DEGREE = math.radians(1.0)  # [rad]
+MM = 1e-3  # one millimeter [m]
+DEGREE = math.radians(1.0)  # one degree [rad]
