@@ -6,7 +6,7 @@ LEVER = 0.25  # distance from the tool center that converts rotational to transl
 # Smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more.
 REGULAR = 0.03
 STILL = 1e-3  # desired tool speed up to which any motion is accepted [m/s]
-TOOL_SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])
+TOOL_SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])  # factors of a velocity [rotational, translational]
 
 
 def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -24,7 +24,7 @@ def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: f
 
 
 class Fault(IntEnum):
-    """Reason for stopping the arm; the order of the codes is no precedence.
+    """Reason for stopping the arm; the codes are not ordered by priority.
 
     Attributes:
         description: Description of the fault for messages.
@@ -112,7 +112,11 @@ MALFORMED_STATUS = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
 
 @dataclass(frozen=True)
 class StatusLimits:
-    """Plausibility limits of status messages; all are positive, settling time and drift of the clock may be zero."""
+    """Plausibility limits of status messages; all are positive, settling time and drift of the clock may be zero.
+
+    Raises:
+        InputError: If a limit is out of range, or there is no joint.
+    """
 
     velocity: tuple[float, ...]  # velocity limit of each joint, which bounds the change of its position (n,) [rad/s]
     max_age: float = 0.03  # age above which a status is stale [s]; until then messages may be lost or reordered

@@ -24,11 +24,16 @@ from guiderail.models.primitives.constraints import LinearConstraints
 
 CLEARANCE = 1e-8
 """Distance that linearized constraints keep from a shape, more than the tolerance of a solver [unit of the output]."""
-_HALVINGS = 60  # bisections of an interval until its ends are neighboring floating-point numbers
+_HALVINGS = 60  # number of bisections after which the ends of an interval are neighboring floating-point numbers
 
 
 class ConvexShape(ABC):
-    """Convex set in the space of the first D outputs of a command, usually x, y and z, enlarged by a margin."""
+    """Convex set in the space of the first D outputs of a command, usually x, y and z, enlarged by a margin.
+
+    Attributes:
+        num_dims: Number of dimensions D.
+        margin: Distance by which the set is enlarged [unit of the output].
+    """
 
     num_dims: int
     margin: float

@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.models.control.message_sequence import RESOLUTION
 
-ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # faults with a valid status
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # faults in spite of a valid status
 # Faults after which the message is dropped, and the next one is compared with the last readable status. After a fault
 # in neither of the two lists, statuses are in doubt until all have been valid for the settling time. A status in doubt
 # is only accepted if it agrees with the prediction.
@@ -116,7 +116,7 @@ class Estimate:
 
 
 class StateEstimator:
-    """Checks each status of a robot and estimates its joint state.
+    """Estimator of a robot's joint state, which checks each status.
 
     `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
     with a model, for each joint:
@@ -174,6 +174,9 @@ class StateEstimator:
             now: Local time [s].
             M: Mass matrix at the accepted positions, (n, n).
             drag: Torques that oppose the estimated velocity in the model (Coriolis, damping), (n,) [Nm].
+
+        Returns:
+            The fault, the age of the accepted status and the estimate; `advance` completes the state.
         """
         state = self._predict(before, now, M, drag)
         is_doubted = np.isfinite(before.doubt_time)

@@ -23,7 +23,11 @@ MAX_WRENCH_SIZE = 8
 
 @dataclass(frozen=True, eq=False)  # arrays do not compare to one truth value
 class WrenchBound:
-    """Largest wrench of an impedance controller, per axis and as norms, and the contact stiffness that it assumes."""
+    """Largest wrench of an impedance controller, per axis and as norms, and the contact stiffness that it assumes.
+
+    Raises:
+        InputError: If `axes` are not six numbers, or a number is negative or NaN.
+    """
 
     axes: np.ndarray  # limits (6,) along and about the axes [N, Nm], not negative
     force: float  # limit of the norm of the force [N], not negative
@@ -161,8 +165,8 @@ def governed_error(
     """Limit the pose error (6,) of a spring and damper for one step of a simulation, so that their force is in a bound.
 
     The plant integrates spring and damper implicitly: their force in the step is K e − (K h + D) v₁ with the velocity
-    v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, it suffices for a force inside the bound that K e is inside the
-    bound reduced by (K h + D) |v₀|.
+    v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, this force is inside the bound if K e is inside the bound
+    reduced by (K h + D) |v₀|.
 
     Args:
         stiffness: Stiffness (6,) K of each coordinate.
