@@ -35,7 +35,7 @@ class Finding:
 
 
 def validate(template: SharedControlTemplate, seed: int = 0) -> list[Finding]:
-    """Return the errors and remarks about a template, errors first."""
+    """Return the errors and remarks about a template, errors first; the poses are sampled with `seed`."""
     rng = np.random.default_rng(seed)
     scenes = [_sample_scene(template, rng) for _ in range(SAMPLES)]
     findings = [

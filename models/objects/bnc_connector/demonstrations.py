@@ -43,7 +43,7 @@ SEARCH_PUSH = 2.5 * MM
 SEAT_COMMAND = -6.0 * MM
 LOCK_COMMAND = -8.0 * MM
 
-# time [s], z [m], Rz [rad]
+# Waypoints of the plug: time [s], z [m], Rz [rad].
 _ABOVE = [[0.0, CLEAR, QUARTER_TURN], [0.2, CLEAR, QUARTER_TURN]]
 _LOCKING = [[6.8, LOCK_COMMAND, 0.0], [7.1, LOCK_COMMAND, 0.0], [7.6, 0.0, 0.0], [8.0, 0.0, 0.0]]
 WAYPOINTS = np.array(
@@ -74,7 +74,7 @@ _TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and corre
 
 
 def poses(z: np.ndarray | float, yaw: np.ndarray | float) -> np.ndarray:
-    """Return upright poses (N, 6), [x y z Rz Ry Rx], on the center line."""
+    """Return upright poses (N, 6), [x y z Rz Ry Rx], on the center line, for heights [m] and yaw angles [rad], (N,)."""
     z, yaw = np.broadcast_arrays(np.atleast_1d(z), yaw)
     zero = np.zeros_like(z, dtype=float)
     return np.stack([zero, zero, z, yaw, zero, zero], axis=1)
@@ -123,7 +123,7 @@ FIRM_PUSH = 6.0 * MM  # distance of the command below the rim, which causes a fo
 SEARCH = (1.2, 3.0)  # begin and end of the search [s]
 HOLD_UNTIL, IN_BY = 3.6, 4.1  # times when the circle begins to shrink and when it has vanished [s]
 
-# time [s], z [m], Rz [rad]
+# Waypoints of the plug: time [s], z [m], Rz [rad].
 SEARCH_WAYPOINTS = np.array(
     [
         *_ABOVE,

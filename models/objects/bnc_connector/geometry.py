@@ -95,7 +95,7 @@ class BncDimensions:
 
 @dataclass(frozen=True)
 class SlotColumns:
-    """Unrolled slot: the heights of the walls below and above it [m] at each angle [rad]."""
+    """Unrolled slot: the heights (n,) of the walls below and above it [m] at the angles (n,) [rad]."""
 
     angles: np.ndarray
     lower: np.ndarray

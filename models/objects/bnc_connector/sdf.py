@@ -33,9 +33,10 @@ from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hu
 
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
-FRICTION = 0.2  # metal on metal
-# Without a margin the plug moves into the jack for a whole step of 10 ms, and the next step ejects it. With a margin,
-# fast sliding is decelerated by more than friction, depending on the step (`python -m research.benchmarks engines`).
+FRICTION = 0.2  # friction coefficient of metal on metal
+# Distance at which contact with the jack begins [m]. Without a margin the plug moves into the jack for a whole step of
+# 10 ms, and the next step ejects it. With a margin, fast sliding is decelerated by more than friction, depending on the
+# step (`python -m research.benchmarks engines`).
 MARGIN = 0.1 * MM
 # Stiffness of brass. A softer barrel distributes the load of a rim, which results in a torque on a misaligned plug that
 # metal parts do not have (docs/experiments.md, "Center of pressure on the rim").

@@ -6,7 +6,7 @@ on the table.
 
 Contact. Every hole is an open rigid surface that collides only with its own peg. It consists of the face around the
 hole, a chamfer and a short wall; a wall of the hole's full depth would take half of the simulation time. Pegs are
-compliant convex solids with as many sides as their holes, so that few triangles keep the full clearance. The middle
+compliant convex solids with as many sides as their holes, so that the clearance is exact with few triangles. The middle
 hole has a lip and the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains
 the clamp. The body is a soft pad, thick enough for impacts, that collides only with the table's slab.
 

@@ -29,7 +29,7 @@ class PassageGeometry:
     second_obstacle: tuple[float, float] | None = None  # center of a second obstacle, or None
     obstacles_move: bool = False  # True if the positions of the obstacles are sampled in every episode
     obstacle_margin: float = 0.04  # distance from an obstacle within which it has a cost
-    robot_radius: float = 0.015  # radius of the robot; the visible walls are smaller by it than those for its center
+    robot_radius: float = 0.015  # radius of the robot; the simulated walls are smaller than `walls` by this radius
 
     @property
     def obstacles(self) -> np.ndarray:

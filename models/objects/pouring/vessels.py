@@ -14,13 +14,17 @@ from pydrake.multibody.tree import RigidBody, SpatialInertia, UnitInertia
 
 from guiderail.models.common.errors import InputError
 
-WALL_BOXES = 16  # boxes of a vessel's wall
-FRICTION = 0.4
+WALL_BOXES = 16  # number of boxes of a vessel's wall
+FRICTION = 0.4  # friction coefficient of vessels and balls
 
 
 @dataclass(frozen=True)
 class Vessel:
-    """Cylindrical vessel, open at the top."""
+    """Cylindrical vessel, open at the top.
+
+    Raises:
+        InputError: If a dimension or the mass is not positive and finite.
+    """
 
     inner_diameter: float  # [m]
     depth: float  # inner depth [m]
@@ -77,13 +81,14 @@ class Ball:
 
     diameter: float = 0.040  # [m]
     mass: float = 0.0027  # [kg]
-    # A stiff ball needs a short plant step. With this stiffness and a step of 2 ms no ball passed through a wall.
+    # A stiff ball needs a short plant step. With this stiffness and a step of 2 ms no ball passed through a wall. The
+    # default step of the pouring station is 5 ms.
     stiffness: float = 1e3  # [N/m]
     dissipation: float = 0.5  # [s/m]
 
 
 def contact(stiffness: float | None = None, dissipation: float | None = None) -> ProximityProperties:
-    """Return contact properties; without a stiffness, the plant's default."""
+    """Return contact properties with a stiffness [N/m] and a dissipation [s/m]; None: the plant's default."""
     properties = ProximityProperties()
     AddContactMaterial(
         properties=properties,
