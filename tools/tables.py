@@ -18,7 +18,7 @@ _INTEGER = re.compile(r"-?[0-9]{1,18}")
 _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf|nan")
 
 MAX_FILE_SIZE = 200_000_000  # largest CSV file [bytes]
-_MAX_LIST = 1_000  # longest list of numbers in one row of a Parquet file, on average
+_MAX_LIST = 1_000  # largest mean length of the lists of numbers in the rows of a Parquet file
 MAX_ROWS = 20_000_000  # largest number of rows of Parquet files that are read together
 
 Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[str, Any]]

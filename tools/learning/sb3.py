@@ -48,7 +48,8 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Return a batch with evenly spaced demonstrated rows.
 
-        Several batches can be sampled at once: each of equal parts of the rows has the same fraction of demonstrations.
+        Several batches can be sampled at once: if the rows are divided into equal parts, each part has the same
+        fraction of demonstrations.
         """
         size, first = self.size(), self.num_demonstrated
         if not 0 < first < size:

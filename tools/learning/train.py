@@ -99,7 +99,7 @@ def train(
         guidance: Name of the guidance; None for the task's default.
         out: Folder of the run; with `resume`, that of the run to continue.
         episodes: Total number of episodes; None for 60.
-        seed: Seed of everything random, in [0, 2³¹); None for 0.
+        seed: Seed of all random numbers, in [0, 2³¹); None for 0.
         algorithm: Registered name of the learner; None for the preset's or the task's.
         preset: Name of the learner's preset; None for the task's.
         settings: Settings of the learner by name, in place of the preset's.
@@ -151,7 +151,7 @@ def start_or_resume(
     - `task`: name of the task; None with `resume`.
     - `environment`: options of the environment by name.
     - `imports`: modules or files (.py) that register the task, the learner, …
-    - `step_log`: whether every control step is written to the step log.
+    - `step_log`: True to write every control step to the step log.
     - `sb3_callbacks`: callbacks of Stable-Baselines3.
     - `make_supervisor`: constructs the supervisor of a run with a human in the loop.
 

@@ -163,7 +163,7 @@ def _train(
     if resume:
         rows, num_written = restore_checkpoint(folder, learner, env)
         if num_written < len(rows):
-            folder.write_episodes(rows)  # a complete run does not write the table again
+            folder.write_episodes(rows)  # the loop below does not write the table of a complete run
         if len(rows) < config.episodes:
             folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
     supervised = None
@@ -247,6 +247,9 @@ def restore_checkpoint(folder: RunFolder, learner: Learner, env: Any) -> tuple[l
     Returns:
         The rows up to the checkpoint, and the number of rows in `episodes.csv`: fewer if the run was killed between
         writing the two files.
+
+    Raises:
+        InputError: If the table differs from the checkpoint's, or the checkpoint is of another learner.
     """
     table = folder.path / "episodes.csv"
     if not folder.checkpoint.exists() and not table.exists():

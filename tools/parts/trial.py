@@ -36,7 +36,7 @@ from guiderail.systems.support.drake_multibody import pose_to_transform, transfo
 
 _VERTICES = 8  # number of vertices with the highest pressure at which the depth of a contact surface is measured
 _AT_REST = 1.0  # time at the end of a motion in which the plug does not move [s]
-_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # distance of the command below a blocked plug [m], and how long it lasts [s]
+_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # distance of the command below a blocked plug [m], time until the trial ends [s]
 _INTERVAL = 4  # simulator steps between two measurements of depth
 
 
@@ -202,7 +202,11 @@ _SCALE = 10.0  # magnification, because the page's camera cannot get close to sm
 
 
 def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
-    """Write the page of a trial: the parts and, initially hidden, the contact pieces in different colors."""
+    """Write the page of a trial: the parts and, initially hidden, the contact pieces in different colors.
+
+    Raises:
+        InputError: If the environment forbids Drake to open a network port.
+    """
     try:
         meshcat = MeshcatPage(is_served=False)
     except RuntimeError as error:
@@ -263,7 +267,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, socket: np.ndarray) -> bool:
-    """Return whether a motion seats the plug in a socket at (x, y, Rz) [m, rad]."""
+    """Return True if a motion seats the plug in a socket at (x, y, Rz) [m, rad]."""
     in_socket = motion.copy()  # on a gantry, moving the plug by the inverse is equivalent to displacing the socket
     cosine, sine = np.cos(socket[2]), np.sin(socket[2])
     in_socket[:, :2] = (motion[:, :2] - socket[:2]) @ np.array([[cosine, -sine], [sine, cosine]])

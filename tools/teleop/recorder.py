@@ -114,7 +114,7 @@ BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END:
 MAX_SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])
 SLOW_RATE = 0.25  # rate of slow motion relative to real time
 UNDO_TIME = 1.0  # motion that one undo takes back [s]
-MAX_UNDOS = 60  # consecutive undos: each needs a copy of the simulation's state
+MAX_UNDOS = 60  # largest number of consecutive undos; each needs a copy of the simulation's state
 FORCE_STEPS = 5  # control steps between updates of the gauge: more frequent updates would delay the page
 MIN_STEPS = 10  # smallest number of control steps of a demonstration
 MAX_REST = 0.1  # longest rest of the command in a demonstration [s]
@@ -399,7 +399,7 @@ def record_demonstrations(
 
 
 class LiveView(EnvCallback):
-    """Renders every transition while it happens."""
+    """Callback that renders every transition."""
 
     def on_step(self, transition: Transition) -> None:
         """Render the transition."""
