@@ -30,7 +30,7 @@ REWARDS = ("sparse", "shaped", "aligned")
 
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # [m], [rad]; larger values are probably in mm or degrees
-FORCE_LIMITS = (1.0, 60.0)  # least and greatest force limit [N]
+FORCE_LIMITS = (1.0, 60.0)  # smallest and largest force limit [N]
 
 
 OffsetRange = Annotated[
@@ -59,7 +59,7 @@ class FixtureOffsetOptions(Options):
         "per_run", description="offset of the fixture: sampled per run, per episode, or none"
     )
     offset_range: OffsetRange | None = Field(
-        None, description="least and greatest offset of the fixture [m]; default: that of fixture_offset"
+        None, description="smallest and largest offset of the fixture [m]; default: that of fixture_offset"
     )
 
 

@@ -63,7 +63,8 @@ FILTERED_PAIRS = [
 ]
 
 # The task board has no collision geometry, because the locked plug's mouth reaches slightly below the jack's bottom.
-BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]  # [m]
+# Size of the board, and its distance below the jack [m].
+BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]
 LOCKED_HEIGHT = 0.6e-3  # [m] largest deviation of a locked plug along the jack's axis
 LOCKED_ANGLE = np.deg2rad(4.0)  # [rad] largest deviation of a locked plug about the jack's axis
 LOCKED_OFFSET = 1.0e-3  # [m] largest lateral offset of a locked plug

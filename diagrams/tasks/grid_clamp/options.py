@@ -30,7 +30,7 @@ class GridClampOptions(ForceOptions):
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offsets of table and clamp: sampled per run, per episode, or none"
     )
-    start_height: StartHeight = Field(START_HEIGHT, description="least and greatest start height [m]")
+    start_height: StartHeight = Field(START_HEIGHT, description="smallest and largest start height [m]")
     force_limit: Number = Field(
         COLLISION_FORCE, ge=8, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
     )

@@ -126,7 +126,7 @@ NUM_PLACES = 6  # pick-up places of clamps
 # Parallel jaws center the clamp across the jaws (y), and not along them (x).
 ALONG_JAWS = 1.0 * MM  # largest grasp offset of a place along the jaws
 ACROSS_JAWS = 0.2 * MM  # largest grasp offset of a place across the jaws
-CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest offset of the table
+CALIBRATION = (1.8 * MM, 2.2 * MM)  # smallest and largest offset of the table
 REPEATABILITY = 0.1 * MM  # largest change of the offset from one pick-up at a place to the next
 KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with "none"
 

@@ -80,7 +80,10 @@ class PouringOptions(Options):
         0.0, ge=0, le=MAX_MUG_OFFSET, description="largest sampled offset of the mug along x and y [m]"
     )
     mug_error_least: Number = Field(
-        0.0, ge=0, le=MAX_MUG_ERROR, description="least sampled distance between actual and estimated mug position [m]"
+        0.0,
+        ge=0,
+        le=MAX_MUG_ERROR,
+        description="smallest sampled distance between actual and estimated mug position [m]",
     )
     mug_error_most: Number = Field(
         0.0,
