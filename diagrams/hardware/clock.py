@@ -89,7 +89,7 @@ class IntervalHistogram:
 
 
 def set_realtime_priority() -> bool:
-    """Ask the operating system to schedule this process before others; return True if it does."""
+    """Request a real-time priority for this process (SCHED_FIFO); return True if the operating system grants it."""
     try:
         # Child processes have normal priority.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(REALTIME_PRIORITY))

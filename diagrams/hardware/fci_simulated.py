@@ -43,7 +43,7 @@ STEP = 0.001  # period of the protocol [s]
 # Steps of the engine in a period. With one step, a contact with a time constant of 2 ms lasts a single step: the tool
 # bounces from it every 5 ms, and joint velocities jump by 0.07 rad/s.
 SUBSTEPS = 4
-IDLE_RATE = 0.1  # rate of the robot's clock without a motion, while the station computes
+IDLE_RATE = 0.1  # rate of the robot's clock relative to the wall clock, without a motion and while the station computes
 REPEAT_INTERVAL = 0.2  # wall clock time after which the state of a waiting robot is sent again [s]
 RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "without gravity and friction"
 # A robot without motion is held by joint stiffness [Nm/rad] and damping [Nms/rad], in place of its brakes. With the

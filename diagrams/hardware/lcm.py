@@ -63,9 +63,9 @@ def _check_url(url: str) -> None:
 
 
 def handlers_are_safe() -> bool:
-    """Return True if Drake holds the interpreter's lock when it calls a Python message handler.
+    """Return True if Drake holds the global interpreter lock (GIL) when it calls a Python message handler.
 
-    Bindings made with nanobind (Drake 1.58 was tried) create the handler's argument without the lock while a simulator
+    Bindings made with nanobind (Drake 1.58 was tried) create the handler's argument without the GIL while a simulator
     reads the bus, which ends the process.
     """
     return not type(DrakeLcmInterface.__dict__["Subscribe"]).__module__.startswith("nanobind")

@@ -170,7 +170,7 @@ class PouringStation(Station):
             model, target, tip, posture=posture, period=config.control_period, speed_limits=SPEED_LIMITS
         )
         builder.AddNamedSystem("controller", controller)
-        # Without a desired velocity the drives' damping lets the arm lag by centimeters.
+        # Without a desired velocity, the drives' damping would oppose the motion, and the arm would lag by centimeters.
         n, body_poses = config.arm.num_joints, plant.get_body_poses_output_port()
         drives = StateInterpolatorWithDiscreteDerivative(n, config.control_period, suppress_initial_transient=True)
         add_system(builder, "drives", drives, controller.get_joint_positions_output_port())
