@@ -37,17 +37,17 @@ class BncDimensions:
     lug_radius: float = 0.975 * MM
     lug_tip_radius: float = 5.5 * MM  # from the center line to the end of a lug
     lug_root_radius: float = 4.025 * MM  # a lug starts inside the barrel
-    lug_depth: float = 5.5 * MM  # below the barrel's open end
+    lug_depth: float = 5.5 * MM  # depth of a lug's center below the barrel's open end
 
     bore_radius: float = 4.925 * MM
     ring_radius: float = 7.0 * MM
     ring_length: float = 9.5 * MM
     mouth_chamfer: float = 0.4 * MM
-    slot_clearance: float = 0.125 * MM  # on each side
+    slot_clearance: float = 0.125 * MM  # clearance between lug and slot on each side
     slot_depth: float = 0.9 * MM  # radial depth of the slots' walls
 
-    entry_height: float = 3.4 * MM  # end of the straight entry, far from the mouth
-    entry_angle: float = np.deg2rad(6.0)  # where the ramp starts
+    entry_height: float = 3.4 * MM  # height at which the straight entry ends
+    entry_angle: float = np.deg2rad(6.0)  # angle at which the ramp starts
     apex_height: float = 5.4 * MM
     apex_angle: float = np.deg2rad(78.0)
     detent_height: float = 5.0 * MM
@@ -55,7 +55,7 @@ class BncDimensions:
     detent_angle: float = np.deg2rad(90.0)
 
     pad_radius: float = 3.0 * MM
-    pad_height: float = 0.6 * MM  # above the barrel's open end
+    pad_height: float = 0.6 * MM  # height of the pad's top above the barrel's open end
     pad_thickness: float = 2.0 * MM
     seat_height: float = 10.7 * MM  # height of the plug's face that meets the pad, from the mouth
     seat_width: float = 8.0 * MM
