@@ -45,6 +45,7 @@ class Trial:
     """Result of a scripted insertion."""
 
     success: bool  # True if the plug reached the target
+    is_blocked: bool  # True if the plug stayed above the height of the target, at any lateral offset
     pose: np.ndarray  # final pose of the plug in the socket, position and rotation vector (6,) [m, rad]
     lowest: float  # smallest height of the plug above the target [m]
     peak_force: float  # largest contact force [N]
@@ -166,10 +167,12 @@ def insert(
     driven.simulator.clear_monitor()  # Drake never frees the diagram; a monitor would keep the surfaces
     spent = time.process_time() - start - depths.seconds
     pose = _plug_pose(driven)
+    lowest = float(min(lowest, pose[2]))
     return Trial(
         success=file.tolerance.accepts(pose),
+        is_blocked=lowest > file.tolerance.height,
         pose=pose,
-        lowest=float(min(lowest, pose[2])),
+        lowest=lowest,
         peak_force=float(recording["contact_force"].max()),
         penetration=depths.deepest,
         resting_penetration=depths.deepest_at_rest,
@@ -306,11 +309,13 @@ def add_convex_pieces(
                     written[-1].write_text(piece_text(piece), encoding="utf-8")
             changes[name] = model.model_copy(update={"convex": tuple(names)})
         changed = file.model_copy(update=changes)
-        aligned, seated = run_isolated(
+        (is_seated, _), (_, is_blocked) = run_isolated(
             lambda: [insert_in_mujoco(folder, changed, offset) for offset in (0.0, OFFSET)], cpu_seconds=CHECK_SECONDS
         )
-        if not aligned or seated:
-            raise IsolatedError("an aligned plug does not seat" if not aligned else "a misaligned plug is not blocked")
+        if not is_seated or not is_blocked:
+            raise IsolatedError(
+                "an aligned plug does not seat" if not is_seated else "a misaligned plug is not blocked"
+            )
     except IsolatedError as error:
         log(f"station=mujoco is not offered: {error}")
         for path in written:
@@ -320,14 +325,16 @@ def add_convex_pieces(
     return changed
 
 
-def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> bool:
-    """Return True if a straight insertion, offset along x [m], seats the plug on `station=mujoco`.
+def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> tuple[bool, bool]:
+    """Insert the plug straight on `station=mujoco`, offset along x [m], and return two flags.
 
-    The task file need not be written yet.
+    The first is True if the plug is seated at the end, the second if it stayed above the height of the target: a plug
+    beside the target that is not blocked is not seated either. The task file need not be written yet.
     """
     times, poses = file.motion.plan_straight_insertion()
     poses[:, 0] += offset
     station = MujocoStation(write_workcell(folder, file), time_step=file.time_step)
     _, recording = drive_along(station, times, poses)
     x, y, z, Rz, Ry, Rx = recording["pose"][-1]
-    return file.tolerance.accepts(np.array([x, y, z, Rx, Ry, Rz]))  # tilts are small
+    is_seated = file.tolerance.accepts(np.array([x, y, z, Rx, Ry, Rz]))  # tilts are small
+    return is_seated, bool(np.min(recording["pose"][:, 2]) > file.tolerance.height)

@@ -89,7 +89,7 @@ def table_row(name: str, out: Path, episodes: int, seed: int, held_out: int) -> 
     deepest = max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"])
     clearance = measured["clearance_mm"]
     row: list[object] = [name, measured["real_time_factor"], deepest, round(clearance / 2, 4), measured["inserted"]]
-    row.append("/".join("in" if one else "stopped" for one in measured["inserted_1.5_mm_off"]))
+    row.append("/".join("stopped" if one else "in" for one in measured["blocked_1.5_mm_off"]))
     if not episodes:
         return [*row, *[""] * 5, f"{measured['minutes']:.1f}"]
     trained = finished(kept / f"{name}-training.json", lambda: train(name, out, log, episodes, seed))

@@ -47,7 +47,7 @@ def test_measured_properties_are_those_of_the_drawing(folder):
     measured = yaml.safe_load((folder / "task.yaml").read_text())["measured"]
     assert measured["clearance_mm"] == pytest.approx(0.1, abs=1e-3)
     assert measured["inserted"] is True
-    assert measured["inserted_1.5_mm_off"] == [False, False]
+    assert measured["blocked_1.5_mm_off"] == [True, True]
     assert max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"]) <= 0.05
     assert measured["demonstrations_seated"] == "10 of 10"
     page = (folder / "preview.html").read_text()
@@ -184,7 +184,9 @@ def test_parts_of_convex_pieces_are_offered_in_mujoco(folder):
     file = read_task_file(folder)
     assert "mujoco" in load_task_folder(folder).stations()
     assert (len(file.plug.convex), len(file.socket.convex)) >= (1, 5)  # four walls and the bottom
-    assert [insert_in_mujoco(folder, file, offset) for offset in (0.0, 2e-3)] == [True, False]
+    assert insert_in_mujoco(folder, file) == (True, False)
+    assert insert_in_mujoco(folder, file, 2e-3) == (False, True)
+    assert insert_in_mujoco(folder, with_floor_only(folder, file), 2e-3) == (False, False)
     env = make_env(str(folder), station="mujoco", guidance="kgrl")
     env.reset(seed=0, options={"offset": (0.0, 0.0)})
     done = False
@@ -193,6 +195,30 @@ def test_parts_of_convex_pieces_are_offered_in_mujoco(folder):
         done = done or terminated
     env.close()
     assert info["is_success"]
+
+
+def with_floor_only(folder, file):
+    """Return the task file with the lowest convex piece of the socket and without its walls."""
+
+    def highest(name):
+        lines = (folder / name).read_text().splitlines()
+        return max(float(line.split()[3]) for line in lines if line.startswith("v "))
+
+    floor = min(file.socket.convex, key=highest)
+    pieces = (file.socket.pieces[0].model_copy(update={"file": floor}),)
+    return file.model_copy(update={"socket": file.socket.model_copy(update={"convex": (floor,), "pieces": pieces})})
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.5e-3])
+def test_plug_beside_the_target_is_not_blocked_without_walls(folder, offset):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.tools.parts.trial import insert
+
+    file = read_task_file(folder)
+    with_walls = insert(folder, file, offset=(offset, 0.0))
+    assert (with_walls.success, with_walls.is_blocked) == (offset == 0.0, offset > 0.0)
+    without = insert(folder, with_floor_only(folder, file), offset=(offset, 0.0))
+    assert (without.success, without.is_blocked) == (offset == 0.0, False)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.5e-3])
