@@ -111,12 +111,8 @@ class FciDriver(PoseDriver):
                 self._robot = franky.Robot(self.url, realtime_config=franky.RealtimeConfig.Ignore)
             except franky.NetworkException:
                 return None
-        try:
-            state = self._robot.state  # without a motion, each call waits for a new state
-        except (franky.Exception, RuntimeError):  # a socket raises RuntimeError("Net Exception")
-            self._is_lost = True
-            return MALFORMED_STATUS
-        if str(state.current_errors) != NO_ERRORS:
+        state = self._read_state()
+        if state is None or str(state.current_errors) != NO_ERRORS:
             return MALFORMED_STATUS
         q, v, external = (np.array(part, dtype=float) for part in (state.q, state.dq, state.tau_ext_hat_filtered))
         return JointStatus(state.time.to_sec(), q, v, -external)
@@ -124,16 +120,26 @@ class FciDriver(PoseDriver):
     @property
     def error(self) -> str:
         """Reason of a reflex of the robot; empty if there is none, or the connection is lost."""
-        if self._robot is None or self._is_lost:
-            return ""
-        errors = str(self._robot.state.current_errors)
+        state = None if self._robot is None else self._read_state()
+        errors = NO_ERRORS if state is None else str(state.current_errors)
         return "" if errors == NO_ERRORS else errors
+
+    def _read_state(self) -> Any:
+        """Return the client's state of the robot, or None if the connection is lost."""
+        if not self._is_lost:
+            try:
+                return self._robot.state  # without a motion, each call waits for a new state
+            except (self._franky.Exception, RuntimeError):  # a socket raises RuntimeError("Net Exception")
+                self._is_lost = True
+        return None
 
     def check_setup(self) -> list[Check]:
         """Check mode, tool, payload and thresholds of the robot, and this machine's kernel."""
-        impedance, state = self._impedance, self._robot.state
+        impedance, state = self._impedance, self._read_state()
         if impedance is None:
             raise InputError("the driver fci is used before it is configured")
+        if state is None:
+            return [Check("connection", f"the robot at {self.url} does not answer", passed=False)]
         mode = str(state.robot_mode).rpartition(".")[2]
         tool = np.array(state.F_T_EE.matrix) - impedance.X_FlangeTool.GetAsMatrix4()
         error = float(np.abs(tool).max())
@@ -220,15 +226,20 @@ class FciDriver(PoseDriver):
                 self._robot.join_motion(STOP_TIME)  # raises the error of the last motion here, not in the next motion
         is_recovered = False
         if not self._is_lost:
-            try:
-                is_recovered = self._robot.recover_from_errors()
-            except (self._franky.NetworkException, RuntimeError):
-                self._is_lost = True
+            is_recovered = self._clear_errors()
         if self._is_lost:
             self._reconnect()
-            is_recovered = self._robot.recover_from_errors()
+            is_recovered = self._clear_errors()
         if not is_recovered:
-            raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
+            raise InputError(f"the robot at {self.url} cannot recover: {self.error or 'the connection is lost'}")
+
+    def _clear_errors(self) -> bool:
+        """Clear the robot's errors; return False if they persist or the connection is lost."""
+        try:
+            return bool(self._robot.recover_from_errors())
+        except (self._franky.NetworkException, RuntimeError):
+            self._is_lost = True
+            return False
 
     def _reconnect(self) -> None:
         self._is_lost, self._robot = False, None

@@ -45,6 +45,15 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
         if self.full and self.pos < self.num_demonstrated:
             self.pos = self.num_demonstrated
 
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        # The row after the last one is a demonstration: a return of several steps ends at the last row.
+        kept = self.timeouts[-1].copy()
+        if self.num_demonstrated:
+            self.timeouts[-1] = np.logical_or(kept, np.logical_not(self.dones[-1]))
+        samples = super()._get_samples(batch_inds, env)
+        self.timeouts[-1] = kept
+        return samples
+
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Return a batch with evenly spaced demonstrated rows.
 

@@ -243,6 +243,29 @@ def test_recover_connects_again_and_configures_the_robot(driver, robot, monkeypa
     assert [name for name, *_ in robot.calls] == ["set_ee", "set_load", "set_collision_behavior"]
 
 
+def test_recover_raises_when_the_connection_is_lost_again(driver, robot, monkeypatch):
+    def lose():
+        robot.is_connected = False
+        raise NetworkError
+
+    monkeypatch.setattr(robot, "recover_from_errors", lose, raising=False)
+    monkeypatch.setattr(fci, "RECONNECTION_TIME", 0.0)
+    robot.is_connected = False
+    driver.read()
+    robot.is_connected = True
+    with pytest.raises(InputError, match="cannot recover: the connection is lost"):
+        driver.recover()
+    assert not driver.read().is_readable
+
+
+@pytest.mark.parametrize("is_noticed", [True, False])
+def test_checks_fail_when_the_connection_is_lost(driver, robot, is_noticed):
+    robot.is_connected = False
+    assert not is_noticed or not driver.read().is_readable
+    assert driver.error == ""
+    assert [(check.name, check.passed) for check in driver.check_setup()] == [("connection", False)]
+
+
 def test_lost_connection_is_no_refusal_of_the_configuration(driver, robot, model):
     robot.is_connected = False
     driver.configure(make_robot_impedance(model, IMPEDANCE))

@@ -14,6 +14,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.networks import DroppedNormalizedReLU
+from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
 OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
 ON_POLICY = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}
@@ -177,6 +178,22 @@ def test_demonstrations_that_fill_the_buffer_are_refused():
     with pytest.raises(InputError, match="fill the replay buffer of 8 transitions"):
         fill(learner, 2)
     assert learner.model.replay_buffer.num_demonstrated == 8
+
+
+def test_returns_of_a_full_buffer_do_not_continue_in_the_demonstrations():
+    box = spaces.Box(-1.0, 1.0, (1,))
+    buffer = DemonstrationReplayBuffer(8, box, box, device="cpu", n_steps=3, gamma=1.0)
+    buffer.num_demonstrated = 2
+    for step in range(9):  # the last one overwrites row 2
+        is_demonstrated = step < 2
+        observations = (np.full((1, 1), float(step + k)) for k in range(2))
+        reward, done = np.array([1000.0 if is_demonstrated else 1.0]), np.array([step == 1])
+        buffer.add(*observations, np.zeros((1, 1)), reward, done, [{}])
+    samples = buffer._get_samples(np.arange(8))
+    np.testing.assert_array_equal(samples.rewards.numpy()[:, 0], [2000.0, 1000.0, 1.0, 3.0, 3.0, 3.0, 2.0, 1.0])
+    np.testing.assert_array_equal(samples.next_observations.numpy()[2:, 0], [9.0, 6.0, 7.0, 8.0, 8.0, 8.0])
+    np.testing.assert_array_equal(samples.dones.numpy()[:, 0], [1, 1, 0, 0, 0, 0, 0, 0])
+    assert not buffer.timeouts.any()
 
 
 def test_demonstration_fraction_needs_demonstrations():
