@@ -314,7 +314,8 @@ def _measure(
     )
     trials = (aligned, *misaligned)
     is_blocked = all(trial.is_blocked for trial in misaligned)
-    log(f"misaligned by 1.5 mm: {'blocked (as required)' if is_blocked else 'at the height of the target, but must be blocked'}")
+    result = "blocked (as required)" if is_blocked else "at the height of the target, but must be blocked"
+    log(f"misaligned by 1.5 mm: {result}")
     deviation = prepared["deviation_mm"] + round(1e3 * contact.deviation, 4)
     if contact.deviation:
         total = _describe_deviation(deviation, prepared["clearance_mm"])
