@@ -87,7 +87,7 @@ class PoseMotionLimiter(LeafSystem):
         motion.current_position, motion.current_velocity, motion.current_acceleration = state[:18].reshape(3, 6)
         motion.target_position = state[18:24]
         motion.max_velocity, motion.max_acceleration, motion.max_jerk = self._limits
-        state[:18] = np.concatenate(_plan(motion).at_time(self._period)[:3])
+        state[:18] = np.concatenate(_plan(motion).at_time(self._period))
         return state
 
     def _limited_pose(self, context: Context) -> np.ndarray:

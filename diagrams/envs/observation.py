@@ -14,6 +14,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.wiring import add_system
+from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
@@ -175,8 +176,9 @@ def _add_clock(
 def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
     try:
-        selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
-        if selection.ndim != 2:
+        entries = range(size) if term.entries is None else list(term.entries)
+        selection = np.eye(size)[entries]
+        if selection.ndim != 2 or not all(is_whole(entry, 0) for entry in entries):
             raise ValueError
     except (IndexError, TypeError, ValueError):
         raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -102,7 +101,7 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
         else:
             never = builder.AddNamedSystem("fallback", ConstantVectorSource([0.0]))
             desired, fallback = chunk.get_output_port(), never.get_output_port()
-        self._finish(builder, replace(config, motion=None), desired, fallback)
+        self._finish(builder, config, desired, fallback)
 
 
 def _chunk_reference(prior: PriorKnowledge, source: str | None, observation_size: int) -> ChunkReference:

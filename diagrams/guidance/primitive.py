@@ -137,15 +137,15 @@ class KgrlGuidance(PrimitiveGuidance):
         With `takes_window`, mean and covariance come from the input ``reference_window``, not from the demonstrations.
         """
         super().__init__()
-        config, builder = primitive_config_of(prior), DiagramBuilder()
-        config = config if constrained else replace(config, motion=None)
+        task, builder = primitive_config_of(prior), DiagramBuilder()
+        config = task if constrained else replace(task, motion=None)
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
         kmp = LcNsKmpSystem(primitive, config.null_space_gains(primitive), config.control_period)
         add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
         if takes_window:
             builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
-        self._finish(builder, config, *self._constrain(builder, config, kmp, pose))
+        self._finish(builder, task, *self._constrain(builder, config, kmp, pose))
 
 
 @register_guidance(

@@ -24,6 +24,7 @@ class Tank:
 
     def reset(self):
         events = self.system.AllocateDiscreteVariables()
+        events.SetFrom(self.context.get_discrete_state())
         self.system._reset(self.context, events)
         self.context.SetDiscreteState(events)
 

@@ -175,6 +175,7 @@ def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
             (ObservationTerm("pose", entries=(0, 5)),),
             "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not",
         ),
+        ((ObservationTerm("pose", entries=(-1,)),), "the entries .* are whole numbers from 0 to 1, not"),
         ((ObservationTerm("pose", entries=1),), "the entries .* are whole numbers from 0 to 1, not 1"),
         ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
     ],

@@ -219,8 +219,9 @@ class NarrowPassage(Task):
         """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles at sampled sides."""
         start, obstacles = reference_trajectory().means[0].copy(), self._geometry.obstacles
         deviation = self._start_deviation(options.held_out)
-        if self.options.has_sampled_obstacles:
+        if self.options.has_sampled_obstacles or self.options.start_deviation > 0:
             rng = episode_stream(rng, options.held_out)
+        if self.options.has_sampled_obstacles:
             sides = (-1.0) ** (rng.integers(2) + np.arange(len(obstacles)))
             obstacles[:, 0] += self.options.obstacle_beside * sides
         if deviation:

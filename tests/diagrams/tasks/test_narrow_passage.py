@@ -400,6 +400,19 @@ def test_commands_stay_outside_of_an_obstacle_that_constrains(guidance):
     assert np.abs(displacements).max() <= 0.5 * (1 + 1e-9)
 
 
+def test_guidance_without_constraints_reports_the_violation_of_a_shape():
+    env = make("residual_covariance", obstacles_constrain=True, obstacle_radius=0.06, action_repeat=1)
+    env.reset(seed=0)
+    guidance, worst = env.task.diagram.GetSubsystemByName("guidance"), -np.inf
+    done = False
+    while not done:
+        *_, terminated, truncated, _ = env.step(np.array([0.5, 0.0]))
+        done = terminated or truncated
+        context = guidance.GetMyContextFromRoot(env.simulator.get_context())
+        worst = max(worst, guidance.GetOutputPort("constraint_violation").Eval(context)[0])
+    assert worst > 0.0
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [

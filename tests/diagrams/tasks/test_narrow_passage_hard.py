@@ -53,6 +53,13 @@ def test_sides_alternate_are_drawn_and_are_seen(env):
     assert 0.01 < np.std(starts, axis=0).min() < 0.1
 
 
+@pytest.mark.parametrize("options", [{"start_deviation": 0.03}, HARD])
+def test_held_out_starts_are_other_starts(options):
+    env = make_env("NarrowPassage", **options)
+    starts = [env.reset(seed=5, options={"held_out": flag})[1]["start"] for flag in (False, True)]
+    assert (starts[0] != starts[1]).all()
+
+
 def test_the_obstacles_are_drawn_where_they_are(env):
     _, info = env.reset(seed=2)
     plant = env.task.diagram.GetSubsystemByName("station").plant

@@ -38,7 +38,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from mutation.mutations import ROOT, Mutant, mutants
 
-CONSTANTS = (bool, int, float, str, tuple, frozenset, set, np.ndarray)
+CONSTANTS = (bool, int, float, str, tuple, list, frozenset, set, np.ndarray)
 WRAPPERS = (property, classmethod, staticmethod, cached_property)
 TEST_MODULES: set[str] = set()
 PRIMITIVES = ["tests/models/primitives"]

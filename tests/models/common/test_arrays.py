@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError
 
 
@@ -23,3 +23,12 @@ def test_objects_that_are_numbers_are_converted_to_doubles():
     numbers = as_numbers(np.array([1, np.float32(2.5), True, 2**53 - 1], dtype=object), "the lengths")
     np.testing.assert_array_equal(numbers, [1.0, 2.5, 1.0, 2.0**53 - 1.0])
     assert numbers.dtype == float
+
+
+@pytest.mark.parametrize(
+    ("value", "is_accepted"),
+    [(1, True), (2.0, True), (np.int64(3), True), (0, False), (True, False), (1.5, False), (np.nan, False)]
+    + [(np.inf, False), ("1", False), (None, False)],
+)
+def test_whole_number_is_no_bool(value, is_accepted):
+    assert is_whole(value, 1) is is_accepted
