@@ -14,7 +14,6 @@ from pydrake.trajectories import PiecewisePolynomial
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
@@ -31,7 +30,7 @@ class ObservationTerm:
         signal: Name of a port of station, guidance or task, or one of `CLOCKS`.
         center: Finite number, or one per entry (n,), in the signal's unit.
         scale: Finite number, or one per entry (n,), in the signal's unit; not 0.
-        entries: Indices of the signal's entries that are observed; default: all.
+        entries: Indices of the observed entries of the signal, a negative one from its end; default: all.
     """
 
     signal: str
@@ -176,14 +175,13 @@ def _add_clock(
 def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
     try:
-        entries = range(size) if term.entries is None else list(term.entries)
-        selection = np.eye(size)[entries]
-        if selection.ndim != 2 or not all(is_whole(entry, 0) for entry in entries):
+        selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
+        if selection.ndim != 2:
             raise ValueError
     except (IndexError, TypeError, ValueError):
         raise InputError(
-            f"the entries of the observed signal {term.signal!r}{of_task} are whole numbers from 0 to {size - 1}, "
-            f"not {brief(term.entries)}"
+            f"the entries of the observed signal {term.signal!r}{of_task} are whole numbers from {-size} to "
+            f"{size - 1}, not {brief(term.entries)}"
         ) from None
     center, scale = (_numbers(term, name, len(selection), of_task) for name in ("center", "scale"))
     with np.errstate(all="ignore"):

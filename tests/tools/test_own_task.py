@@ -160,10 +160,10 @@ def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
         ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is empty"),
         (
             (ObservationTerm("pose", scale=0.0),),
-            "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0",
+            "the observed signal 'pose' of lab/Own is divided by its scale, which cannot be .*0.0",
         ),
-        ((ObservationTerm("phase"), ObservationTerm("pose", scale=[0.5, 0.0])), "the scale .* 'pose' .* cannot be"),
-        ((ObservationTerm("pose", scale=1e-320),), "the scale of the observed signal 'pose' of lab/Own divides it"),
+        ((ObservationTerm("phase"), ObservationTerm("pose", scale=[0.5, 0.0])), "'pose' .* its scale, which cannot be"),
+        ((ObservationTerm("pose", scale=1e-320),), "the observed signal 'pose' of lab/Own is divided by its scale"),
         (
             (ObservationTerm("pose", scale=np.nan),),
             "the scale .* 'pose' of lab/Own is a finite number, or 2 of them, not nan",
@@ -173,11 +173,10 @@ def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
         ((ObservationTerm("pose", center=np.inf),), "the center .* is a finite number, or 2 of them, not inf"),
         (
             (ObservationTerm("pose", entries=(0, 5)),),
-            "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not",
+            "the entries .* 'pose' of lab/Own are whole numbers from -2 to 1, not",
         ),
-        ((ObservationTerm("pose", entries=(-1,)),), "the entries .* are whole numbers from 0 to 1, not"),
-        ((ObservationTerm("pose", entries=1),), "the entries .* are whole numbers from 0 to 1, not 1"),
-        ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
+        ((ObservationTerm("pose", entries=1),), "the entries .* are whole numbers from -2 to 1, not 1"),
+        ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from -2 to 1, not"),
     ],
 )
 def test_invalid_observation_term_is_refused(observed, says):
