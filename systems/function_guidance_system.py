@@ -1,11 +1,12 @@
 """Guidance by a function of action, measured pose and measured wrench."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
@@ -19,7 +20,7 @@ class FunctionGuidanceSystem(LeafSystem):
         desired_pose[k] = function(action[k], pose[k], wrench[k])
 
     If the function does not return O finite numbers, the previous desired pose is repeated (initially the measured
-    pose) and ``fallback`` is 1, so that NaN is never commanded.
+    pose) and ``fallback`` is 1, so that NaN is never commanded. At initialization, anything but O numbers is refused.
 
     .. pydrake_system::
 
@@ -44,7 +45,8 @@ class FunctionGuidanceSystem(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If a size or the period is out of range; at initialization, if the measured pose is not finite.
+        InputError: If a size or the period is out of range; at initialization, if the measured pose is not finite, or
+            the function does not return O numbers.
     """
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
@@ -71,24 +73,33 @@ class FunctionGuidanceSystem(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the function did not return O finite numbers, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._desired_pose, declare.start_pose(self._pose_port, context))
-        self._step(context, discrete_state)
+        start = declare.start_pose(self._pose_port, context)
+        returned = self._evaluate(context)
+        if _numbers(returned, len(start)) is None:
+            raise InputError(f"a guidance's function must return {len(start)} numbers, not {brief(returned)}")
+        discrete_state.set_value(self._desired_pose, start)
+        self._set(context, discrete_state, returned)
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
-        action = self._action_port.Eval(context)
-        returned = self._function(
-            action.copy(), self._pose_port.Eval(context).copy(), self._wrench_port.Eval(context).copy()
-        )
-        try:
-            desired = np.asarray(returned)
-        except ValueError:
-            desired = np.empty(0)
-        is_usable = (
-            desired.shape == (self._desired_pose_port.size(),)
-            and desired.dtype.kind in "fiu"
-            and bool(np.isfinite(desired).all())
-        )
+        self._set(context, discrete_state, self._evaluate(context))
+
+    def _evaluate(self, context: Context) -> Any:
+        ports = (self._action_port, self._pose_port, self._wrench_port)
+        return self._function(*(port.Eval(context).copy() for port in ports))
+
+    def _set(self, context: Context, discrete_state: DiscreteValues, returned: Any) -> None:
+        desired = _numbers(returned, self._desired_pose_port.size())
+        is_usable = desired is not None and bool(np.isfinite(desired).all())
         if is_usable:
             discrete_state.set_value(self._desired_pose, desired)
-        discrete_state.set_value(self._held_action, action)
+        discrete_state.set_value(self._held_action, self._action_port.Eval(context))
         discrete_state.set_value(self._fallback, [float(not is_usable)])
+
+
+def _numbers(returned: Any, size: int) -> np.ndarray | None:
+    """Return an array (size,) of numbers, finite or not; None if the function returned anything else."""
+    try:
+        desired = np.asarray(returned)
+    except ValueError:
+        return None
+    return desired if desired.shape == (size,) and desired.dtype.kind in "fiu" else None

@@ -36,9 +36,11 @@ class Options(BaseModel):
 
 
 def _split_list(value: Any) -> Any:
-    """Return comma-separated text or an array as a list; return anything else unchanged."""
+    """Return comma-separated text, an array or a single number as a list; return anything else unchanged."""
     if isinstance(value, str):
         return [part for part in value.split(",") if part.strip()]
+    if isinstance(value, int | float | np.number) and not isinstance(value, bool):
+        return [value]
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 

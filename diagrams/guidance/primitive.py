@@ -12,6 +12,7 @@ from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.wiring import add_system
+from guiderail.models.common.errors import InputError
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
@@ -20,6 +21,20 @@ def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
     """Return the configuration of the prior's primitive; the kind of guidance requires demonstrations."""
     assert prior.demonstrations is not None
     return prior.demonstrations
+
+
+def refuse_limits(config: PrimitiveConfig) -> None:
+    """Raise an `InputError` if limits of the motion are given, for guidance that does not enforce them."""
+    motion = config.motion
+    if motion is None:
+        return
+    given = {
+        "max_speed": np.isfinite(np.asarray(motion.max_speed, float)).any(),
+        "max_acceleration": np.isfinite(np.asarray(motion.max_acceleration, float)).any(),
+        "joint_margin": bool(motion.state),
+    }
+    if names := " and ".join(name for name, is_given in given.items() if is_given):
+        raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
 
 
 class PrimitiveGuidance(Guidance):
@@ -139,6 +154,8 @@ class KgrlGuidance(PrimitiveGuidance):
         super().__init__()
         task, builder = primitive_config_of(prior), DiagramBuilder()
         config = task if constrained else replace(task, motion=None)
+        if not constrained:
+            refuse_limits(task)
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
         kmp = LcNsKmpSystem(primitive, config.null_space_gains(primitive), config.control_period)

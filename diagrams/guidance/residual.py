@@ -12,7 +12,12 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.envs.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, primitive_config_of
+from guiderail.diagrams.guidance.primitive import (
+    PrimitiveGuidance,
+    add_demonstration,
+    primitive_config_of,
+    refuse_limits,
+)
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
@@ -83,6 +88,7 @@ class ResidualGuidance(PrimitiveGuidance):
         config, builder = primitive_config_of(prior), DiagramBuilder()
         if config.progress is not None:
             raise InputError("residual guidance is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
+        refuse_limits(config)
         action, pose = self._export_inputs(builder, config)
         kmp = add_demonstration(builder, config, action, takes_window=takes_window)
         residual = Residual(config.residual_gains())

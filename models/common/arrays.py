@@ -28,8 +28,9 @@ def is_finite(values: np.ndarray) -> bool:
 
 def is_whole(value: object, least: int) -> bool:
     """Return True for a whole number of at least `least`; False for bools, NaN, infinity and what is no real number."""
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    return is_number and float(value).is_integer() and float(value) >= least
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    return float(value).is_integer() and float(value) >= least
 
 
 _EXACT = 2**53  # a double represents smaller whole numbers exactly

@@ -60,8 +60,14 @@ def test_desired_pose_is_repeated_when_the_value_is_invalid(nothing):
 
 
 def test_first_fallback_is_the_measured_pose():
-    _, _, out = running(lambda action, pose, wrench: None)
+    _, _, out = running(lambda action, pose, wrench: [np.nan, 0.0])
     assert (out("desired_pose"), out("fallback")) == ([1.0, 2.0], [1.0])
+
+
+@pytest.mark.parametrize("nothing", [None, [1.0], np.zeros((1, 2)), "far", np.array([1j, 0.0]), [[], 1.0]])
+def test_initialization_raises_when_the_function_does_not_return_a_pose(nothing):
+    with pytest.raises(InputError, match="function must return 2 numbers, not"):
+        running(lambda action, pose, wrench: nothing)
 
 
 def test_function_cannot_modify_the_inputs():

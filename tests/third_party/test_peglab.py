@@ -109,7 +109,10 @@ def test_a_setting_of_its_learner_is_validated(lab):
     guiderail(lab, *words, "--set", "deviation=0.1", "--out", "careful", "--no-pictures")
     assert "deviation: 0.1" in (lab.folder / "careful" / "config.yaml").read_text()
     for setting, sentence in (
-        ("deviation=-1", "learner's deviation cannot be '-1'"),
+        (
+            "deviation=-1",
+            "learner's deviation cannot be '-1' (input should be greater than 0): give a value such as 0.3",
+        ),
         ("deviaton=1", "did you mean deviation?"),
         ("learning_rate=0.1", "peglab_hill_climbing has no setting 'learning_rate'"),
     ):

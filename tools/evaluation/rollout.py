@@ -149,8 +149,23 @@ def rollout(
         else outside_row(index, total, infos, is_terminated=terminated)
     )
     for callback in callbacks:
-        row |= callback.on_episode_end(row)
+        row |= new_columns(callback, row)
     return row
+
+
+def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the columns that a callback adds to an episode's row.
+
+    Raises:
+        InputError: If the row has one of them already.
+    """
+    columns = callback.on_episode_end(row)
+    if taken := sorted(set(columns) & set(row)):
+        raise InputError(
+            f"{type(callback).__name__}.on_episode_end returns the column {taken[0]!r}, which every episode has "
+            "already: choose another name"
+        )
+    return columns
 
 
 class Paths(EnvCallback):

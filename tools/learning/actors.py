@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import set_random_seed
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, has_image, rollout
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, has_image, new_columns, rollout
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
@@ -109,7 +109,7 @@ class ParallelLearner(Learner):
         for transition in episode.transitions:
             learner.on_step(transition)
             self._exchange(0.0)  # an idle actor must not wait until the whole episode is learned
-        row = {**episode.row, **learner.on_episode_end(episode.row)}
+        row = {**episode.row, **new_columns(learner, episode.row)}
         self._learned += 1
         self._snapshots[self._learned] = _snapshot(learner)
         for old in [number for number in self._snapshots if number < self._required(self._learned)]:

@@ -312,7 +312,8 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0]) if first["loc"] else "configuration"
-        example = next((f" such as {field.default!r}" for field in fields(kind) if field.name == name), "")
+        defaults = {field.name: getattr(field.default, "default", field.default) for field in fields(kind)}
+        example = f" such as {defaults[name]!r}" if name in defaults else ""
         raise InputError(
             f"the learner's {name} cannot be {brief(values.get(name))} ({first['msg'].lower()}): give a value{example}"
         ) from None

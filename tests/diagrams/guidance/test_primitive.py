@@ -7,6 +7,8 @@ import pytest
 from pydantic import ValidationError
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import PrimitiveOptions
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
@@ -300,3 +302,20 @@ def test_motion_that_waits_refuses_constraints_of_each_step(skill):
     moving = LinearConstraints.box(np.full((STEPS, 2), -1.0), np.full((STEPS, 2), 1.0))
     with pytest.raises(InputError, match="progress=clock"):
         replace(skill, constraints=moving, progress=StateProgress((0.02, 0.1), 20))
+
+
+LIMITS = {"max_speed": (0.5,), "max_acceleration": (4.0,)}
+
+
+@pytest.mark.parametrize("guidance", ["residual", "safe_residual", "residual_covariance"])
+@pytest.mark.parametrize("name", LIMITS)
+def test_guidance_without_constraints_refuses_limits_of_the_motion(guidance, name):
+    with pytest.raises(InputError, match=f"only kgrl, skgrl and kmp enforce {name}: choose"):
+        make_env("NarrowPassage", guidance=guidance, **{name: LIMITS[name]})
+
+
+def test_one_number_limits_the_speed_of_all_positions():
+    speeds = [EnvConfig.resolve("NarrowPassage", {"max_speed": value}).options["max_speed"] for value in (0.5, "0.5")]
+    assert speeds == [(0.5,), (0.5,)]
+    with pytest.raises(InputError, match="max_speed must be several numbers, such as"):
+        EnvConfig.resolve("NarrowPassage", {"max_speed": True})

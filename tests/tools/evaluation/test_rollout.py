@@ -2,7 +2,9 @@ import itertools
 
 import gymnasium
 import numpy as np
+import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
 from guiderail.tools.evaluation.metrics import COLUMNS
@@ -36,6 +38,15 @@ def test_callbacks_are_called_from_start_to_end():
     assert row["return"] == sum(decision.reward for decision in decisions)
     assert list(row) == [*(c.name for c in COLUMNS), "reward_goal_distance", "decisions"]
     assert row["episode"] == 7
+
+
+def test_callback_cannot_replace_a_column():
+    class Score(Callback):
+        def on_episode_end(self, row):
+            return {"score": 2.0, "return": 1.0}
+
+    with pytest.raises(InputError, match="on_episode_end returns the column 'return', which"):
+        rollout(make_environment("Bead", {}), lambda observation: np.zeros(2), Score(), seed=3)
 
 
 def test_seed_repeats_an_episode_and_held_out_differs():
