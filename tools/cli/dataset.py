@@ -152,7 +152,7 @@ def create_task(
     from guiderail.tools.parts.create_task import ask_unit
     from guiderail.tools.parts.create_task import create_task as create
 
-    result = create(
+    created = create(
         plug,
         socket,
         out,
@@ -170,4 +170,9 @@ def create_task(
         hard_episodes=hard_episodes,
         log=(lambda text: None) if as_json else print_progress,
     )
-    print_result(result, as_json)
+    if not as_json:
+        hard = created.pop("hard", {})
+        created |= {f"hard_{name}": value for name, value in hard.items()}
+        for name, unit in (("modulus", "Pa"), ("force", "N"), ("hard_force_limit", "N")):
+            created = {f"{name.replace('_', ' ')} [{unit}]" if key == name else key: created[key] for key in created}
+    print_result(created, as_json)

@@ -366,6 +366,11 @@ def _write_task(
             f"none of the {NUM_DEMONSTRATIONS} scripted demonstrations seats the plug: check --plug-pose, --axis, "
             "--center and --turn, or give a larger --force-limit"
         )
+    if succeeded < NUM_DEMONSTRATIONS:
+        log(
+            f"only {succeeded} of {NUM_DEMONSTRATIONS} demonstrations seat the plug: check clearance, friction and the "
+            "axis if no policy learns the task"
+        )
     measured["demonstrations_seated"] = f"{succeeded} of {NUM_DEMONSTRATIONS}"
     measured["total_s"] = _seconds_since(start)
     file = file.model_copy(update={"measured": measured})
