@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -157,9 +157,11 @@ def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]
     """Return the columns that a callback adds to an episode's row.
 
     Raises:
-        InputError: If the row has one of them already.
+        InputError: If the callback returns no columns by name, or one that the row has already.
     """
     columns = callback.on_episode_end(row)
+    if not isinstance(columns, Mapping):
+        raise InputError(f"{type(callback).__name__}.on_episode_end must return a dictionary, not {brief(columns)}")
     if taken := sorted(set(columns) & set(row)):
         raise InputError(
             f"{type(callback).__name__}.on_episode_end returns the column {taken[0]!r}, which every episode has "

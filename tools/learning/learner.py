@@ -163,7 +163,7 @@ def described_observation(env: gymnasium.Env) -> dict[str, Any]:
 
 def divergence_error() -> InputError:
     """Return the error for a learner that `has_diverged`."""
-    return InputError("learning diverged: train again with a smaller --set learning_rate=...")
+    return InputError("learning diverged: train again with other settings, such as a smaller --set learning_rate=...")
 
 
 def learner_arguments(config: Any, task: Any) -> dict[str, Any]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from numbers import Number
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import torch
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.metrics import WORDS
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
@@ -166,7 +169,7 @@ def _train(
             folder.write_episodes(rows)  # the loop below does not write the table of a complete run
         if len(rows) < config.episodes:
             folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
-    supervised = None
+    num_restored, supervised = len(rows), None
     if config.human_in_the_loop and supervisor is not None:
         from guiderail.tools.learning.interventions import SupervisedTraining
 
@@ -195,11 +198,7 @@ def _train(
         if num_demonstrated:
             row["is_demonstration"] = int(episode < num_demonstrated)
         row["wall_time"] = time.perf_counter() - started
-        if rows and rows[0].keys() != row.keys():
-            raise InputError(
-                f"the run in {folder.path} was begun by another version of guiderail, whose episodes have other "
-                "columns: resume it with that version, or train again in another folder"
-            )
+        _check_columns(row, rows, num_restored, folder)
         rows.append(row)
         training_time += time.perf_counter() - started
         if report is not None:
@@ -218,8 +217,26 @@ def _train(
     learner.finish()
     learning_log.record(rows, learner.metrics, is_finished=True)
     policy = learner.policy({"task": config.task, **described_observation(env)})
+    if not isinstance(policy, Policy):
+        raise InputError(f"{type(learner).__name__}.policy must return a Policy, not {brief(policy)}")
     policy.save(folder.path, write=write_atomically)
     return rows
+
+
+def _check_columns(row: dict[str, Any], rows: list[dict[str, Any]], num_restored: int, folder: RunFolder) -> None:
+    """Raise an `InputError` unless an episode has numbers in the columns of the episodes before it."""
+    if rows and (changed := sorted(rows[0].keys() ^ row.keys())):
+        if len(rows) == num_restored:
+            raise InputError(
+                f"the run in {folder.path} was begun by another version of guiderail or of its learner, whose episodes "
+                "have other columns: resume it with that version, or train again in another folder"
+            )
+        raise InputError(
+            f"the column {changed[0]!r} is missing in some episodes: on_episode_end must always return the same names"
+        )
+    for name, value in row.items():
+        if name not in WORDS and not isinstance(value, Number | None):
+            raise InputError(f"the column {name!r} of an episode must be a number, not {brief(value)}")
 
 
 def _save(

@@ -203,3 +203,29 @@ def test_corrections_rescue_demonstrations_that_are_5_mm_off(tmp_path):
     assert [row["success"] for row in rows] == [0, 0, 1]
     assert sum(row["interventions"] for row in rows) <= 5
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("columns", "policy", "words"),
+    [
+        ([None], Policy, "on_episode_end must return a dictionary, not None"),
+        ([{"return": 0.0}], Policy, "returns the column 'return', which"),
+        ([{"word": "good"}], Policy, "the column 'word' of an episode must be a number, not 'good'"),
+        ([{"a": 1}, {"b": 1}], Policy, "the column 'a' is missing in some episodes"),
+        ([{}, {}], None, "Odd.policy must return a Policy, not None"),
+    ],
+)
+def test_learner_that_returns_something_else_is_named(columns, policy, words, tmp_path):
+    class Odd(ZeroLearner):
+        def on_episode_end(self, row):
+            return columns[row["episode"]]
+
+        def policy(self, description):
+            return super().policy(description) if policy else None
+
+    LEARNERS.register("odd")(Odd)
+    try:
+        with pytest.raises(InputError, match=words):
+            run_training(RunFolder(tmp_path / "run"), configure("Bead", {}, algorithm="odd", episodes=2, seed=1))
+    finally:
+        del LEARNERS._entries["odd"]
