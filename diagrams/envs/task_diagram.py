@@ -76,12 +76,12 @@ class TaskDiagram:
     one per reward term     (1,) each, named as in `reward_terms`
     ``termination``         (1,) an index into `guiderail.systems.episode_monitor.TERMINATIONS`
     ``commanded_violation`` (1,) max over the constraints of c - G y of the commanded output; negative is slack
-    ``measured_violation``  (1,) the same for the measured pose
+    ``measured_violation``  (1,) the same maximum for the measured pose
     ``contact_force``       (1,) magnitude of the contact force [N]
     ``desired_pose``        (O,) commanded pose
     ``pose``                (O,) measured pose
     ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
-    ``wrench``              (W,) of the surroundings on the tool; this port and the next four are optional
+    ``wrench``              (W,) wrench of the surroundings on the tool; this port and the next four are optional
     ``saturation``          nonzero while an actuator is at its limit; its size depends on the station
     ``collision``           (1,) positive during a collision
     ``privileged``          (m,) observation for a privileged critic; the policy does not receive it

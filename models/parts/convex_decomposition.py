@@ -13,11 +13,11 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.parts.solids import SCALE, SurfaceLocator, measure_distance, to_arrays
 
-MAX_PIECES = 300  # the base of two gears with a third between them has 282
-MAX_FINE_PIECES = 800  # of a fine decomposition; few of them touch at a time
-_FINE_SLIVER = 1e-8  # part of the whole volume below which a piece of a fine decomposition is a rounding error
-_SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding error
-_CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its hull
+MAX_PIECES = 300  # largest number of pieces; the base of two gears with a third between them has 282
+MAX_FINE_PIECES = 800  # largest number of pieces of a fine decomposition; few of them are in contact at a time
+_FINE_SLIVER = 1e-8  # fraction of the whole volume below which a piece of a fine decomposition is a rounding error
+_SLIVER = 1e-6  # fraction of the whole volume below which a piece is a rounding error
+_CONVEX = 1e-4  # fraction of its volume by which a convex piece may differ from its hull
 _FLAT = 1e-2  # angle below which an edge does not count as concave [rad]
 _DEPTH_SAMPLES = 500  # points sampled on the surface of a part and its hull
 THINNEST = 1e-3  # thickness below which a piece is a rounding error [mm]
@@ -36,8 +36,8 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
     Args:
         solid: Solid of `manifold3d`.
         max_pieces: Largest number of pieces.
-        depth: Depth below which a concavity is filled [mm], whatever its volume. If it is given, smaller parts are cut
-            off, and parts that the planes of their faces only graze are cut between the faces.
+        depth: Depth below which a concavity is filled [mm]; None: volumes decide instead. With a depth, smaller parts
+            are kept, and a part that no plane of a face cuts is cut by planes that halve the angles between faces.
 
     Returns:
         The pieces; None if more than `max_pieces` are necessary, or if hulls fill a concavity that no cut removes.
@@ -88,7 +88,7 @@ def cut_into_sectors(solid: Any, number: int, max_pieces: int = MAX_PIECES) -> l
 
 
 def _with_large_faces(convex: Any) -> Any:
-    """Return a convex solid without vertices so near to an edge or vertex that a face is too small for Drake."""
+    """Remove vertices of a convex solid until no face is too small for Drake; return the new solid."""
     from pydrake.geometry import Convex  # imported here because it takes half a second
 
     manifold3d = import_extra("manifold3d")
@@ -137,7 +137,7 @@ def _hollow(solid: Any) -> float:
 
 
 def _depth(solid: Any) -> float:
-    """Return the largest distance of a solid's vertices from its convex hull, and of hull samples from it [mm]."""
+    """Return the sampled Hausdorff distance of a solid and its convex hull [mm], from vertices and samples."""
     surface, hull = to_arrays(solid), to_arrays(solid.hull())
     inside = float(SurfaceLocator(*hull).find_nearest(surface[0])[1].max())
     return SCALE * max(inside, measure_distance(hull, surface, _DEPTH_SAMPLES))
@@ -185,7 +185,7 @@ def _planes(mesh: Any) -> list[tuple[np.ndarray, float]]:
 def _bisectors(mesh: Any) -> list[tuple[np.ndarray, float]]:
     """Return planes that halve the angle at concave edges, those with the largest angles and lengths first.
 
-    The plane of a face may only graze the part, but these cut it in two.
+    The plane of a face may only touch the part, but these planes cut it in two.
     """
     concave = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _ALMOST_FLAT)
     starts, ends = mesh.vertices[mesh.face_adjacency_edges[concave]].transpose(1, 0, 2)

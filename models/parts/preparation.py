@@ -45,7 +45,7 @@ _FIRST_FRACTION = 0.7  # fraction of the remaining tolerance at the first attemp
 KINDS = ("convex", "sectors", "fine", "tetrahedra")
 """Kinds of pieces of a compliant part: convex pieces, sectors of a screw, more and finer convex pieces, and tetrahedra.
 
-Each is tried if the ones before do not let the plug reach its target.
+Each kind is tried if the plug does not reach its target with the kinds before it.
 """
 
 Arrays = tuple[np.ndarray, np.ndarray]
@@ -197,7 +197,7 @@ def make_compliant(
 
 
 def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") -> tuple[list[Piece], float] | None:
-    """Return convex pieces of all bodies and the measured distance of what they add from the surface [m].
+    """Return convex pieces of all bodies, and the largest measured distance of added material from the surface [m].
 
     The result is None if there are too many pieces or they deviate too much. `kind` is one of `KINDS`, not tetrahedra.
     """
@@ -226,7 +226,7 @@ def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") 
 
 
 def _added(pieces: Sequence[Any], solid: Any) -> Arrays | None:
-    """Return the surface of what pieces add to a solid; None if they add nothing."""
+    """Return the surface of the material that pieces add to a solid; None if they add none."""
     manifold3d = import_extra("manifold3d")
     # The opposite difference would contain the seams between pieces.
     added = to_arrays(manifold3d.Manifold.batch_boolean(list(pieces), manifold3d.OpType.Add) - solid)

@@ -1,6 +1,7 @@
 """Solids of `manifold3d`, in millimeters, distances between surfaces in meters (libigl), and tetrahedral meshes.
 
-Tetrahedra (fTetWild) are for parts that do not close exactly, or do not decompose into few convex pieces.
+Tetrahedra (fTetWild) are used for parts whose surface is not exactly closed, or that do not decompose into few convex
+pieces.
 """
 
 from __future__ import annotations
@@ -110,6 +111,9 @@ def tetrahedralize(
         tolerance: Largest deviation of the boundary [m].
         edge: Desired length of an edge, as a fraction of the diagonal of the bounding box.
         optimize: True to improve the shape of the tetrahedra, which takes most of the time.
+
+    Raises:
+        ValueError: If the triangles enclose no volume.
     """
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     mesher = import_extra("pytetwild")
@@ -140,7 +144,7 @@ def _oriented(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def boundary_of(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) and outward triangles (T, 3) of the boundary of tetrahedra."""
+    """Return vertices (V, 3) [m] and outward triangles (T, 3) of the boundary of tetrahedra (N, 4)."""
     used, faces = np.unique(_boundary_faces(cells), return_inverse=True)
     return points[used], faces.reshape(-1, 3)
 
@@ -153,7 +157,10 @@ def _boundary_faces(cells: np.ndarray) -> np.ndarray:
 
 
 def add_interior_points(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split each tetrahedron at its center if all its corners are on the boundary, where the pressure is zero."""
+    """Split each tetrahedron at its center if all its corners are on the boundary, where the pressure is zero.
+
+    Points are (P, 3) [m] and tetrahedra (N, 4); returns new arrays of both.
+    """
     is_outer = np.zeros(len(points), bool)
     is_outer[_boundary_faces(cells)] = True
     flat = is_outer[cells].all(axis=1)
@@ -166,7 +173,7 @@ def add_interior_points(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarr
 
 
 def vtk_text(points: np.ndarray, cells: np.ndarray) -> str:
-    """Return a VTK file of points (P, 3) [m] and tetrahedra (N, 4)."""
+    """Return the text of a VTK file of points (P, 3) [m] and tetrahedra (N, 4)."""
     lines = ["# vtk DataFile Version 3.0", "guiderail", "ASCII", "DATASET UNSTRUCTURED_GRID"]
     lines += [f"POINTS {len(points)} double", *(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in points)]
     lines += [f"CELLS {len(cells)} {5 * len(cells)}", *(f"4 {a} {b} {c} {d}" for a, b, c, d in cells)]

@@ -80,6 +80,8 @@ def check_deviation(
 ) -> float:
     """Return the first number of `measure_deviation`, in standard deviations; warn if it exceeds one.
 
+    The arguments are those of `measure_deviation`, and `max_deviation` is the largest accepted first number.
+
     Raises:
         InputError: If the first number exceeds `max_deviation` and the second one exceeds `MAX_MISS`.
     """

@@ -35,7 +35,7 @@ _MAX_DIRECTORY_SIZE = 100_000  # largest directory of an archive [bytes]
 
 # Name of the clock's column in a file of one demonstration, with or without a unit.
 _TIME = re.compile(r"(?:t|time|timestamp)\s*(?P<unit>[\[(/].*)?", re.IGNORECASE)
-SECONDS = ("s", "sec", "secs", "second", "seconds")
+SECONDS = ("s", "sec", "secs", "second", "seconds")  # accepted spellings of the unit of time
 
 
 class Recording(NamedTuple):
@@ -78,7 +78,7 @@ def _read_file(path: Path, max_size: int) -> Recording:
 
 
 def write_npz(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    """Write the samples of all demonstrations one after another, and the `lengths` of the demonstrations."""
+    """Write demonstrations to an .npz file: their concatenated samples, their `lengths` and the outputs' names."""
     content = io.BytesIO()
     np.savez_compressed(
         content,
@@ -91,7 +91,7 @@ def write_npz(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndar
 
 
 def write_csv(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    """Write one row per sample: demonstration, time, outputs."""
+    """Write demonstrations to a .csv file with one row per sample: demonstration, time, outputs."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(["demonstration", "time", *names])

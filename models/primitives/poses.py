@@ -20,6 +20,7 @@ POSE_NAMES: dict[str, tuple[str, ...]] = {
     "euler_zyx": ("x [m]", "y [m]", "z [m]", "psi_z [rad]", "psi_y [rad]", "psi_x [rad]"),
     "rotation_vector": ("x [m]", "y [m]", "z [m]", "r_x [rad]", "r_y [rad]", "r_z [rad]"),
 }
+"""Names of the six outputs, by the representation of the orientation."""
 
 
 def pose_outputs(

@@ -273,7 +273,7 @@ class Funnel(PositionConstraint):
 class FixedOrientation(FrameConstraint):
     """Constant orientation R_FE."""
 
-    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch and yaw of R_FE
     frame: str = WORLD  # F: frame of an object, or `world`
 
     def __post_init__(self) -> None:
@@ -344,7 +344,7 @@ class TiltLimits(TiltConstraint):
     min_deg: float  # lower bound of the tilt
     max_deg: float  # upper bound of the tilt
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
-    turns_along: bool = False  # whether E turns about F's z axis as it moves around it
+    turns_along: bool = False  # True if E turns about F's z axis as it moves around it
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
@@ -364,7 +364,7 @@ class TiltByDistance(TiltConstraint):
     distance_m: tuple[float, ...]  # distances to F's origin, increasing
     tilt_deg: tuple[float, ...]  # one tilt for each distance; linear in between, constant beyond
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
-    turns_along: bool = False  # whether E turns about F's z axis as it moves around it
+    turns_along: bool = False  # True if E turns about F's z axis as it moves around it
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")

@@ -75,7 +75,7 @@ def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames:
 
 
 def bearing(p_FE: np.ndarray) -> np.ndarray:
-    """Return the horizontal unit vector in F from E to F's origin; +x if E is on F's z axis."""
+    """Return the horizontal unit vector (3,) in F from E to F's origin; +x if E is on F's z axis."""
     horizontal = math.hypot(p_FE[0], p_FE[1])
     if horizontal < NEAR_AXIS:
         return np.array([1.0, 0.0, 0.0])
@@ -83,7 +83,7 @@ def bearing(p_FE: np.ndarray) -> np.ndarray:
 
 
 def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
-    """Return the axis in F about which a positive angle tilts an upright tool towards F's origin: z × bearing."""
+    """Return the axis (3,) in F about which a positive angle tilts an upright tool towards F's origin, z × bearing."""
     towards = bearing(p_FE)
     return np.array([-towards[1], towards[0], 0.0])
 

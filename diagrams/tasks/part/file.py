@@ -125,7 +125,10 @@ class Tolerance(Options):
     steps: int = Field(3, ge=1, description="consecutive control steps that count as success")
 
     def accepts(self, plug: np.ndarray) -> bool:
-        """Return True if a plug is at the target; `plug` is its position and rotation vector in the socket, (6,)."""
+        """Return True if a plug is at the target.
+
+        `plug` is its position [m] and rotation vector [rad] in the socket, (6,).
+        """
         return bool(
             abs(plug[2]) < self.height
             and np.hypot(plug[0], plug[1]) < self.lateral
@@ -339,7 +342,9 @@ def read_task_file(folder: Path) -> PartTaskFile:
 
 
 def task_folder_digest(folder: Path) -> str:
-    """Return a digest of `task.yaml`, of whose measurements only the clearance counts, and of all files that it names.
+    """Return a digest of `task.yaml` and of all files that it names.
+
+    Of the measurements in `task.yaml`, only the clearance is part of the digest.
 
     Raises:
         InputError: As `read_task_file`.
