@@ -27,7 +27,7 @@ class HistoryBuffer(LeafSystem):
         - history
 
     ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
-    ``output``. ``history`` is discrete state without direct feedthrough, so a feedback loop with the primitive is not
+    ``output``. ``history`` is a discrete state without direct feedthrough, so a feedback loop with the primitive is not
     algebraic.
 
     Args:

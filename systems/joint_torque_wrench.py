@@ -30,9 +30,9 @@ class JointTorqueWrench(LeafSystem):
         - wrench
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool center P in the axes of
-    T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, without direct feedthrough.
-    The first sample initializes the filter: a filter that starts at zero would not reach the full bias before a tare.
-    Samples that are not finite are skipped.
+    T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without direct feedthrough: one sample old, and zero in a
+    default context. The first sample initializes the filter: a filter that starts at zero would not reach the full bias
+    before a tare. Samples that are not finite are skipped.
 
     Args:
         plant: Model of the arm alone, finalized.

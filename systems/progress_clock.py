@@ -20,7 +20,7 @@ class ProgressClock(LeafSystem):
         - motion_time
 
     ``command`` and ``pose`` (measured) are (O,). ``motion_time`` (1,) is the time of the motion [s], a whole multiple
-    of the period; it is state, and zero at initialization.
+    of the period; it is a discrete state, and zero at initialization.
 
     Args:
         rule: Rule of the progress.

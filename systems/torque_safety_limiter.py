@@ -80,8 +80,8 @@ class TorqueSafetyLimiter(LeafSystem):
     A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
     the start the limiter waits for a valid status and then takes over without `resume`. The output is always finite and
     within the torque limits; at zero torque the robot only compensates its weight. After a stop, zero torque is sent
-    for `ZERO_TORQUE_TIME`, and then only while there is no status fault. A driver that can hold the arm by itself
-    (brakes, position control) is asked to do so when a status fault stopped the arm.
+    for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the driver can hold the arm
+    by itself (brakes, position control), ``is_holding`` requests this after a status fault stopped the arm.
 
     .. pydrake_system::
 

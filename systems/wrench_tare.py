@@ -41,8 +41,8 @@ class WrenchTare(LeafSystem):
         if skipped < 0 or averaged < 1:
             raise InputError(f"a tare skips samples from 0 and averages at least one, not {skipped} and {averaged}")
         self._skipped, self._averaged = skipped, averaged
-        self._count = self.DeclareDiscreteState(1)  # k
-        self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # the mean of the samples so far
+        self._count = self.DeclareDiscreteState(1)  # number k of samples so far
+        self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # mean of the averaged samples so far
         self._measured_wrench_port = self.DeclareVectorInputPort("measured_wrench", WRENCH_SIZE)
         sources = [self._measured_wrench_port, self._count, self._offset]
         self._tared_wrench_port = declare.output(self, "tared_wrench", WRENCH_SIZE, self._tared_wrench, sources)
