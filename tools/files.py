@@ -60,6 +60,7 @@ def _check_output(kind: str, endings: tuple[str, ...], path: Path) -> None:
     check_writable(path)
 
 
+# Functions of a path that raise an InputError if its ending is wrong or the file cannot be written.
 check_picture = partial(_check_output, "picture", PICTURES)
 check_video = partial(_check_output, "video", VIDEOS)
 check_page = partial(_check_output, "page", PAGES)
@@ -127,13 +128,14 @@ def check_new(out: Path, what: str) -> None:
     check_writable(out)
 
 
-ENDINGS = (".npz", ".csv")
+ENDINGS = (".npz", ".csv")  # endings of demonstration files
 
 
 def load_demonstrations(path: Path) -> Demonstrations:
     """Return the demonstrations of a file, or of all .npz and .csv files of a folder.
 
-    Files are read by `Demonstrations.load`, as in training: what is valid here is also valid there.
+    Each file is read by `Demonstrations.load`, as in training. As a folder, `Demonstrations.load` itself accepts only
+    .csv files.
 
     Raises:
         InputError: If there are none, or a file is invalid.

@@ -20,7 +20,7 @@ from guiderail.diagrams.tasks.registry import is_task_folder, register_task_fold
 from guiderail.models.common.errors import InputError, brief
 
 _IMPORTED_FILES: dict[Path, bytes] = {}  # content of each file when it was imported
-_TRUSTED = ContextVar("trusted", default=False)  # whether imports that a file names may be executed
+_TRUSTED = ContextVar("trusted", default=False)  # True if imports that a file names may be executed
 
 
 @contextmanager

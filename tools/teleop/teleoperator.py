@@ -33,7 +33,7 @@ class Teleoperator(Protocol):
 class Slider:
     """Slider of a page."""
 
-    limit: float  # largest value, and smallest value with the opposite sign
+    limit: float  # largest magnitude of the value
     step: float  # change by one key press
     keys: tuple[str, str]  # keys that lower and raise the value, by JavaScript's codes
     scale: float = 1.0  # factor from the slider's unit to that of the input

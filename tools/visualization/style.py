@@ -17,7 +17,7 @@ from guiderail.tools.files import check_picture, write_atomically
 
 
 def is_demonstrated(guidance: str | None) -> bool:
-    """Return True if an action of zero reproduces the demonstration and so shows the success without learning."""
+    """Return True if an action of zero reproduces the demonstration, so that its success needs no learning."""
     return guidance in GUIDANCE.names() and GUIDANCE.get(str(guidance)).demonstrates
 
 
@@ -46,7 +46,7 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a picture in the format of its file ending; the SVG file of the same figure is always the same."""
+    """Write a picture in the format of its file ending; equal figures give equal SVG files."""
     check_picture(path)
     content, kind = io.BytesIO(), path.suffix[1:].lower()
     with matplotlib.rc_context({"svg.hashsalt": "guiderail", "svg.fonttype": "none"}):
@@ -56,7 +56,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
 
 
 def rolling(values: Sequence[float] | np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """Return the moving mean of the last `window` values, or of fewer values at the start."""
+    """Return the moving mean (n,) of the last `window` of the values (n,), or of fewer values at the start."""
     return pd.Series(np.asarray(values, float)).rolling(window, min_periods=1).mean().to_numpy()
 
 

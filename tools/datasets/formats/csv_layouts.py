@@ -24,7 +24,7 @@ from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
 from guiderail.tools.datasets.formats.recorded import UNITS, Recorded, poses_in_target, rotations_of
 
-TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)
+TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)  # names of a time column
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
 _ORDERS = ("wxyz", "xyzw")
@@ -45,10 +45,10 @@ _NO_POSE = re.compile(
 )  # column names of quantities other than a pose, such as velocity and force
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
 _EULER = (("roll", "pitch", "yaw"), ("rx_rpy", "ry_rpy", "rz_rpy"))
-_UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
-_DELIMITERS = ",\t;| "
-_EMPTY = ("", "na", "n/a", "#n/a", "null", "none")
-_MAX_LISTED = 8
+_UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))  # numbered columns: the names do not state the order
+_DELIMITERS = ",\t;| "  # accepted delimiters; the first one in the header is used, in this order
+_EMPTY = ("", "na", "n/a", "#n/a", "null", "none")  # texts of an empty field, in lower case
+_MAX_LISTED = 8  # largest number of names in a message
 
 
 @dataclass(frozen=True)

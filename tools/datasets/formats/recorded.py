@@ -108,6 +108,6 @@ def choose_signal(candidates: Sequence[str], given: str | None, where: str, opti
     kind = (
         "the commanded motion, by its name"
         if is_commanded(chosen[0])
-        else "the measured motion, as its name does not say commanded"
+        else "the measured motion, as its name does not state that it is commanded"
     )
     return chosen[0], [f"{chosen[0]} is {kind}"]
