@@ -216,9 +216,9 @@ def evaluate(
         describe_differences: Function from a configuration to sentences on how it differs from a reference.
 
     Returns:
-        Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, what the
-        result is valid for; the statistics `COMPARED`, each also as `demonstration_<name>` (None without a
-        demonstration) and `<baseline>_<name>`; `baselines`, the names of the baseline policies evaluated, and
+        Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, the
+        conditions that the result is valid for; the statistics `COMPARED`, each also as `demonstration_<name>` (None
+        without a demonstration) and `<baseline>_<name>`; `baselines`, the names of the evaluated baseline policies, and
         `skipped_baselines`, those with another observation or action; `best_baseline` and `p`, see `Comparison`;
         `episodes` and `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run;
         `saved`, the number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is.

@@ -70,8 +70,8 @@ class ForeignPolicy(Callback):
     ):
         """Construct the policy from a function from an observation to an action; shapes are given if they are known.
 
-        A leading dimension of 1 of the action is removed. `errors` are raised by `act` for an observation of a wrong
-        shape.
+        A leading dimension of 1 of the action is removed. `errors` are the exceptions that `act` raises for an
+        observation of a wrong shape.
         """
         self.observation_shape, self.action_shape = observation_shape, action_shape
         self._act, self._errors = act, errors

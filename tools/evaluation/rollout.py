@@ -228,7 +228,8 @@ class EpisodeProgress:
             name: Name of the bar.
             window: Number of last episodes over which success and return are averaged; None for all episodes.
             console: Console; standard error by default, so that results can be piped.
-            asks: True if questions are asked meanwhile; the bar is then drawn after episodes only, not over a question.
+            asks: True if questions are asked while the bar is shown. The bar is then redrawn only after episodes, so
+                that it covers no question.
         """
         from rich.console import Console  # slow to import
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -45,7 +45,7 @@ def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> 
 
 
 def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets: bool) -> str:
-    """Return what an evaluation is valid for: the hidden offset of one run, or offsets sampled in every episode.
+    """Return the scope of an evaluation: the hidden offset of one run, or offsets sampled in every episode.
 
     Raises:
         InputError: If `resample_offsets` is True and a run of the task has no hidden offset.
@@ -239,7 +239,7 @@ class EpisodeSpec:
 
 
 def outcome(row: Mapping[str, Any]) -> str:
-    """Return how an episode ended, from its row."""
+    """Describe the end of an episode, from its row: termination, control steps and peak force."""
     reason = row["termination"] or "running"
     meaning = f" ({COLLISION})" if reason == "collision" else ""
     return f"{reason} after {row['steps']} control steps, peak force {row['peak_force']:.1f} N{meaning}"

@@ -47,6 +47,7 @@ from guiderail.tools.hardware.preflight import (
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
+# Recorded signals of a control step and their sizes.
 SIGNALS = {
     "wrench": 6,
     "saturation": 1,
@@ -56,6 +57,7 @@ SIGNALS = {
     "fault": 1,
     "arm_state": 1,
 }
+# Recorded signals of the joints, of size n each.
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
 MAX_WARM_UP_TIME = 0.1  # longest duration of the warm-up [s]
 BLEND_TIMEOUT = 5.0  # longest time until the controller has full authority [s]
@@ -232,7 +234,7 @@ class SkillExecutor:
         )
 
     def save(self, folder: Path, outcome: Outcome, metadata: Mapping[str, Any], log: Log) -> None:
-        """Write the recording with its outcome and further metadata, and show where it is."""
+        """Write the recording with its outcome and further metadata, and log its path."""
         metadata = {
             **metadata,
             "outcome": outcome.description,

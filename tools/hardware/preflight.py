@@ -75,7 +75,7 @@ MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
 NUM_STATUSES = 20  # statuses that are received before the checks
 
 
-MARKS = {True: "ok  ", False: "NOT ", None: "read"}  # marks of the printed lines; `read` is for the operator to check
+MARKS = {True: "ok  ", False: "NOT ", None: "read"}  # line marks; the operator checks lines marked `read`
 
 
 class PreflightChecks:

@@ -1,7 +1,7 @@
 """On-policy learners: PPO of Stable-Baselines3 and TRPO of sb3-contrib, trained by the libraries' own steps.
 
-An update uses only the transitions since the last update. A checkpoint stores the transitions
-collected for the next update.
+An update uses only the transitions since the last update. A checkpoint stores the transitions collected for the next
+update.
 """
 
 from collections.abc import Mapping
@@ -118,7 +118,7 @@ class OnPolicyLearner(Learner):
             return policy.predict_values(policy.obs_to_tensor(observation)[0]).flatten()
 
     def metrics(self) -> Mapping[str, float]:
-        """Return what the last training recorded in Stable-Baselines3's logger."""
+        """Return the values that the last training recorded in the logger of Stable-Baselines3."""
         recorded = dict(self.model.logger.name_to_value)
         self.model.logger.dump()
         return recorded

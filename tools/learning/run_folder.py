@@ -41,9 +41,9 @@ class RunConfig:
     seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # seed of everything random
     versions: dict[str, str] = field(default_factory=dict)  # versions of the packages that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register the task, the learner, …
-    step_log: bool = True  # whether every control step is written to the step log
+    step_log: bool = True  # True if every control step is written to the step log
     task_content: str = ""  # digest of the files that define the task; empty if there are none
-    human_in_the_loop: bool = False  # whether a supervisor corrects the policy; see the option via_points
+    human_in_the_loop: bool = False  # True if a supervisor corrects the policy; see the option via_points
 
     @property
     def action_repeat(self) -> int:
