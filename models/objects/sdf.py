@@ -13,7 +13,10 @@ from guiderail.models.common.errors import InputError
 
 
 def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
-    """Return points (N, 3) from cylindrical coordinates about z."""
+    """Return points (N, 3) [m] from cylindrical coordinates about z.
+
+    Radius [m], angle [rad] and height [m] are (N,) or numbers; they are broadcast.
+    """
     radius, angle, height = np.broadcast_arrays(radius, angle, height)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
 
@@ -54,10 +57,11 @@ class TriangleMesh:
 
     @staticmethod
     def from_obj(path: Path) -> "TriangleMesh":
-        """Read the vertices and triangles of an OBJ file, such as one with the text of `to_obj`.
+        """Read the vertices and triangles of an OBJ file with triangular faces, such as one with the text of `to_obj`.
 
         Raises:
-            InputError: If a face has a number of no vertex, or one that is relative to the last vertex.
+            InputError: If a vertex number of a face is less than 1 or more than the number of vertices. Negative
+                numbers, which count from the last vertex, are not supported.
         """
         lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
         vertices = [line[1:4] for line in lines if line[:1] == ["v"]]
@@ -82,9 +86,9 @@ class TriangleMesh:
 
 
 def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMesh:
-    """Return a surface of revolution about z with regular polygons for circles.
+    """Return a surface of revolution about z, whose circles are approximated by regular polygons.
 
-    The middle of a side lies on the x axis.
+    The middle of one side of each polygon lies on the x axis.
 
     Args:
         profile: (radius, height) [m] of each circle. Along the profile, with the radius plotted to the right and the
@@ -98,7 +102,7 @@ def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMes
     )
 
 
-# References that prevent the deletion of the folders: a simulator may read a mesh long after the SDF file.
+# These references prevent the deletion of the folders: a simulator may read a mesh long after the SDF file.
 _FOLDERS: list[TemporaryDirectory[str]] = []
 
 

@@ -24,7 +24,7 @@ _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a roun
 
 @dataclass(frozen=True)
 class InsertionMotion:
-    """Motion of a plug to its target along z, with a turn about z at the end, during which a screw also advances."""
+    """Motion of a plug along z to its target. It may end with a turn about z, during which a screw also advances."""
 
     travel: float  # height of the start above the target [m]
     rim: float  # height at which the plug's lowest point is level with the socket's highest [m]
@@ -215,7 +215,7 @@ def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
 def shrink(part: Part, distance: float) -> Part:
     """Return a part whose faces are moved inwards by a distance [m].
 
-    Each vertex moves such that the planes of its faces move by the distance, in the sense of least squares.
+    The motion of each vertex is a least-squares solution: the planes of its faces move by the distance.
 
     Raises:
         InputError: If the part would have no volume left.
@@ -230,6 +230,7 @@ def shrink(part: Part, distance: float) -> Part:
 
 
 def _vertex_motion(vertices: np.ndarray, triangles: np.ndarray, distance: float) -> np.ndarray:
+    """Return the motion of each vertex (V, 3) [m] that moves the faces inwards by a distance [m]."""
     corners, normals = vertices[triangles], area_vectors(vertices, triangles)
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(areas > 1e-14, normals / np.maximum(areas, 1e-30), 0.0)

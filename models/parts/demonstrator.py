@@ -1,7 +1,7 @@
 """Scripted demonstrator of an insertion: a straight motion for tests, and a search for demonstrations.
 
-Poses [x y z Rz Ry Rx] are those of the plug in the target frame. A command lies below the surface that stops the plug:
-under impedance control the difference is the push.
+Poses [x y z Rz Ry Rx] are those of the plug in the target frame [m, rad]. A command lies below the surface that stops
+the plug; under impedance control, the distance between them determines the push.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # height above and below the rim [m], a
 TURN_SPEED = 45.0 * DEGREE  # [rad/s]
 SEARCH = 1.8  # time on the rim [s]
 PAUSE = 0.3  # time after each part of the motion [s]
-NUM_DEMONSTRATIONS = 10  # with five, the variance changes by a factor of four along the search
+NUM_DEMONSTRATIONS = 10  # with only five, the variance along the search would vary by a factor of four
 SPREAD = 1.7 * MM  # radius of the circle around the nominal position on which the demonstrations' sockets lie [m]
 _ANGLES = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS  # angles of the sockets on the circle [rad]
 
@@ -29,7 +29,9 @@ _CENTERING = 0.9  # fraction of the mean of the random curves that is subtracted
 def plan_straight_insertion(
     travel: float, rim: float, turn: float, push: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) and poses (N, 6) of an insertion: down, slowly past the rim, a push, a turn, and to the target.
+    """Return times (N,) [s] and poses (N, 6) of an insertion.
+
+    The plug moves down, slowly past the rim, is pushed, turns, and moves to the target.
 
     Args:
         travel: Height of the start [m].
@@ -55,7 +57,9 @@ def plan_straight_insertion(
 def plan_search(
     travel: float, rim: float, turn: float, push: float, press: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) and poses (N, 6) of a demonstration: to the rim, a search there, the insertion and a turn.
+    """Return times (N,) [s] and poses (N, 6) of a demonstration.
+
+    The plug moves to the rim, searches there, is inserted, and turns.
 
     Args:
         travel: Height of the start [m].
@@ -120,6 +124,7 @@ def socket_turns(largest: float) -> np.ndarray:
 
 
 def _poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) [s] and poses (N, 6) from the duration [s], the height [m] and the turn [rad] of each point."""
     durations, heights, turns = np.array(points).T
     poses = np.zeros((len(points), POSE_SIZE))
     poses[:, 2], poses[:, 3] = heights, turns

@@ -40,7 +40,7 @@ _KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that defin
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A solid of one or several bodies."""
+    """Solid part of one or several bodies."""
 
     path: Path  # mesh file
     # Vertices (V, 3) [m] and triangles (T, 3) of each body, counter-clockwise as seen from outside.
@@ -155,7 +155,10 @@ class Surface(Protocol):
 
 
 def obj_text(vertices: np.ndarray, triangles: np.ndarray) -> str:
-    """Return an OBJ file of vertices (V, 3) [m] and triangles (T, 3), without triangles of almost no area."""
+    """Return the text of an OBJ file of vertices (V, 3) [m] and triangles (T, 3).
+
+    Triangles of almost no area are left out, because their normals are rounding errors.
+    """
     has_area = np.linalg.norm(area_vectors(vertices, triangles), axis=1) > 1e-10
     return TriangleMesh(vertices, triangles[has_area]).to_obj()
 
@@ -175,8 +178,8 @@ def part_sdf(
     Args:
         name: Name of the model and its link.
         visual_file: OBJ file of the visual geometry.
-        surfaces: Collision geometry; a compliant OBJ mesh is convex, a compliant VTK mesh
-            has tetrahedra, and a rigid mesh may have any shape.
+        surfaces: Collision geometry; a compliant OBJ mesh is convex, a compliant VTK mesh has tetrahedra, and a rigid
+            mesh may have any shape.
         mass: Mass [kg].
         center: Center of mass (3,) [m].
         gyration: Radius of gyration [m].

@@ -94,6 +94,7 @@ def close_surface(
 
 
 def _is_solid(solid: Any) -> bool:
+    """Return True if a `manifold3d` solid is valid and not empty."""
     return bool(solid.status() == import_extra("manifold3d").Error.NoError and not solid.is_empty())
 
 
@@ -111,7 +112,10 @@ def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
 def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
     """Return the solid of triangles that may cross or leave gaps: the boundary of their tetrahedral mesh.
 
-    `gaps` are the gaps in words, for messages.
+    `gaps` describes the gaps, for messages.
+
+    Raises:
+        InputError: If the software for the repair is not installed, or no attempt gives a solid.
     """
     if find_spec("pytetwild") is None or find_spec("pyvista") is None:
         raise InputError(
