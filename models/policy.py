@@ -194,6 +194,7 @@ class Policy:
 
 
 def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:
+    """Return the digest of weights and description, which detects damaged files."""
     return digest(arrays, json.dumps(description, sort_keys=True))
 
 
@@ -243,10 +244,10 @@ def chunk_samples(policy: BasePolicy, observation: np.ndarray, num_outputs: int)
 
 
 def mean_and_variance(samples: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and the variance of chunks (E, K, O) at the next points, each (num_points, O).
+    """Return the mean and the variance over the samples of chunks (E, K, O) at the next points, each (num_points, O).
 
-    The last point of a shorter chunk is repeated. Covariances between outputs are left out, because those of few
-    samples are spurious. The variance of a single sample is zero.
+    The last point of a chunk of fewer than `num_points` points is repeated. Covariances between outputs are left out,
+    because those of few samples are spurious. The variance of a single sample is zero.
     """
     points = np.minimum(np.arange(num_points), samples.shape[1] - 1)
     variances = samples.var(axis=0, ddof=1) if len(samples) > 1 else np.zeros(samples.shape[1:])

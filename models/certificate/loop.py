@@ -21,10 +21,10 @@ class CertifiedLoop:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of one regime at every step; infinite at commands without a bound."""
+    """Bounds of one regime at every step; infinite where a command has no bound."""
 
-    lower: np.ndarray  # least command (N, O)
-    upper: np.ndarray  # greatest command (N, O)
+    lower: np.ndarray  # smallest command (N, O) [unit of the output]
+    upper: np.ndarray  # largest command (N, O) [unit of the output]
     speed: np.ndarray  # largest speed (N, O) from the previous step to this step [unit of the output/s]
     acceleration: np.ndarray  # largest acceleration (N, O) over this step and the two before it [unit of the output/s²]
 
@@ -33,8 +33,9 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
     """Compute the zonotope of motions without active constraints.
 
     Returns:
-        The motion without actions (P + N, O), which begins with P copies of the start, and the generators around it
-        (P + N, O, B): one for each action of each step and, with a history, one for each output of the start.
+        Center and generators of the zonotope. The center (P + N, O) is the motion without actions and begins with P
+        copies of the start. The generators (P + N, O, B) are one for each action of each step and, with a history, one
+        for each output of the start.
     """
     primitive, past = loop.primitive, loop.primitive.history
     steps, outputs = primitive.num_steps, primitive.num_outputs
@@ -55,7 +56,10 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds (N, O) from the constraints on a single output, widened by the tolerance."""
+    """Return lower and upper bounds (N, O) from the constraints on a single output, widened by `TOLERANCE`.
+
+    The bounds are infinite where no constraint has this output alone.
+    """
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))
     is_single = ((G != 0.0).sum(axis=2) == 1)[..., None]

@@ -190,7 +190,7 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
 
     Args:
         demonstrations: Demonstrations of one motion.
-        band: Largest shift, as a share of the duration, in (0, 1].
+        band: Largest shift in time, as a share of the duration, in (0, 1].
 
     Returns:
         Demonstrations on one clock.
@@ -225,7 +225,7 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
 def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tuple[int, int]]:
     """Return the first and the last sample of `other` (N, O) that match each sample of `target` (N, O)."""
     size = len(target)
-    # Of the matrix of costs only two rows are kept, and for each match in the band its predecessor: 0 for the match of
+    # Only two rows of the cost matrix are kept. The predecessor of each match in the band is stored: 0 for the match of
     # both previous samples, 1 for the previous sample of `target`, 2 for that of `other`.
     predecessors = np.zeros((size, min(size, 2 * width + 1)), dtype=np.uint8)
     last = [0.0] + [np.inf] * size
@@ -254,13 +254,16 @@ def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tup
 
 
 def phases_of_steps(phases: Sequence[float] | np.ndarray, num_steps: int) -> np.ndarray:
-    """Return the phase (num_steps,) of each step of a motion; phases (K,) start at these parts of it, from 0 to 1."""
+    """Return the index of the phase of each step of a motion, (num_steps,).
+
+    `phases` (K,) are the increasing starts of the phases, as fractions of the duration; the first one is 0.
+    """
     return np.searchsorted(phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
 
 
 @dataclass(frozen=True)
 class DemonstratedBounds:
-    """Lower and upper bounds of each output in each phase."""
+    """Lower and upper bounds of each output in each phase of a motion."""
 
     names: tuple[str, ...]  # names of the outputs (O,)
     phases: np.ndarray  # start of each phase (K,), from 0 to 1
@@ -290,7 +293,7 @@ def compute_bounds(
         phases: Number K of phases; they divide the motion into parts of equal duration.
         margin: Margin on each side, relative to the range of the phase, not negative.
         min_margin: Smallest margin on each side [unit of the output], not negative.
-        bounded: Indices of the bounded outputs; all by default.
+        bounded: Indices of the bounded outputs, not a mask; all by default.
 
     Raises:
         InputError: If an argument is out of range.

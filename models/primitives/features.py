@@ -17,7 +17,7 @@ _MIN_INDEPENDENCE = 1e-9
 
 @dataclass(frozen=True)
 class WindowFeatures:
-    """Prior of the outputs y_j in a window given the history h: y_j = W_j h + (F_j ⊗ I) w.
+    """Prior distribution of the outputs y_j in a window given the history h: y_j = W_j h + (F_j ⊗ I) w.
 
     The weights w are standard normal. W and F depend on the inputs of history and window, and not on any outputs.
     """
@@ -94,7 +94,9 @@ def _conditioned(
 class KernelBasis:
     """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on few inputs that span the others.
 
-    The features represent the given inputs (N, I) up to rounding.
+    Args:
+        kernel: Kernel k.
+        inputs: Inputs (N, I) that the features represent up to rounding.
     """
 
     def __init__(self, kernel: Kernel, inputs: np.ndarray):

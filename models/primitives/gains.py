@@ -19,12 +19,16 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 
 
 def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.ndarray:
-    """Compute the displacement (O,) of each output by a constant raw action of one in this output, RMS over the motion.
+    """Compute the displacement (O,) of each output by a constant raw action of one in the same output.
 
-    `outputs` are indices or a mask of the explored outputs, all by default; the others have authority zero.
+    The displacement [unit of the output] is the RMS over the motion. `outputs` are indices or a mask of the explored
+    outputs, all by default; the others have authority zero.
+
+    Raises:
+        InputError: If there is no explored output, or an index does not exist.
     """
     explored = _explored_mask(primitive, outputs)
-    # Output i by a constant raw action of one in output j, (N, O, O).
+    # Displacement of output i by a constant raw action of one in output j, (N, O, O).
     response = _closed_loop(primitive, np.tile(np.eye(primitive.num_outputs), (primitive.num_steps, 1, 1)))
     authority = np.sqrt(np.mean(np.einsum("noo->no", response) ** 2, axis=0))
     return np.where(explored, authority, 0.0)
@@ -88,6 +92,9 @@ def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 
     """Compute the RMS displacement (O,) by white actions times gains (O,), in demonstration standard deviations.
 
     The actions are uniform in ±1, and each lasts `action_repeat` control steps.
+
+    Raises:
+        InputError: If `action_repeat` is not a whole number of at least 1.
     """
     power = _white_power(primitive, action_repeat) @ np.asarray(gains, dtype=float) ** 2
     return np.sqrt(power) / deviation(primitive.reference)
@@ -108,7 +115,7 @@ def residual_gains(
 
     Args:
         reference: Reference trajectory of the demonstrations.
-        action_scale: κ.
+        action_scale: κ, positive.
         groups: Indices of the outputs of each group; one group of all outputs by default.
     """
     variances = np.mean(reference.standard_deviations**2, axis=0)
@@ -119,7 +126,7 @@ def residual_gains(
 
 
 def deviation(reference: ReferenceTrajectory) -> np.ndarray:
-    """Compute the RMS over the motion of the demonstrations' standard deviations, (O,)."""
+    """Compute the RMS over the motion of the demonstrations' standard deviations, (O,) [unit of the output]."""
     return np.sqrt(np.mean(reference.standard_deviations**2, axis=0))
 
 
@@ -159,7 +166,10 @@ def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
 
 
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
-    """Compute the mean square displacement (O, O) of output i by uniform white actions in output j, with gain 1."""
+    """Compute the mean square displacement (O, O) of output i by uniform white actions in output j.
+
+    The actions are in ±1, with gain 1.
+    """
     if not is_whole(action_repeat, 1):
         raise InputError(f"action_repeat is a number of control steps, at least 1, not {brief(action_repeat)}")
     action_repeat = int(action_repeat)

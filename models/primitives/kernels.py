@@ -13,7 +13,7 @@ from guiderail.models.common.registry import Registry, did_you_mean
 
 
 class Kernel(Protocol):
-    """A positive definite function of two inputs, evaluated on whole arrays at once."""
+    """Positive definite function of two inputs, evaluated on whole arrays at once."""
 
     #: True if k depends on ζ − ζ' only: a uniform clock then has the same kernel matrix in every window.
     stationary: bool
@@ -47,8 +47,8 @@ def make_kernel(
         parameters: Further parameters of the kernel by name.
 
     Raises:
-        InputError: If there is no such kernel, a parameter is missing or not one of the kernel's, or a value is
-                out of range.
+        InputError: If there is no such kernel, a parameter is missing or not one of the kernel's, or a value is out of
+            range.
     """
     factory = KERNELS.get(name)
     parameters = parameters or {}

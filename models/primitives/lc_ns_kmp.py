@@ -236,8 +236,12 @@ class LcNsKmp:
     ) -> Prediction:
         """Compute the output at a step from a given window, such as that of a base policy; nothing is cached.
 
-        Arguments are those of `predict`, and the window's `means` (H+1, O) and positive definite `covariances`
-        (H+1, O, O), the executed point first.
+        Args:
+            step: As in `predict`; it selects the constraints.
+            means: Reference means of the window (H+1, O), the executed point first.
+            covariances: Reference covariances of the window (H+1, O, O), positive definite.
+            null_space_action: As in `predict`.
+            history: As in `predict`.
 
         Raises:
             InputError: As `predict`, if shapes do not match, or a covariance is not positive definite.

@@ -204,7 +204,10 @@ class ReferenceTrajectory:
         return np.sqrt(np.einsum("noo->no", self.covariances))
 
     def inputs(self, steps: np.ndarray) -> np.ndarray:
-        """Return times (n,) [s] at steps (n,); the clock is extrapolated before the first and after the last step."""
+        """Return the times (n,) [s or phase] of steps (n,).
+
+        The clock is extrapolated before the first and after the last step.
+        """
         last = self.num_steps - 1
         inside = self.times[np.clip(steps, 0, last)]
         before = np.minimum(steps, 0) * (self.times[1] - self.times[0])
@@ -235,6 +238,7 @@ class ReferenceTrajectory:
         return ReferenceTrajectory(self.times[0] + clock, resampled[:, :outputs], covariances)
 
     def _check_covariances(self) -> None:
+        """Make the covariances exactly symmetric; raise an InputError if one is asymmetric or singular."""
         asymmetry = np.abs(self.covariances - self.covariances.transpose(0, 2, 1)).max(axis=(1, 2))
         size = np.abs(self.covariances).max(axis=(1, 2))
         worst = int(np.argmax(asymmetry - 1e-9 * size))

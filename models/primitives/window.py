@@ -23,8 +23,8 @@ class Window:
 
     means: np.ndarray  # reference means (H+1, O)
     covariances: np.ndarray  # reference covariances (H+1, O, O), positive definite
-    G: np.ndarray  # (H+1, F, O)
-    c: np.ndarray  # (H+1, F)
+    G: np.ndarray  # constraint matrices (H+1, F, O)
+    c: np.ndarray  # right-hand sides of the constraints (H+1, F)
 
     @classmethod
     def checked(cls, means: ArrayLike, covariances: ArrayLike, G: np.ndarray, c: np.ndarray) -> "Window":
@@ -52,11 +52,11 @@ class _Solution:
     """
 
     whiten: np.ndarray  # Σ^(-1/2), (H+1, O, O)
-    Lw: np.ndarray  # Σ^(-1/2) L
-    L: np.ndarray
-    latent_mean: np.ndarray
-    latent_map: np.ndarray
-    direct_map: np.ndarray
+    Lw: np.ndarray  # Σ^(-1/2) L, ((H+1) O, rO)
+    L: np.ndarray  # factor L of the posterior covariance L Lᵀ, ((H+1) O, rO)
+    latent_mean: np.ndarray  # latent vector for x = 0, (rO,)
+    latent_map: np.ndarray  # map from x to the latent vector, (rO, PO+O)
+    direct_map: np.ndarray  # map from the history to the window, ((H+1) O, PO)
 
     def rows(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the map (n, PO+O) and the offset (n,) from x to the rows `at` of y."""
@@ -66,7 +66,7 @@ class _Solution:
 
 
 class StepFactor:
-    """Factored problem 4.5 of the thesis for one window, as a function of x = [history, null-space action].
+    """Factored problem 4.5 of the thesis for one window; its solution depends on x = [history, null-space action].
 
     With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w. Its QR factor
     gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ with ħ = λ + β directly, without forming Σ⁻¹ or K⁻¹ (equation 4.12 for weights). The
