@@ -26,8 +26,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite. The same
     happens if the tracking error exceeds its bound and the request would not reduce it, for example when the robot is
-    blocked. If a transition or a moved object puts the repeated command outside the constraints,
-    the command moves inside.
+    blocked. If a transition or a moved object puts the repeated command outside the constraints, the command moves
+    inside.
 
     .. pydrake_system::
 
@@ -51,8 +51,8 @@ class ActiveConstraintProjector(LeafSystem):
         template: Shared control template.
         frames: Poses of the template's objects by name, in the frame of the poses at the ports.
         period: Control period [s], positive.
-        max_tracking_error: Distance between the robot and its command beyond which the last command is
-            repeated [m], positive.
+        max_tracking_error: Distance between the robot and its command beyond which the last command is repeated [m],
+            positive.
 
     Raises:
         InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the

@@ -39,7 +39,7 @@ class SpeedLimits:
 
 
 class CartesianPositionController(LeafSystem):
-    """Joint position commands that move the tool center P to a desired pose by differential inverse kinematics.
+    """Command joint positions that move the tool center P to a desired pose, by differential inverse kinematics.
 
         q[k+1] = clip(q[k] + v·period),  J v = V
 
@@ -68,9 +68,9 @@ class CartesianPositionController(LeafSystem):
     ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``positions`` is (n,), measured joint
     positions [rad], read at initialization as the first joint command. ``command_time`` is (1,), the time stamp of
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
-    (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 while the
-    desired direction cannot be followed. ``command_timed_out`` (1,) is 1 while no valid command is available. All
-    outputs depend on state alone; there is no direct feedthrough.
+    (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 if the desired
+    direction could not be followed for the last valid command. ``command_timed_out`` (1,) is 1 while no valid command
+    is available. All outputs depend on state alone; there is no direct feedthrough.
 
     Args:
         plant: Model of the arm alone, finalized; its joint limits are satisfied.

@@ -78,7 +78,7 @@ class CommandDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state().value(self._count)[0] + 1.0
         discrete_state.set_value(self._count, [count])
-        # At time zero no period has ended: the values from before this instant's updates are no command.
+        # At time zero no period has ended: the value of the port before this instant's updates is not a command.
         has_ended = context.get_time() > 0
         if has_ended:
             discrete_state.set_value(self._last_delivered, self._delivered(context))

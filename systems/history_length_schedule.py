@@ -13,10 +13,10 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class HistoryLengthSchedule(LeafSystem):
     """Shorten the history of sKGRL in contact and lengthen it again in free space.
 
-    In contact the length decreases to the next shorter one at every control step. In free space it increases to the
-    next longer one after every `dwell_steps` control steps. Contact is detected with hysteresis: it begins if the
-    measured force exceeds `contact_threshold` and ends if the force falls to `release_threshold`. NaN counts as
-    contact.
+    In contact, the length decreases to the next shorter one of `lengths` at every control step. In free space, it
+    increases to the next longer one after every `dwell_steps` control steps. Contact is detected with hysteresis: it
+    begins if the measured force exceeds `contact_threshold` and ends if the force falls to `release_threshold`. A force
+    that is NaN counts as contact.
 
     .. pydrake_system::
 

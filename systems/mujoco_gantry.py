@@ -69,7 +69,8 @@ class MujocoGantry(LeafSystem):
         - geometry_poses
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
-    output of the static plant; ``body_poses`` contains these poses, with tool and workpiece at their simulated poses.
+    output of the static plant; ``body_poses`` contains the same poses, but tool and workpiece are at their simulated
+    poses.
     ``state`` is (12,), the pose and its velocity. ``geometry_poses`` contains the poses of all frames with geometry.
     ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is (6,), the forces and
     torques of the six motors in the order of the pose. Positions, velocities and warm start of the engine and the state

@@ -11,7 +11,7 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 
 
 class PolicyError(RuntimeError):
-    """Raised if a policy does not return an action: the robot must stop, as no other action is known to be safe."""
+    """Error raised if a policy does not return an action: the robot must stop, as no other action is known to be safe."""
 
 
 class PolicySystem(LeafSystem):
@@ -74,7 +74,7 @@ class PolicySystem(LeafSystem):
     get_action_output_port = output_getter("action", "last action, (A,), in [−1, 1]")
 
     def _update(self, context: Context, state: State) -> None:
-        """Set the action; raise a `PolicyError` if the policy does not return A finite numbers."""
+        """Evaluate the policy and set the action; raise a `PolicyError` if it does not return A finite numbers."""
         returned = self._policy(self._observe(context))
         try:
             action = np.asarray(returned, dtype=float)

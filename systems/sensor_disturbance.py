@@ -34,8 +34,7 @@ class SensorDisturbance(LeafSystem):
     Args:
         period: Period h of noise, drift and delay [s], positive.
         noise: Standard deviations σ, (n,), not negative.
-        delay: Largest delay in periods, at least 0, and the default of k. If it is positive, `set_delay` changes k to a
-            value from 1 to it.
+        delay: Largest delay and default of k [periods], at least 0. `set_delay` changes k to a value from 1 to `delay`.
         drift: Standard deviations of d after `DRIFT_TIME`, (n,), not negative; none by default.
         resolution: Resolution of the output, (n,), not negative; 0, the default, disables rounding.
         configuration_size: Size m of the configuration; 0 if the error does not depend on a configuration.
@@ -100,7 +99,10 @@ class SensorDisturbance(LeafSystem):
     get_disturbed_measurement_output_port = output_getter("disturbed_measurement", "disturbed measurement, (n,)")
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
-        """Set scale s and bias b, (n,) each, and the seed of noise and drift; `context` is this system's."""
+        """Set scale s, (n,), bias b, (n,), in the units of the sensor, and the seed of noise and drift.
+
+        `context` is this system's.
+        """
         for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 

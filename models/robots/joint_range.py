@@ -12,14 +12,14 @@ from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.damped_inverse import LEVER, TOOL_SCALE
 from guiderail.models.robots.inverse_kinematics import pose_error
 
-_ITERATIONS = 60
+_ITERATIONS = 60  # largest number of iterations of the inverse kinematics
 _TOLERANCE = 1e-9  # largest norm of the pose error, as a scaled twist [m]
 _MAX_CHANGE = 0.5  # largest change of a joint in one iteration [rad]
 _DIFFERENCE = 1e-6  # joint step of the finite difference of a singular value [rad]
 
 
 class JointRange:
-    """Joint positions at a commanded pose, and constraints on them.
+    """Joint positions at a commanded pose [x y z Rz Ry Rx], and constraints on them.
 
     The joint positions of a pose are those nearest to the posture, because null-space control brings an arm there.
     Near a command y they are q(z) ≈ q(y) + J⁺ (z − y), so that limits of the joints are linear constraints on the next
@@ -61,7 +61,10 @@ class JointRange:
             raise InputError(f"the posture is not within the joint limits and a margin of {margin} rad")
 
     def solve(self, pose: np.ndarray) -> np.ndarray | None:
-        """Return the joint positions (n,) of a pose (6,), nearest to the posture; None if they are not found."""
+        """Return the joint positions (n,) [rad] of a finite pose (6,), nearest to the posture; None if none is found.
+
+        Results are cached: the caller must not modify the array.
+        """
         return self._solve_once(np.asarray(pose, dtype=float).tobytes())
 
     def _solve(self, coordinates: bytes) -> np.ndarray | None:
@@ -81,7 +84,10 @@ class JointRange:
         return None
 
     def linearize(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows G (F, 6) of unit norm and c (F,) of G y ≥ c near a pose (6,); none if it cannot be reached."""
+        """Return rows G (F, 6) of unit norm and c (F,) of constraints G y ≥ c near a finite pose (6,).
+
+        There are no rows if the pose cannot be reached.
+        """
         q = self.solve(output)
         if q is None:
             return np.zeros((0, POSE_SIZE)), np.zeros(0)
@@ -98,7 +104,7 @@ class JointRange:
         return G, G @ output + c[used] / norms[used]
 
     def violation(self, output: np.ndarray) -> float:
-        """Return the largest violation of a pose (6,), negative inside; infinite if it cannot be reached.
+        """Return the largest violation of a finite pose (6,), negative inside; infinite if it cannot be reached.
 
         The violation of a joint limit is an angle [rad]. The violation of the singular value [m] is converted to an
         angle by `LEVER`, like rotations in the scaled Jacobian.

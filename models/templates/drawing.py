@@ -14,7 +14,7 @@ from guiderail.models.templates.template import SharedControlTemplate, TemplateS
 
 
 def state_lines(state: TemplateState) -> list[str]:
-    """Describe a state in short lines: mappings, constraints, limits and distance, in the order in which they apply."""
+    """Return a description of a state in short lines: mappings, constraints, limits and transition distance."""
     mappings = [f"{type(m).__name__} ← {', '.join(f'u{i + 1}' for i in m.used_inputs)}" for m in state.input_mapping]
     constraints = [f"{i + 1}. {type(c).__name__}" for i, c in enumerate(state.active_constraints)]
     limits = (
@@ -42,7 +42,7 @@ def list_edges(template: SharedControlTemplate) -> list[tuple[str, str, str]]:
 
 
 def to_dot(template: SharedControlTemplate) -> str:
-    """Return the state machine in Graphviz's language."""
+    """Return the state machine as text in Graphviz's DOT language."""
     lines = [f"digraph {_quote(template.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
     for number, state in enumerate(template.states):
         label = "\n".join([state.name.upper(), *state_lines(state)])

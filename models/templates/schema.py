@@ -73,7 +73,16 @@ def load_template(source: str | Path, **parameters: float) -> SharedControlTempl
 
 
 def parse_template(text: str, where: str = "template", **parameters: float) -> SharedControlTemplate:
-    """Read a template from YAML text like `load_template`; `where` names the text in messages."""
+    """Read a template from YAML text.
+
+    Args:
+        text: Content of a template file.
+        where: Name of the text, for messages.
+        **parameters: As in `load_template`.
+
+    Raises:
+        InputError: If the text is not a valid template.
+    """
     return _read(parse_yaml(text, where), where, parameters)
 
 
@@ -94,7 +103,10 @@ def _load_shipped(path: Path) -> Any:
 
 
 def _calculate(node: ast.expr, parameters: Mapping[str, float] | None) -> float:
-    """Return the value of arithmetic on the names of parameters; if `parameters` is None, names are not allowed."""
+    """Return the value of an arithmetic expression of numbers and names of parameters.
+
+    If `parameters` is None, names are not allowed.
+    """
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         return float(node.value)  # type: ignore[arg-type]
     if isinstance(node, ast.Name):
@@ -137,7 +149,7 @@ def _number(entry: Any, info: ValidationInfo) -> float:
 
 
 def _name(text: str) -> str:
-    """Return `text` if it is short and printable enough for a message and a figure."""
+    """Return `text`; raise a ValueError if it is empty, too long for a figure, or not printable."""
     if not (0 < len(text) <= 100 and text.isprintable()):
         raise ValueError(f"{brief(text)} can't name anything; use a short text")
     return text

@@ -47,7 +47,8 @@ class TemplateState:
     transitions: tuple[Transition, ...] = ()
     max_force_n: float | None = None  # largest force of the impedance [N]; None: that of the task
     max_torque_nm: float | None = None  # largest torque of the impedance [Nm]; None: that of the task
-    max_speed_m_per_s: float | None = None  # largest speed of the command, at most that of the template
+    # Largest speeds of the command, at most those of the template; None: those of the template.
+    max_speed_m_per_s: float | None = None
     max_speed_rad_per_s: float | None = None
 
     @property
@@ -76,7 +77,7 @@ class TemplateState:
 class Command:
     """Pose that the constraints allow for a request."""
 
-    X_WE: RigidTransform
+    X_WE: RigidTransform  # pose of the end effector in the world
     fraction: float  # part of the requested displacement that is executed: 1 all of it, 0 none
 
 
@@ -124,20 +125,26 @@ class SharedControlTemplate:
     def map(
         self, state: int, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float
     ) -> RigidTransform:
-        """Return the displacement ΔH of one period for inputs (n,), clipped to [−1, 1]: map_q (equation 2.19)."""
+        """Return the displacement ΔH of one period [s] for inputs (n,): map_q (equation 2.19).
+
+        Inputs are clipped to [−1, 1].
+        """
         inputs = np.clip(inputs, -1.0, 1.0)
         parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
         return reduce(self.displace, parts, RigidTransform())
 
     @staticmethod
     def displace(X_WE: RigidTransform, displacement: RigidTransform) -> RigidTransform:
-        """Return H^im, translated in the world and rotated about E's origin: displace_q (equation 2.20)."""
+        """Return the displaced pose H^im: displace_q (equation 2.20).
+
+        The pose is translated along the axes of the world and rotated about the origin of the end effector E.
+        """
         return RigidTransform(
             displacement.rotation().matrix() @ X_WE.rotation().matrix(), X_WE.translation() + displacement.translation()
         )
 
     def project(self, state: int, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        """Return H^ac, the state's active constraints applied in order: project_q (equation 2.21)."""
+        """Return the pose H^ac after the state's active constraints, applied in order: project_q (equation 2.21)."""
         for constraint in self.states[state].grouped_constraints:
             X_WE = constraint.project(X_WE, frames)
         return X_WE
@@ -272,7 +279,9 @@ class SharedControlTemplate:
         return tuple(progress)
 
     def progress(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the progress in the task: that of previous phases plus the weighted decrease of this phase's distance.
+        """Return the progress in the task.
+
+        It is the progress of previous phases plus the weighted decrease of this phase's distance.
 
         An increase of progress is d_{t−1} − d_t of equation 3.2, on one scale for all phases. Progress is continuous at
         a transition if the distance of the next phase equals its `starts_at` there.

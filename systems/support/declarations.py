@@ -264,9 +264,9 @@ def plant_context(
 
 
 def input_getter(name: str, description: str) -> Callable[[System], InputPort]:
-    """Return a method that returns the input port `name`, stored as `_<name>_port` or found by name.
+    """Return a method of a system that returns the input port `name`, stored as `_<name>_port` or found by name.
 
-    The method's docstring is "Return the port of the" with the description, which names signal, shape and unit.
+    The method's docstring is "Return the port of the", followed by `description`, which states signal, shape and unit.
     """
 
     def getter(self: System) -> InputPort:
