@@ -11,7 +11,10 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 
 
 class PolicyError(RuntimeError):
-    """Error raised if a policy does not return an action: the robot must stop, as no other action is known to be safe."""
+    """Error raised if a policy does not return an action.
+
+    The robot must stop, because no other action is known to be safe.
+    """
 
 
 class PolicySystem(LeafSystem):
