@@ -189,6 +189,14 @@ class Signals:
 class Loop:
     """Station, guidance and observation, connected as a control loop without its policy.
 
+    Args:
+        task: Task.
+        station: Station.
+        guidance: Diagram with the ports of `Guidance`.
+
+    Raises:
+        InputError: If a signal that the task names does not exist, or a port has the wrong size.
+
     Attributes:
         builder: Builder of the root diagram.
         station: Subsystem "station".
@@ -260,7 +268,11 @@ class Loop:
     def add_terms(
         self, task: Task, terms: Sequence[ObservationTerm], name: str
     ) -> tuple[gymnasium.spaces.Box, OutputPort]:
-        """Add the diagram `name` of observation terms; return the space and the port of its output."""
+        """Add the diagram `name` of observation terms; return the space and the port of its output.
+
+        Raises:
+            InputError: If a term names a signal that does not exist.
+        """
         user = f"the {name} of {task.name}"
         names = [term.signal for term in terms if term.signal not in CLOCKS]
         ports = {signal: self.signals.get(signal, user) for signal in names}
@@ -331,7 +343,7 @@ def build_task_diagram(
         exported[name] = reward.get_term_output_port(name)
     if task.privileged_terms() and station.HasOutputPort("body_poses"):
         exported["privileged"] = loop.add_terms(task, task.privileged_terms(), "privileged")[1]
-    # Outputs that only this guidance has, such as the state of a template.
+    # Outputs that only this guidance has, such as the state of a template, are exported too.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
         builder.ExportOutput(port, name)
@@ -425,6 +437,7 @@ def build_skill_diagram(
 
 
 def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
+    """Return the vector output ports of a diagram by name."""
     ports = (diagram.get_output_port(index) for index in range(diagram.num_output_ports()))
     return {port.get_name(): port for port in ports if port.get_data_type() == PortDataType.kVectorValued}
 
@@ -449,7 +462,13 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
 
 
 def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
-    """Return `TaskDiagram.randomize`: it samples an episode's conditions and writes them into the root context."""
+    """Return the function `TaskDiagram.randomize`.
+
+    It samples an episode's conditions, writes them into the root context, and returns them by name.
+
+    The function raises an InputError if a reset option is invalid, or the task's `reset` returns something other than
+    values by name, or a reserved name.
+    """
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         sampled = task.reset(
@@ -469,6 +488,8 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
 
 
 def _push(station: Station) -> Any:
+    """Return a function that displaces the robot; it takes the root context and the displacement (O,)."""
+
     def push(context: Context, displacement: np.ndarray) -> None:
         pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))
         station.set_pose(context, pose + displacement)

@@ -67,7 +67,10 @@ class ResidualDescent(Guidance):
 
 
 class ResidualGuidance(PrimitiveGuidance):
-    """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t."""
+    """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t.
+
+    Motion constraints, such as limits of the speed, are not enforced.
+    """
 
     def __init__(
         self,
@@ -82,7 +85,10 @@ class ResidualGuidance(PrimitiveGuidance):
             prior: Prior knowledge.
             make_filter: Function of the primitive's configuration and the keep-out walls. It returns a `SafetyFilter`
                 or `CommandFilter` for the sum; ``fallback`` is 1 while the filter changes the sum. None: no filter.
-            takes_window: True takes the motion from the input ``reference_window`` instead of the demonstrations.
+            takes_window: True to take the motion from the input ``reference_window`` instead of the demonstrations.
+
+        Raises:
+            InputError: If the motion waits for the robot (``progress=state``).
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
@@ -124,7 +130,7 @@ def residual(prior: PriorKnowledge) -> Diagram:
     displaces=True,
 )
 def safe_residual(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning that stops at walls."""
+    """Build residual learning behind a filter that stops the command at walls; see `SafetyFilter`."""
     return ResidualGuidance(prior, lambda config, keep_out: SafetyFilter(keep_out, config.control_period))
 
 

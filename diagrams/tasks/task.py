@@ -48,7 +48,7 @@ class EpisodeConstant:
         return self._source.get_output_port()
 
     def set(self, root_context: Context, values: np.ndarray) -> None:
-        """Set the values, (size,); the context is the root diagram's."""
+        """Set the values, (size,), in the root diagram's context."""
         context = self._source.GetMyMutableContextFromRoot(root_context)
         self._source.get_mutable_source_value(context).SetFromVector(values)
 
@@ -76,6 +76,7 @@ def terminal_reward(rewards: Mapping[str, float], name: str = "terminal_reward")
 
 @lru_cache(maxsize=32)
 def _on_clock(reference: ReferenceTrajectory, period: float, time_scale: float) -> ReferenceTrajectory:
+    """Return `Task.on_clock` for a control period [s]; cached, so that environments share trajectories."""
     is_on_clock = np.abs(np.diff(reference.times) - period).max() <= 1e-6 * period
     return reference if is_on_clock and time_scale == 1.0 else reference.resampled(period, time_scale)
 
@@ -152,13 +153,16 @@ class Task(ABC):
         self.episode_constants: dict[str, EpisodeConstant] = {}
 
     def steps_of(self, nominal_steps: int) -> int:
-        """Return the number of control steps, at least one, with the duration of `nominal_steps` default steps."""
+        """Return the number of control steps, at least one, that last as long as `nominal_steps` default periods."""
         return max(round(nominal_steps * self.default_control_period / self.control_period), 1)
 
     def on_clock(self, reference: ReferenceTrajectory, time_scale: float = 1.0) -> ReferenceTrajectory:
         """Return a reference trajectory resampled to the control period, and `time_scale` times as long.
 
         The trajectory itself is returned if it has this period already and `time_scale` is 1.
+
+        Raises:
+            InputError: If `time_scale` is not positive, or fewer than two steps remain.
         """
         return _on_clock(reference, self.control_period, time_scale)
 
