@@ -23,7 +23,10 @@ from guiderail.tools.learning.learner import LEARNERS
 
 
 def describe_all() -> dict[str, Any]:
-    """Describe all tasks, guidance, stations, robots, end effectors and learners by name, with ports and options."""
+    """Describe all registered tasks, guidance, stations, robots, end effectors, learners and kernels by name.
+
+    The descriptions have the ports and the options; `options` has the options that tasks share.
+    """
     return {
         "tasks": {name: describe_task(name) for name in TASKS.names()},
         "guidance": {name: _guidance(name) for name in GUIDANCE.names()},

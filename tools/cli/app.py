@@ -38,7 +38,10 @@ def to_json(result: Mapping[str, Any]) -> str:
 def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
     """Print a result, with a column for every baseline policy in `baselines`, or as one JSON object.
 
-    In the names of the values, `space` replaces an underscore.
+    Args:
+        result: Values by name.
+        as_json: Print JSON.
+        space: Text that replaces an underscore in the names of the values, except in JSON.
     """
     if as_json:
         typer.echo(to_json(result))
@@ -125,7 +128,7 @@ class Command(typer.core.TyperCommand):
 
 
 def expand_choices(text: str) -> str:
-    """Return a help text with every `{name}` of `CHOICES` replaced by its choices."""
+    """Return a help text in which every `{name}` of `CHOICES` is replaced by its choices, comma-separated."""
     for name, list_names in CHOICES.items():
         if f"{{{name}}}" in text:
             text = text.replace(f"{{{name}}}", ", ".join(list_names()))
@@ -198,7 +201,7 @@ TaskImports = Annotated[
 
 
 def _trust(context: typer.Context, value: bool) -> bool:
-    """Trust the imports of files until the command ends."""
+    """Allow imports that a file names until the command ends, if the option is given; return the option's value."""
     if value:
         from guiderail.tools.imports import trust_imports
 
@@ -340,7 +343,18 @@ def is_hardware(station: Any) -> bool:
 def connect(
     environment: Mapping[str, Any], scenario: Path | None, *, sim: bool, synchronous: bool, rate: float | None
 ) -> "RobotConnection":
-    """Return the connection to a robot; its address, the robot and the driver are options of the environment."""
+    """Return the connection to a robot.
+
+    Args:
+        environment: Options of the environment; `robot_url`, `robot` and `driver` are used.
+        scenario: Scenario file, or None.
+        sim: Use a simulated driver.
+        synchronous: The driver and the controller wait for each other.
+        rate: Speed of the simulated robot's clock relative to real time; None for the default.
+
+    Raises:
+        InputError: As `RobotConnection.from_scenario`.
+    """
     from guiderail.tools.hardware.connection import RobotConnection
 
     given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}

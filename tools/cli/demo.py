@@ -33,7 +33,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     An existing demo in the folder `out` is replaced.
 
     Raises:
-        InputError: If the folder contains something else than a demo, or a number is out of range.
+        InputError: If the folder contains anything other than a demo, or a number is out of range.
     """
     check_episodes(episodes)
     check_seed(seed)
@@ -95,7 +95,7 @@ def _command_name() -> str:
 
 
 def _clear(out: Path) -> None:
-    """Remove an earlier demo, and nothing else."""
+    """Remove an earlier demo; raise an InputError if the folder contains anything else."""
     if (out / MARK).is_file():
         shutil.rmtree(out)
     RunFolder(out).refuse_existing()
@@ -117,12 +117,13 @@ def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _outcome(rows: pd.DataFrame) -> str:
+    """Return the success rate and the mean return of held-out episodes as text."""
     success, total, cost = (rows[name].mean() for name in ("success", "return", "reward_obstacle_cost"))
     return f"{success:.0%} reach the goal, return {total:.1f}, {cost:+.1f} of it from the obstacle"
 
 
 def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
-    """Draw the paths before and after learning, and the return over the episodes."""
+    """Draw the paths before and after learning, and the return over the episodes; return the path of the picture."""
     figure, ((plane, curve),) = new_figure(1, 2, (11, 5.2))
     draw_passage(plane, named=True)
     for index, path in enumerate(after["measured"]):

@@ -35,6 +35,7 @@ def load_commands(name: str = "") -> typer.Typer:
 
 
 def _print_version(requested: bool) -> None:
+    """Print the version and exit, if it is requested."""
     if requested:
         import guiderail
 
@@ -105,7 +106,7 @@ def _show_messages() -> None:
 
 
 def _resume_hint(arguments: list[str]) -> str:
-    """Return a hint how to resume an interrupted command; empty if it cannot be resumed."""
+    """Return a hint on how to resume an interrupted command; empty if it cannot be resumed."""
     name, *words = map(str, [*arguments, ""])
     if name == "study":
         return "; the same command resumes it"

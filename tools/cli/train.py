@@ -92,7 +92,7 @@ def train(
     if imports:
         from guiderail.tools.imports import import_modules
 
-        modules = import_modules(modules)  # first, because one of them may register the station
+        modules = import_modules(modules)  # before the options are read, because a module may register the station
     environment = cli.parse_environment(
         env,
         guidance=guidance,
@@ -183,7 +183,7 @@ def train(
 
 
 def _with_stored_robot(out: Path, environment: dict[str, Any]) -> dict[str, Any]:
-    """Return options with the station, the robot and the driver of a run, if it was trained on a robot."""
+    """Return the given options, completed by the station, the robot and the driver of a run on hardware."""
     from guiderail.tools.learning.run_folder import RunFolder
 
     stored = RunFolder(out).config().environment

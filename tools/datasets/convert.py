@@ -31,7 +31,7 @@ def import_recording(
     rate: float | None = None,
     **csv_options: str | None,
 ) -> dict[str, Any]:
-    """Write demonstrations from a LeRobot dataset, bags or CSV files; return a summary with the assumptions made.
+    """Import demonstrations from a LeRobot dataset, bags or CSV files into a file.
 
     Args:
         source: File or folder.
@@ -40,6 +40,9 @@ def import_recording(
         target: Pose of the task's target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees.
         rate: Sampling rate of the result [1/s]; the recording's by default.
         csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
+
+    Returns:
+        Summary of the demonstrations, with the assumptions made.
 
     Raises:
         InputError: If the source cannot be read, a required unit or signal is neither stated in it nor given, or
@@ -82,9 +85,13 @@ def import_recording(
 
 
 def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None = None) -> dict[str, Any]:
-    """Write the demonstrations of a file or folder in the format `kind` of `WRITERS`; return a summary.
+    """Write the demonstrations of a file or folder in another format; return a summary.
 
-    The folder `out` must not exist. The sampling rate [1/s] is the demonstrations' by default.
+    Args:
+        source: File or folder of demonstrations.
+        out: Folder to write; it must not exist.
+        kind: Format, a key of `WRITERS`.
+        rate: Sampling rate of the result [1/s]; the demonstrations' by default.
 
     Raises:
         InputError: For an unknown format, demonstrations that it cannot represent, or a folder that cannot be written.
@@ -101,6 +108,7 @@ def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None
 
 
 def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
+    """Return the demonstrations resampled at a rate [1/s]; each begins at time zero."""
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"--rate is in samples per second and must be positive, not {rate}")
     samples = sum(float(t[-1] - t[0]) * rate for t in demonstrations.times)

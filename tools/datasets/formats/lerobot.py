@@ -29,10 +29,14 @@ _CLOCKS = {
 
 
 def read_lerobot(folder: Path, signal: str | None) -> Recorded:
-    """Return one demonstration per episode of a dataset; `choose_signal` selects one of the vector-valued features.
+    """Return one demonstration per episode of a dataset.
+
+    Args:
+        folder: Folder of the dataset.
+        signal: Name of a vector-valued feature; None for the only one (`choose_signal`).
 
     Raises:
-        InputError: If the folder is not such a dataset, or several features could be imported.
+        InputError: If the folder is not such a dataset, a file is damaged, or no single feature can be chosen.
     """
     import pyarrow as arrow
     import pyarrow.parquet as parquet
@@ -91,7 +95,7 @@ def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
 
 
 def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
-    """Write a dataset with the demonstrated motion as its action; return remarks.
+    """Write a dataset in which the demonstrated motion is both the action and the state; return remarks.
 
     Raises:
         InputError: If the demonstrations have no common rate, a value exceeds 32 bits, or the folder cannot be written.

@@ -176,7 +176,10 @@ def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
 
 
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
-    """Return the time since the first message [s] (N,), from the header stamps if they increase, with remarks."""
+    """Return the time of each message since the first one [s] (N,), with remarks.
+
+    It is computed from the header stamps if they increase, otherwise from the times of receipt.
+    """
     headers: list[Any] = [getattr(message, "header", None) for _, message in rows]
     if all(header is not None for header in headers):
         stamps = np.array([header.stamp.sec * 10**9 + header.stamp.nanosec for header in headers], dtype=np.int64)
@@ -189,6 +192,7 @@ def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
 
 
 def _frame(message: Any, path: Sequence[str]) -> str:
+    """Return a description of the frame in which a pose is given; `path` has the attributes that lead to the pose."""
     for holder in (message, reduce(getattr, path[:1], message)):
         header = getattr(holder, "header", None)
         if header is not None and header.frame_id:
