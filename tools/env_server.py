@@ -29,6 +29,10 @@ MAX_LINE = 100_000  # longest request [characters]
 def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
     """Return the environment of a run's folder or of a task, with changed options.
 
+    Args:
+        name: Folder of a run, or name of a task.
+        options: Options of the environment by name; they override those of the run.
+
     Raises:
         InputError: If there is no such task, or an option is invalid.
     """
@@ -109,7 +113,7 @@ def serve(server: EnvServer, requests: IO[str], answers: IO[str]) -> None:
 
 
 def _check_complete(line: str, requests: IO[str]) -> None:
-    """Raise a ValueError if a line is too long, after reading it to its end, so that it is answered once."""
+    """Raise a ValueError if a line is too long; the rest of it is read first, so that it is answered only once."""
     if len(line) < MAX_LINE or line.endswith("\n"):
         return
     while len(line) == MAX_LINE and not line.endswith("\n"):
@@ -118,7 +122,7 @@ def _check_complete(line: str, requests: IO[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Serve the environment that the arguments name."""
+    """Serve the environment that the arguments name; return the exit code."""
     # Redirect standard output to standard error: messages of libraries would be read as answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

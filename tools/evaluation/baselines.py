@@ -1,4 +1,4 @@
-"""Baseline policies: they ignore the observation, and show what a task's success rate is without learning."""
+"""Baseline policies, which ignore the observation: they show the success rate of a task without learning."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -81,7 +81,7 @@ class BaselinePolicy(Callback):
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
     def start_episode(self, index: int) -> None:
-        """Continue with episode `index`, whichever episodes this process has run before."""
+        """Continue with episode `index`, independent of the episodes that this process has run before."""
         self._episode = index - 1
 
     def on_episode_start(self) -> None:

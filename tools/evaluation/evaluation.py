@@ -27,7 +27,11 @@ BASELINES_FOLDER = "baselines"  # folder of the baseline policies' episodes, in 
 
 
 def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
-    """Return the rows of a file; if it does not exist, compute and write them. Empty tables are not written."""
+    """Return the rows of a file; if it does not exist, compute and write them. An empty table is not written.
+
+    Raises:
+        InputError: If the file is damaged or cannot be written.
+    """
     if not file.exists():
         rows = compute()
         if not len(rows):
@@ -52,7 +56,10 @@ def episodes_file(
 
 
 def policy_digest(source: Path) -> str:
-    """Return the digest of a policy's folder or file; a unique value for module:function, which may use other files."""
+    """Return the digest of a policy's weights in a folder, or of its file.
+
+    For module:function it is a unique value, because the function may read other files.
+    """
     file = source / "policy.safetensors" if source.is_dir() else source
     if not file.is_file():
         return str(time.time_ns())
@@ -181,6 +188,7 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
 
 
 def _mcnemar(won: Any, other: Any) -> float:
+    """Return the one-sided p-value of McNemar's exact test, for successes (n,) on the same episodes."""
     wins, losses = int((won > other).sum()), int((won < other).sum())
     return float(scipy.stats.binomtest(wins, wins + losses, alternative="greater").pvalue) if wins + losses else 1.0
 

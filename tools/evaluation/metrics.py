@@ -26,7 +26,7 @@ CONFIDENCE = 0.95
 RESAMPLES = 1000
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
-TOLERANCE = 1e-9  # a violation up to this is rounding of the primitive's solver
+TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 
 
 def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,6 +48,7 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, tuple[float, flo
 
 
 def _bootstrap(values: np.ndarray, statistic: Any) -> tuple[Any, Any]:
+    """Return the ends of the 95 % percentile interval of a statistic over the first axis, by resampling."""
     if np.ptp(values, axis=0).max() == 0:  # SciPy warns if there is nothing to resample
         mean = statistic(values, axis=0)
         return mean, mean
@@ -59,7 +60,7 @@ def _bootstrap(values: np.ndarray, statistic: Any) -> tuple[Any, Any]:
 
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
-    """Return the 95 % Wilson interval of a success rate."""
+    """Return the 95 % Wilson interval of a success rate over at least one episode."""
     interval = scipy.stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
 

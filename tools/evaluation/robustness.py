@@ -39,7 +39,7 @@ Environment = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Axis:
-    """Disturbance, varied over several values."""
+    """Disturbance of the environment, varied over several values."""
 
     name: str  # name, as `--axes` takes it
     label: str  # label of the plot's axis, with the unit
@@ -60,7 +60,10 @@ def _scalar(option: str, unit: float = 1.0, kind: type = float) -> Callable[[Env
 
 
 def _force_and_torque(option: str) -> Callable[[Environment, float], dict[str, Any]]:
-    """Return the change of an option (force [N], torque [Nm]); the torque is the force times a lever arm of 0.02 m."""
+    """Return the `change` of an option (force [N], torque [Nm]).
+
+    The value on the axis is the force; the torque is the force times a lever arm of 0.02 m.
+    """
     return lambda environment, value: {option: (value, 0.02 * value)}
 
 
@@ -371,6 +374,7 @@ def _table_name(axes: str | None, given: Mapping[str, Any], policies: Sequence[s
 
 
 def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """Return the row of the table for a policy's episodes at a point."""
     return {
         "axis": point.axis.name,
         "value": float(point.value),

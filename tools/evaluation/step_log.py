@@ -31,7 +31,7 @@ MEANINGS = {
     "measured_violation": (SLACK, "violation of the measured pose"),
     "contact_force": ("N", "contact force"),
     "wrench_i": ("N, Nm", "wrench of the surroundings on the tool"),
-    "saturation": ("", "largest demand on an actuator beyond its limit, 0 within it"),
+    "saturation": ("", "1 while the controller is at a limit; in the plane, the largest excess of a joint's force [N]"),
     "collision": ("", "True in a collision"),
     "command_timed_out": ("", "True while the last safe pose is held because commands stopped or are not finite"),
     "fallback": ("", "True if guidance commanded a safe pose instead of the requested one"),
@@ -92,6 +92,7 @@ def table(trace: EpisodeTrace, episode: int) -> pa.Table:
 
 
 def _numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns `name_i` of values (n, size)."""
     return {f"{name}_{index}": values[:, index] for index in range(values.shape[1])}
 
 
@@ -107,7 +108,7 @@ def read_step_log(folder: Path) -> pd.DataFrame:
     """Return the control steps of all episodes in a run's `steps/`, in order.
 
     Raises:
-        InputError: If there is no step log, it has more than `MAX_ROWS` rows, or a file is damaged.
+        InputError: If there is no step log, it has too many rows, or a file is damaged.
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:

@@ -109,7 +109,7 @@ class Sweep(_Strict):
 
 
 class Ratio(_Strict):
-    """Ratio of a table's column between two methods."""
+    """Ratio of a table's column for one method to that for another one."""
 
     of: str  # name of the column
     method: str  # method of the numerator
@@ -117,7 +117,10 @@ class Ratio(_Strict):
 
 
 class Study(_Strict):
-    """Methods × seeds × numbers of training episodes × evaluation sets."""
+    """Study: every method is trained with every seed and evaluated on every evaluation set.
+
+    A policy is evaluated after each number of training episodes in `after_episodes`.
+    """
 
     name: FolderName  # name of the tables
     task: str  # name of the task of every method; in a YAML file, the path of a task folder is allowed too

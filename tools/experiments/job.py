@@ -242,6 +242,7 @@ def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFram
 
 
 def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> Path:
+    """Return the file of the evaluated episodes of a policy after a number of training episodes."""
     name = re.sub(r"[ /\\\0]", "_", eval_set.name).lstrip(".")  # one path component, inside the run's folder
     values = {"name": name, "after_episodes": episodes, "episodes": eval_set.episodes}
     return job.folder.path / eval_set.file.format(**values, digest=digest(job, eval_set, episodes))
@@ -264,6 +265,7 @@ def _refuse_other_rows(job: Job, episodes: int, eval_set: EvalSet) -> None:
 
 
 def _evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
+    """Evaluate a policy after a number of training episodes, and return the rows of the evaluated episodes."""
     config, policy = job.config(episodes), _policy(job, episodes)
     environment = as_arguments(changed_environment(config.task, config.environment, eval_set.env))
     every, tables = eval_set.every if eval_set.sampled else eval_set.episodes, []

@@ -81,8 +81,18 @@ def study_command(
 ) -> dict[str, Any]:
     """Run a study by `run_study`, write its table as `.csv` and `.md`, and return a summary with results of each seed.
 
-    The table has the study's name by default. In the summary, `differences` has the sentences of `describe_differences`
-    by method, and `failed` one sentence for each failed job, which has no rows in the table.
+    Args:
+        study: As in `run_study`.
+        out: As in `run_study`; the table is written into it.
+        engine: As in `run_study`.
+        table: Name of the table; by default that of the study.
+        describe_differences: Function whose sentences the summary has as `differences`, by method.
+
+    Returns:
+        Summary. `failed` has one sentence for each failed job, which has no rows in the table.
+
+    Raises:
+        InputError: As `run_study`, or if a file cannot be written.
     """
     result: dict[str, Any] = {}
     try:
@@ -143,6 +153,7 @@ def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
 
 
 def _check_ratios(study: Study) -> None:
+    """Raise an InputError if a ratio is of a column that the table does not have."""
     known = {*EVALUATED, *(f"training_{name}" for name in (*TRAINING, *study.statistics))}
     for one in study.ratios:
         if one.of not in known:

@@ -47,7 +47,11 @@ class Frame:
             raise InputError("a frame's rotation must not be a reflection: its determinant is -1")
 
     def to_world(self, output: np.ndarray, orientation: Orientation) -> np.ndarray:
-        """Transform an output (O,) from F to W; if F has a rotation, the last 3 of 6 entries are an orientation."""
+        """Transform an output (O,) from F to W; if F has a rotation, the last three of six entries are an orientation.
+
+        Raises:
+            InputError: If the frame does not fit the number of entries.
+        """
         return self._transformed(output, orientation, is_inverse=False)
 
     def to_frame(self, output: np.ndarray, orientation: Orientation, near: np.ndarray | None = None) -> np.ndarray:
@@ -57,6 +61,9 @@ class Frame:
             output: Output (O,) in W.
             orientation: Meaning of the last three of six entries.
             near: Output (O,) in F; full turns are added to the orientation so that it is nearest to this one.
+
+        Raises:
+            InputError: If the frame does not fit the number of entries.
         """
         return self._transformed(output, orientation, is_inverse=True, near=near)
 
@@ -205,7 +212,9 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
 
 
 def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np.ndarray], bool]]) -> list[list[int]]:
-    """Return the sample indices of events in each recording: the first match of each condition after the event before.
+    """Return the sample indices of events in each recording.
+
+    An event is the first sample after the previous event at which its condition holds.
 
     Args:
         signals: M arrays (N_m, S), such as outputs and a gripper.

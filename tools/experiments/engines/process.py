@@ -51,7 +51,7 @@ class ProcessEngine(Engine):
                     waiting.append(key)
 
     def _assign(self, waiting: deque[int], work: Work, jobs: Mapping[int, Any]) -> None:
-        """Give waiting jobs to free workers, and start workers up to the number of processes."""
+        """Assign waiting jobs to free workers; start workers until there are `processes` of them."""
         while waiting:
             worker = next((one for one in self._workers if one.key is None), None)
             if worker is None:
