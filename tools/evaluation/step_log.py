@@ -108,7 +108,8 @@ def read_step_log(folder: Path) -> pd.DataFrame:
     """Return the control steps of all episodes in a run's `steps/`, in order.
 
     Raises:
-        InputError: If there is no step log, it has too many rows, or a file is damaged.
+        InputError: If there is no step log, it has more than `guiderail.tools.tables.MAX_ROWS` rows, or a
+            file is damaged.
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:

@@ -54,7 +54,7 @@ def evaluate_on_robot(
     Args:
         run: Run folder, or `pretrained:NAME`.
         connection: Connection to the robot driver.
-        episodes: Number of episodes.
+        episodes: Number of episodes, at least 1.
         station: Name of a hardware station.
         policy: Name of the policy that replaces the run's own, for the file name.
         make_policy: Function that returns this policy for an environment.
@@ -63,7 +63,8 @@ def evaluate_on_robot(
         log: Function that shows a message.
 
     Returns:
-        Path of the rows, and statistics of the episodes; a stopped episode counts as a failure.
+        `rows`, the path of the rows; the statistics of the episodes, in which a stopped one counts as a failure; and
+        `stopped`, the number of stopped episodes.
 
     Raises:
         InputError: If the policy cannot be executed, no robot answers, a check fails or is not confirmed, or the rows

@@ -1,4 +1,4 @@
-"""The operator at the robot: keys that stop and pause the arm, and confirmation of a question."""
+"""Input of the operator at the robot: keys that stop and pause the arm, and confirmation of a question."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ class OperatorKeys:
         return self._is_stop_requested
 
     def describe(self, *, has_pauses: bool = False) -> str:
-        """Return a sentence on the keys, with the pause key if `has_pauses`; without a terminal, only Ctrl-C works."""
+        """Return a description of the keys, with the pause key if `has_pauses`.
+
+        Without a terminal, only Ctrl-C works.
+        """
         if not sys.stdin.isatty():
             return "Ctrl-C stops the arm"
         return "Enter or Ctrl-C stops the arm" + has_pauses * ", p and Enter pauses it at the end of an episode"

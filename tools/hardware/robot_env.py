@@ -153,7 +153,7 @@ class RobotEnv(DiagramEnv):
         return Fault(int(self._station.get_fault_output_port().Eval(self._context)[0]))
 
     def _switch_station(self, simulator: Simulator, station: HardwareStation) -> None:
-        """Let another station control the arm from now on, without a gap."""
+        """Transfer control of the arm to another station, without a gap in the commands."""
         previous, previous_context = self._station, self._context
         station.start(simulator)
         context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -165,6 +165,7 @@ class RobotEnv(DiagramEnv):
         self._station, self._is_stepping = station, False
 
     def _switch_to_new_transfer(self) -> None:
+        """Transfer control to the transfer station in a new simulator, which holds the present pose."""
         pose, simulator = self.pose, Simulator(self._transfer_station)
         self._transfer_station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), pose)
         self._switch_station(simulator, self._transfer_station)
@@ -215,10 +216,15 @@ class RobotEnv(DiagramEnv):
         return observation, reward, terminated, truncated, info
 
     def _extend_return_path(self) -> None:
+        """Append the way back along the measured poses of the episode."""
         self._return_path.extend(retrace(self.trace.measured, self.task.control_period)[::-1])
 
     def _statistics(self, first: int) -> tuple[float, float, float, bool]:
-        """Return largest commanded and measured violation, largest force and fallback of the steps from `first` on."""
+        """Return statistics of the control steps from `first` on.
+
+        They are the largest commanded and measured violation, the largest contact force [N], and True if a step was a
+        fallback.
+        """
         signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
         if not len(self.trace) > first:
             return *self._violations, 0.0, False
@@ -266,6 +272,7 @@ class RobotEnv(DiagramEnv):
     # Motions between episodes.
 
     def _command(self, pose: np.ndarray) -> None:
+        """Command a pose (6,) of the transfer station for a control step."""
         self._transfer_station.get_desired_pose_input_port().FixValue(
             self._transfer_simulator.get_mutable_context(), pose
         )
@@ -283,6 +290,7 @@ class RobotEnv(DiagramEnv):
             return False
 
     def _resists(self, test: HoldTest, before: np.ndarray) -> bool:
+        """Push the workpiece from the pose `before` (6,) and back; return True if it resists."""
         push = np.array([*test.displacement, 0.0, 0.0, 0.0])
         direction = push[:3] / np.linalg.norm(push)
         shares = np.arange(1, HOLD_STEPS + 1) / HOLD_STEPS
@@ -377,7 +385,7 @@ class RobotEnv(DiagramEnv):
                 self._come_to_rest()
 
     def _come_to_rest(self) -> None:
-        """Advance until the arm has no torque."""
+        """Advance until the arm is at rest and its commanded torque is zero."""
         self._advance_statuses(round((self._station.limits.damping_time + 0.1) / self._station.period))
 
     def _resume(self) -> None:

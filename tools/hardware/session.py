@@ -48,7 +48,7 @@ def robot_session(
     need no confirmation; if the driver is also simulated, resuming after a stop needs none either.
 
     Raises:
-        InputError: If the task cannot be done on hardware, or a check fails or is not confirmed.
+        InputError: If the task cannot be done on hardware, no robot answers, or a check fails or is not confirmed.
     """
     task = EnvConfig.resolve(config.task, config.environment).make_task()
     if not isinstance(task, InsertionTask) or task.observable_success() is None:

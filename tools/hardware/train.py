@@ -54,9 +54,9 @@ def train_on_robot(
         out: Run folder; with `resume`, that of the run to continue.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
-        given: Arguments of `configure`: algorithm, preset, episodes, seed.
+        given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.
         settings: Settings of the learner.
-        resume: Continue a run from its last episode. The address of the robot may be another one.
+        resume: Continue a run from its last episode. The address of the robot may differ.
         assume_yes: Skip the confirmation of the checks and, with a simulated driver, of resuming after a stop.
         log: Function that shows a message.
 

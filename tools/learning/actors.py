@@ -87,7 +87,7 @@ class ParallelLearner(Learner):
         self._snapshots = {0: _snapshot(learner)}  # by the number of episodes learned from
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action (A,) of the learner."""
+        """Return the action (A,) of the learner for an observation."""
         return self._learner.act(observation)
 
     def episode(self, index: int) -> dict[str, Any]:

@@ -79,9 +79,9 @@ class ChunkLearner(BcLearner):
         return super().on_episode_end(row)
 
     def _add(self, observations: np.ndarray, chunks: np.ndarray) -> None:
-        """Store observations (n, …) and chunks (n, K, O) with symmetric copies.
+        """Store observations (n, size) and chunks (n, K, O) with symmetric copies.
 
-        A symmetry transforms the outputs `_dims` as it transforms actions.
+        A symmetry transforms the outputs that actions move, `_dims`, as it transforms actions.
         """
         symmetries = [(np.eye(observations.shape[1]), None)]
         if self._symmetry is not None:

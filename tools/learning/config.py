@@ -270,9 +270,12 @@ def action_gamma(config: OffPolicyConfig | OnPolicyConfig, action_repeat: int) -
 def resolve_preset(
     preset: str | None, algorithm: str | None = None, settings: Mapping[str, Any] | None = None
 ) -> LearnerConfig:
-    """Return the configuration of a learner: a preset, by default `default_preset`, with single settings replaced.
+    """Return the configuration of a learner: a preset in which single settings are replaced.
 
-    The algorithm is the preset's by default. Settings are numbers or text by name.
+    Args:
+        preset: Name of a preset; `default_preset` by default.
+        algorithm: Name of the learner; the preset's by default.
+        settings: Values that replace the preset's, numbers or text by name.
 
     Raises:
         InputError: If a name is unknown, the preset is of another kind of learner, or a value is out of range.

@@ -110,7 +110,7 @@ class Learner(Callback, ABC):
         """Release resources such as processes; called even if training fails."""
 
     def metrics(self) -> Mapping[str, float]:
-        """Return scalars since the last call, such as losses, by their names in a log."""
+        """Return scalars that were recorded since the last call, such as losses, by their names in a log."""
         return {}
 
     @abstractmethod

@@ -20,7 +20,7 @@ from guiderail.models.parts.preparation import KINDS, ContactSurface, make_compl
 from guiderail.models.parts.solids import join_surfaces
 
 MODULUS = 2e9  # first modulus of the compliant part [Pa]
-MAX_MODULUS = 5e10
+MAX_MODULUS = 5e10  # largest modulus [Pa]
 SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
 # Commanded depths below the target [m]: tried in turn if bodies snap, until one seats the plug; otherwise the first.
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)
@@ -180,6 +180,7 @@ def _refusal_of_drake(folder: Path, file: Any) -> str | None:
 
 
 def _make_station(folder: Path, file: Any) -> None:
+    """Build a station of the task file, as the check of its geometry; run in a child process."""
     from guiderail.diagrams.stations.gantry import GantryStation
     from guiderail.diagrams.tasks.part.task import write_workcell
 
@@ -250,6 +251,7 @@ def _try_contact(folder: Path, contact: Contact, make_file: MakeFile) -> Choice:
 
 
 def _write_pieces(folder: Path, contact: Contact, surfaces: dict[str, ContactSurface]) -> None:
+    """Write the files of the contact geometry into the folder, and delete those of another contact."""
     for name in surfaces:
         for old in [*folder.glob(f"{name}_*.obj"), *folder.glob(f"{name}_*.vtk")]:
             old.unlink()

@@ -98,7 +98,7 @@ class Score:
 
 
 def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, bool]:
-    """Return one of `SETTINGS` with its score, and whether it has the required success rates.
+    """Return one of `SETTINGS`, its score, and True if it has the required success rates.
 
     The first setting has the index `FIRST`. After a setting that is too easy the next harder one is tried, and after
     one that is too hard the next easier one, until one has the required rates or was already tried, or none is left.
@@ -179,9 +179,11 @@ def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
 
 
 def turn_of(clearance: float, radius: float) -> float:
-    """Return the largest turn of the socket that the clearance [m] allows, at most `MAX_TURN` [degrees].
+    """Return the largest turn of the socket that the clearance allows, at most `MAX_TURN` [degrees].
 
-    The clearance is 0 without walls, and the radius is the largest distance of the plug from the axis [m].
+    Args:
+        clearance: Clearance between the walls [m]; 0 without walls.
+        radius: Largest distance of the plug from the axis [m].
     """
     if clearance <= 0.0:
         return 0.0

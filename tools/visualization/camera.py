@@ -18,7 +18,7 @@ from guiderail.tools.visualization.style import new_figure, save_figure
 
 ROWS, COLUMNS = 2, 3
 MAX_FRAMES = 24  # frames stored for a picture
-MAX_VIDEO_FRAMES = 240
+MAX_VIDEO_FRAMES = 240  # frames stored for a video
 LAST_FRAME = 1000  # duration of a video's last frame [ms]
 PATH = "#00a33a"  # color of the robot's path
 
@@ -116,6 +116,7 @@ def record_frames(episode: EpisodeSpec, number: int) -> tuple[dict[str, Any], li
 
 
 def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]:
+    """Run an episode; return its row and at most `max_frames` camera frames."""
     env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
     env.reset(seed=episode.run_seed)
     frames = Frames(env, max_frames)
@@ -125,7 +126,7 @@ def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]
 
 
 def path_in_picture(base: Any) -> np.ndarray:
-    """Return the measured positions of an environment's trace in the image of its task's camera, (n, 2) [pixel].
+    """Return the measured positions of an environment's trace in the image of its task's camera, (n, 2) [pixels].
 
     The result is empty if the task has no camera.
     """

@@ -71,9 +71,9 @@ class Motion(EnvCallback):
         """Return the episode as numbers for a page: `times` [s], `frames`, and the signals at those times.
 
         `frames` maps each body's path in Meshcat's tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32 in
-        base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the
-        previous sample, so that no peak is lost. `time` is in percent of the longest possible
-        episode. An episode that failed before its first control step has one sample.
+        base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the previous
+        sample, so that no peak is lost. `time` is in percent of the longest possible episode. An episode that failed
+        before its first control step has one sample.
         """
         trace = self.base.trace
         stride = max(1, -(-len(trace) // POINTS))
@@ -131,6 +131,7 @@ def state_names(task: Any) -> Sequence[str]:
 
 
 def _encode(poses: np.ndarray) -> str:
+    """Return poses (n, 7) as float32 in base64; the first pose alone if all are equal."""
     poses = poses.astype("<f4")
     return base64.b64encode((poses[:1] if (poses == poses[0]).all() else poses).tobytes()).decode()
 
@@ -288,7 +289,13 @@ def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, color: tup
 
 
 def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices (n·sides, 3) and triangles (m, 3) of a tube through every third point and the last."""
+    """Return the vertices (V, 3) and triangles (T, 3) of a tube.
+
+    Args:
+        points: Points of a path (n, 3) [m], at least two; the tube passes through every third one and the last.
+        radius: Radius of the tube [m].
+        sides: Number of sides of its cross section.
+    """
     points = np.vstack([points[:-1:3], points[-1:]])
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)

@@ -177,6 +177,7 @@ def _folder_names(runs: Sequence[Run]) -> list[str]:
 
 
 def _episodes(folder: RunFolder) -> pd.DataFrame:
+    """Return the training episodes of a run, empty without a table; raise an InputError if a column is missing."""
     rows = folder.episodes() if (folder.path / "episodes.csv").is_file() else pd.DataFrame()
     if len(rows) and (missing := [name for name in REQUIRED_COLUMNS if name not in rows]):
         raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train again")
@@ -203,6 +204,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
 
 
 def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of a study's table with the number of successes instead of the success rate."""
     rows = rows[["study", "method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"]].copy()
     rows["successes"] = (rows["success_rate"] * rows["episodes"]).round().astype(int)
     rows["episodes"] = rows["episodes"].astype(int)
