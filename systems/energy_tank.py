@@ -119,6 +119,8 @@ class EnergyTank(LeafSystem):
         limits, K = np.minimum(last_limits, requested), self._stiffness
         if not is_finite(pose):  # NaN would fill the tank and remain in its state
             return _Admitted(reference, limits, content)
+        if not is_finite(reference):  # the pose was not finite at initialization: start here
+            reference = pose
         moved = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
         dissipated = float(self._damping.dot(moved * moved)) / self._period
         error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)

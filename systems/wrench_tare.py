@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.systems.support import declarations as declare
@@ -15,7 +16,7 @@ class WrenchTare(LeafSystem):
         y_k = 0 for k < s + n,  y_k = u_k − (1/n) Σ u_j over j = s … s + n − 1 afterwards
 
     k counts samples since the initialization. The first s samples are skipped, because filters settle during this time.
-    The next n samples are averaged. A contact force during these n samples would be subtracted too.
+    The next n finite samples are averaged. A contact force during these n samples would be subtracted too.
 
     .. pydrake_system::
 
@@ -62,6 +63,8 @@ class WrenchTare(LeafSystem):
         if count >= self._skipped:
             offset = context.get_discrete_state().value(self._offset)
             sample = self._measured_wrench_port.Eval(context)
+            if not is_finite(sample):
+                return
             discrete_state.set_value(self._offset, offset + (sample - offset) / (count - self._skipped + 1.0))
         discrete_state.set_value(self._count, [count + 1.0])
 

@@ -98,12 +98,12 @@ class LinearConstraints:
         return self.G.shape[0] if self.G.ndim == 3 else None
 
     def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return G (n, F, O) and c (n, F) at steps (n,); a step past the end has the last constraints."""
+        """Return G (n, F, O) and c (n, F) at steps (n,); steps outside of the motion have those of its nearest step."""
         steps = np.asarray(steps)
         if self.G.ndim == 2:
             G, c = (np.broadcast_to(values, (len(steps), *values.shape)) for values in (self.G, self.c))
             return G, c
-        steps = np.minimum(steps, self.G.shape[0] - 1)
+        steps = np.clip(steps, 0, self.G.shape[0] - 1)
         return self.G[steps], self.c[steps]
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
@@ -115,7 +115,7 @@ class LinearConstraints:
             return -np.inf
         if self.G.ndim == 2:
             return float((self.c - self.G @ output).max())
-        step = min(step, self.G.shape[0] - 1)
+        step = min(max(step, 0), self.G.shape[0] - 1)
         return float((self.c[step] - self.G[step] @ output).max())
 
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:

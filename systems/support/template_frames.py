@@ -57,11 +57,13 @@ class TemplateFrames:
         Raises:
             InputError: If the template has no such frame, or a pose is not finite.
         """
-        for name, X_WF in frames.items():
+        for name in frames:
             if name not in self._names:
                 raise InputError(f"the template has no frame {name}, only {', '.join(self._names)}")
+        poses = {name: _checked_pose(name, X_WF) for name, X_WF in frames.items()}
+        for name, pose in poses.items():
             index = self._indices[self._names.index(name)]
-            context.get_mutable_numeric_parameter(index).SetFromVector(_checked_pose(name, X_WF))
+            context.get_mutable_numeric_parameter(index).SetFromVector(pose)
 
     def _calc(self, context: Context) -> dict[str, RigidTransform]:
         return {

@@ -119,6 +119,15 @@ def test_initialization_fills_the_tank_and_restarts_at_the_measured_pose():
     np.testing.assert_array_equal(wrench, BOUND.numbers)
 
 
+def test_motion_starts_at_the_first_finite_pose():
+    tank, pose = Tank(0.01), np.full(6, 0.2)
+    tank.put(pose, np.full(6, np.nan), BOUND.numbers)
+    tank.reset()
+    tank.step(pose, np.full(6, np.nan), BOUND.numbers)
+    reference, *_ = tank.step(pose + np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
+    np.testing.assert_allclose(reference - pose, np.r_[np.sqrt(2.0 * 0.01 / 1500.0), np.zeros(5)], rtol=1e-6)
+
+
 def test_bound_is_constant_without_an_input():
     system = EnergyTank(STIFFNESS, DAMPING, BOUND, capacity=0.5, period=PERIOD)
     context = system.CreateDefaultContext()

@@ -55,6 +55,11 @@ def test_input_mapping_depends_on_the_state(system):
 
 
 def test_input_mapping_uses_a_frame_set_by_a_reset(system):
+    context = system.CreateDefaultContext()
+    before = system.frames.eval(context)["mug_tip"].translation().copy()
+    with pytest.raises(InputError, match="the template has no frame lid"):
+        system.frames.set(context, {"mug_tip": RigidTransform([0.5, -0.06, 0.0]), "lid": RigidTransform()})
+    np.testing.assert_array_equal(system.frames.eval(context)["mug_tip"].translation(), before)
     # With the mug at the side instead of ahead, the same input is across the bearing and causes no tilt.
     aside = requested(system, np.array([0.0, 1.0, 0.0]), 2, frames={"mug_tip": RigidTransform([0.5, -0.06, 0.0])})
     np.testing.assert_allclose(aside, POSE, atol=1e-12)

@@ -41,6 +41,18 @@ def test_skipped_samples_do_not_count_and_the_others_are_averaged(tare):
     np.testing.assert_allclose(system.get_tared_wrench_output_port().Eval(context), -3.0)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_samples_that_are_not_finite_do_not_count(tare, number):
+    system, simulator, context, port = tare
+    for step, value in enumerate([100.0, 100.0, 1.0, number, 2.0, 3.0, 6.0]):
+        assert not system.is_tared(context)
+        port.GetMutableData().set_value([value, *np.full(5, 0.0 if np.isfinite(value) else 1.0)])
+        simulator.AdvanceTo((step + 0.5) * PERIOD)
+    assert system.is_tared(context)
+    port.GetMutableData().set_value(np.zeros(6))
+    np.testing.assert_allclose(system.get_tared_wrench_output_port().Eval(context), [-3.0, *np.zeros(5)])
+
+
 def test_initialization_tares_again(tare):
     system, simulator, context, port = tare
     simulator.AdvanceTo(PERIOD * 8)

@@ -263,7 +263,8 @@ class EpisodeProgress:
         """Add a finished episode."""
         self._done, self._count = int(row["episode"]) + 1, self._count + 1
         self._recent.append((float(row["success"]), float(row["return"])))
-        self._max_violation = max(self._max_violation, float(row.get("max_commanded_violation", -math.inf)))
+        violation = float(row.get("max_commanded_violation", -math.inf))
+        self._max_violation = float(np.maximum(self._max_violation, violation))  # NaN if one is NaN
         self._bar.update(self._task, completed=self._done, status=self.status(), refresh=True)
         now = time.monotonic()
         is_due = self._count == 1 or self._done == self._episodes or now - self._printed > INTERVAL

@@ -93,7 +93,7 @@ class OnPolicyLearner(Learner):
         if "simulation_failure" in transition.info or self._sampled is None:
             if not self._is_start and buffer.pos:
                 buffer.rewards[buffer.pos - 1] += self.model.gamma * float(self._value(transition.observation))
-            self._is_start = True
+            self._is_start, self._sampled = True, None
             return
         action, value, log_prob = self._sampled
         reward = transition.reward

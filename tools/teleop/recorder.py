@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 from pydrake.geometry import Box, Cylinder, MeshcatCone, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from guiderail.diagrams.envs.config import EnvConfig
@@ -253,7 +253,8 @@ class DemonstrationRecorder:
         snapshot = snapshots.pop()
         self.steps, self.command, self.offset = snapshot.steps, snapshot.command, snapshot.offset
         self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(snapshot.context)
-        self.simulator.Initialize()
+        # Initialization would start the tare, the energy tank and filters again.
+        self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         del self.recording.commands[snapshot.samples :]
         self.recording.resting = snapshot.resting
         self.panel.set(self.offset)

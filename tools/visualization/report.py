@@ -186,7 +186,7 @@ def _safety(safety: dict[str, list[dict[str, Any]]]) -> Table:
             if not values:
                 cells.append(Cell("–"))
             elif key in LARGEST:
-                cells.append(_largest(max(values), key))
+                cells.append(_largest(float(np.max(values)), key))
             else:
                 is_bad = key in MUST_BE_ZERO and sum(values) > 0
                 cells.append(Cell(f"{sum(values):,}", "bad" if is_bad else "good" if key in MUST_BE_ZERO else ""))

@@ -299,3 +299,10 @@ def test_constructor_refuses_contradictions_of_fixed_outputs(gap):
 def test_constructor_refuses_small_contradictions_of_rows():
     with pytest.raises(InputError, match="contradict each other"):
         LinearConstraints(np.array([[1.0, 1.0], [-1.0, -1.0]]), np.array([1.0, -1.0 + 5e-8]))
+
+
+def test_steps_outside_of_the_motion_have_the_constraints_of_the_nearest_step():
+    box = LinearConstraints.box(np.full((3, 1), -np.inf), np.array([[0.0], [1.0], [2.0]]))
+    assert [box.violation(np.array([0.0]), step) for step in (-2, 0, 2, 5)] == [0.0, 0.0, -2.0, -2.0]
+    _, c = box.window(np.array([-1, 0, 1, 3]))
+    np.testing.assert_array_equal(c[:, 0], [0.0, 0.0, -1.0, -2.0])

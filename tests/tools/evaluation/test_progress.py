@@ -1,4 +1,5 @@
 import io
+import math
 
 from rich.console import Console
 
@@ -43,3 +44,10 @@ def test_terminal_gets_a_bar():
     text = printed(terminal=True)
     for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03 m"):
         assert word in text
+
+
+def test_violation_that_is_not_a_number_is_shown():
+    progress = EpisodeProgress(2)
+    for episode, violation in enumerate((math.nan, 0.0)):
+        progress.update({"episode": episode, "success": 1, "return": 0.0, "max_commanded_violation": violation})
+    assert "largest violation nan" in progress.status()

@@ -135,6 +135,18 @@ def test_undo_takes_back_one_second(session):
     assert session.simulator.get_context().get_time() == pytest.approx(70 * 0.02)
 
 
+def test_undo_restores_the_states_of_all_systems(session):
+    session.reset()
+    lead(session, "x [mm]", 1.0, 60)
+    lead(session, "x [mm]", -3.0, 50)
+    stored = session.recording.snapshots[-1].context
+    session.undo()
+    states = [one.get_discrete_state() for one in (stored, session.simulator.get_context())]
+    assert states[0].num_groups() == states[1].num_groups() > 1
+    for group in range(states[0].num_groups()):
+        np.testing.assert_array_equal(states[1].value(group), states[0].value(group))
+
+
 def test_undo_takes_back_a_long_motion_in_seconds(session):
     session.reset()
     lead(session, "z [mm]", 40.0, 90)  # two seconds of motion at the limited speed

@@ -1,4 +1,5 @@
 import itertools
+import math
 import re
 import shlex
 import shutil
@@ -21,7 +22,7 @@ from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.curves import plot_run
-from guiderail.tools.visualization.report import write_report
+from guiderail.tools.visualization.report import SAFETY_COLUMNS, _safety, write_report
 from guiderail.tools.visualization.report_data import command, gather
 from guiderail.tools.visualization.report_figures import _svg
 from guiderail.tools.visualization.style import new_figure
@@ -215,3 +216,13 @@ def test_report_evaluates_a_run_next_to_a_study(studied, tmp_path):
     judged = gather([run, studied], episodes=2).held_out
     assert set(judged["seed"]) == {1, 2, 9}
     assert judged[(judged["seed"] == 9) & (judged["policy"] == "learned")]["episodes"].tolist() == [2]
+
+
+@pytest.mark.parametrize("values", [[0.1, math.nan], [math.nan, 0.1]])
+def test_violation_that_is_not_a_number_is_shown_in_any_order(values):
+    runs = [
+        dict.fromkeys(SAFETY_COLUMNS, 0.0) | {"episodes": 1, "steps": 1, "max_commanded_violation": value}
+        for value in values
+    ]
+    (row,) = _safety({"kgrl": runs}).rows
+    assert "not finite" in [cell.text for cell in row.cells]
