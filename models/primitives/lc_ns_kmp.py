@@ -240,8 +240,8 @@ class LcNsKmp:
             step: As in `predict`; it selects the constraints.
             means: Reference means of the window (H+1, O), the executed point first.
             covariances: Reference covariances of the window (H+1, O, O), positive definite.
-            null_space_action: As in `predict`.
-            history: As in `predict`.
+            null_space_action: ξ̂ (O,), as in `predict`.
+            history: (P, O), as in `predict`.
 
         Raises:
             InputError: As `predict`, if shapes do not match, or a covariance is not positive definite.
