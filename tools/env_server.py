@@ -39,6 +39,8 @@ def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
     if (Path(name) / "config.yaml").is_file():
         config = RunFolder(name).config()
         name, options = config.task, config.environment | options
+    if "task" in options:
+        raise InputError("the task is given as the name, and not as the option 'task'")
     return make_env(name, **as_arguments(options))
 
 

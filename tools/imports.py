@@ -5,6 +5,7 @@ as the configuration of a run; a module or file that this process has not import
 `trust_imports` is active.
 """
 
+import hashlib
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -116,13 +117,19 @@ def _is_module(name: str) -> bool:
         return False
 
 
+def module_name(path: Path) -> str:
+    """Return the name in `sys.modules` of an imported file; files of equal names in two folders have two names."""
+    path = path.resolve()
+    return f"guiderail_imported_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+
+
 def _import_file(path: Path) -> str:
     """Run a file with its folder on `sys.path`, as for a script, unless it has run with the same content before."""
     path = path.resolve()
     content = path.read_bytes()
     if _IMPORTED_FILES.get(path) == content:
         return str(path)
-    name = f"guiderail_imported_{path.stem}"
+    name = module_name(path)
     spec = spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None

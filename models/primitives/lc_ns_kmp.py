@@ -247,6 +247,7 @@ class LcNsKmp:
             InputError: As `predict`, if shapes do not match, or a covariance is not positive definite.
             UnsolvableError: As `predict`.
         """
+        step = self._checked_step(step)
         window = Window.checked(means, covariances, *self.constraints.window(self._window_steps(step, self.horizon)))
         factor = StepFactor(window, self._features(step), self.lambda_, self.beta)
         return self._finish(factor, self._stack(null_space_action, history))
@@ -412,12 +413,16 @@ class LcNsKmp:
             raise InputError("histories and null-space actions must be finite")
         return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
-    def _factor(self, step: int) -> StepFactor:
+    def _checked_step(self, step: int) -> int:
+        """Return a step, the last one for a step past the end; raise an `InputError` unless it is a whole number."""
         if step < 0:
             raise InputError(f"step counts from 0, not {step}")
         if not float(step).is_integer():
             raise InputError(f"a step is a whole number, not {brief(step)}")
-        step = min(int(step), self.num_steps - 1)
+        return min(int(step), self.num_steps - 1)
+
+    def _factor(self, step: int) -> StepFactor:
+        step = self._checked_step(step)
         factor = self._cache.get(step)
         if factor is None:
             factor = StepFactor(self._window(step, self.horizon), self._features(step), self.lambda_, self.beta)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 Orientation = Literal["euler_zyx", "rotation_vector"]
+
+SINGULAR = math.sin(math.radians(89.0))  # largest |sin Ry| of Euler angles [Rz Ry Rx]
 
 POSE_NAMES: dict[str, tuple[str, ...]] = {
     "euler_zyx": ("x [m]", "y [m]", "z [m]", "psi_z [rad]", "psi_y [rad]", "psi_x [rad]"),
@@ -63,7 +66,7 @@ def pose_outputs(
     p_TE = R_WT.inv().apply(positions - np.asarray(target_position, dtype=float))
     R_TE = R_WT.inv() * Rotation.from_quat(quaternions, scalar_first=True)
     if orientation == "euler_zyx":
-        if np.abs(R_TE.as_matrix()[:, 2, 0]).max() > np.sin(np.deg2rad(89)):
+        if np.abs(R_TE.as_matrix()[:, 2, 0]).max() > SINGULAR:
             raise InputError("ZYX Euler angles are singular in this motion: use orientation='rotation_vector'")
         return np.hstack([p_TE, _continued(R_TE.as_euler("ZYX"), near)])
     if orientation == "rotation_vector":

@@ -96,7 +96,7 @@ def _command_name() -> str:
 
 def _clear(out: Path) -> None:
     """Remove an earlier demo; raise an InputError if the folder contains anything else."""
-    if (out / MARK).is_file():
+    if (out / MARK).is_file() and not out.is_symlink():
         shutil.rmtree(out)
     RunFolder(out).refuse_existing()
 

@@ -27,7 +27,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import BASE_POLICIES, MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
-from guiderail.tools.imports import import_modules, is_trusted
+from guiderail.tools.imports import import_modules, is_trusted, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
@@ -200,7 +200,7 @@ def _function_of(source: str) -> tuple[str, str] | None:
 
 def _load_function(module: str, name: str) -> PolicyFn:
     (imported,) = import_modules([module])
-    loaded = sys.modules.get(f"guiderail_imported_{Path(imported).stem}" if imported.endswith(".py") else imported)
+    loaded = sys.modules.get(module_name(Path(imported)) if imported.endswith(".py") else imported)
     if not hasattr(loaded, name):
         names = [one for one in vars(loaded or object) if not one.startswith("_")]
         raise InputError(f"{module} has no {brief(name)}: {did_you_mean(name, names)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import string
 from collections.abc import Sequence
@@ -91,6 +92,14 @@ class EvalSet(_Strict):
     episodes: Integer = Field(default=100, ge=1)  # number of episodes
     first_seed: Integer = Field(default=HELD_OUT_SEED, ge=0)  # seed of the first episode; episode i has first_seed + i
     file: EvaluatedFile = "{name}-{after_episodes}-{digest}.csv"  # file of the episodes in the run's folder
+
+    @field_validator("sampled")
+    @classmethod
+    def _are_ranges(cls, value: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        for name, (low, high) in value.items():
+            if not -math.inf < low <= high < math.inf:
+                raise ValueError(f"the range of {name} is two finite numbers, the smaller first, not {low}, {high}")
+        return value
 
 
 class Sweep(_Strict):

@@ -124,9 +124,10 @@ def check_job(job: Job) -> None:
     if policy not in (LEARNED, BEST_CONSTANT):
         make_baseline(job.study.task, policy)
     for eval_set in job.study.eval_sets:
-        sampled = {name: low for name, (low, _) in eval_set.sampled.items()}
         environment = changed_environment(config.task, config.environment, eval_set.env)
-        configure(job.study.task, environment | sampled, episodes=1)
+        for end in (0, 1):
+            sampled = {name: ends[end] for name, ends in eval_set.sampled.items()}
+            configure(job.study.task, environment | sampled, episodes=1)
         check_reset(job.study.task, eval_set.options)
     for episodes, eval_set in itertools.product(job.after_episodes, job.study.eval_sets):
         _refuse_other_rows(job, episodes, eval_set)

@@ -32,8 +32,8 @@ MAX_EPISODES = 10**9  # largest number of episodes of a run
 
 
 def _check_ent_coef(ent_coef: str) -> str:
-    initial = ent_coef.removeprefix("auto").removeprefix("_")
-    if ent_coef != "auto" and not 0 < float(initial) < math.inf:
+    initial = ent_coef.removeprefix("auto_")
+    if ent_coef != "auto" and (initial.startswith("_") or not 0 < float(initial) < math.inf):
         raise ValueError("it is auto, auto_<initial value> or a positive number")
     return ent_coef
 
@@ -96,6 +96,10 @@ class OffPolicyConfig(LearnerConfig):
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
             raise InputError("demonstration_fraction needs demonstrations: give --set demonstration_episodes=... too")
+        if self.demonstration_fraction and self.pipelined:
+            raise InputError("demonstration_fraction does not work with pipelined=true: leave one of them out")
+        if self.init_from and self.demonstration_episodes:
+            raise InputError("demonstration_episodes does not work with init_from: leave one of them out")
         if self.device == "cuda" and self.num_envs:
             raise InputError("parallel actors are forks, which cannot use cuda: leave num_envs or device=cuda out")
 
@@ -314,6 +318,8 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
+        if not first["loc"]:  # settings that exclude each other
+            raise InputError(str(first.get("ctx", {}).get("error", first["msg"]))) from None
         name = str(first["loc"][0]) if first["loc"] else "configuration"
         defaults = {field.name: getattr(field.default, "default", field.default) for field in fields(kind)}
         example = f" such as {defaults[name]!r}" if name in defaults else ""

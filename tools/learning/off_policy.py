@@ -214,7 +214,8 @@ class OffPolicyLearner(Learner):
         if "simulation_failure" in transition.info:
             if self._has_transition:
                 buffer = self.model.replay_buffer
-                buffer.dones[buffer.pos - 1] = buffer.timeouts[buffer.pos - 1] = 1.0
+                newest = getattr(buffer, "newest", buffer.pos - 1)
+                buffer.dones[newest] = buffer.timeouts[newest] = 1.0
             return
         self.store(transition)
         self.learn()

@@ -45,6 +45,12 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
         if self.full and self.pos < self.num_demonstrated:
             self.pos = self.num_demonstrated
 
+    @property
+    def newest(self) -> int:
+        """Index of the row that was added last."""
+        is_wrapped = self.full and self.pos == self.num_demonstrated
+        return self.buffer_size - 1 if is_wrapped else self.pos - 1
+
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         # The row after the last one is a demonstration: a return of several steps ends at the last row.
         kept = self.timeouts[-1].copy()

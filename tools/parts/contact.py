@@ -198,7 +198,12 @@ def _adapt_settings(
     choices: list[Choice] = []
     start = cpu_time()
     for _ in range(MAX_TRIALS):
-        choice = _try_contact(folder, contact, make_file)
+        try:
+            choice = _try_contact(folder, contact, make_file)
+        except RuntimeError:
+            if not choices:
+                raise
+            break  # the settings before work
         choices.append(choice)
         resting = max(trial.resting_penetration for trial in choice.trials)
         log(

@@ -127,6 +127,14 @@ def test_base_policy_of_a_function_is_stored_with_its_path_and_its_code(tmp_path
     assert task_content("NarrowPassage", environment, ()) != before
 
 
+def test_functions_of_files_with_equal_names_are_different_policies(tmp_path):
+    for folder, value in (("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "pol.py").write_text(f"def act(observation):\n    return [{value}.0]\n")
+    loaded = [load_policy(f"{tmp_path}/{name}/pol.py:act") for name in ("a", "b", "a")]
+    assert [list(policy(np.zeros(1))) for policy in loaded] == [[1.0], [2.0], [1.0]]
+
+
 def test_function_of_a_file_is_a_policy(env, tmp_path):
     file = tmp_path / "own_policies.py"
     file.write_text(

@@ -305,6 +305,8 @@ WRONG = [
     ({"eval_set": [{"episodes": 0}]}, "eval_set"),
     ({"eval_set": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
     ({"eval_set": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
+    ({"eval_set": [{"sampled": {"wall": [0.3, 0.2]}}]}, "the smaller first"),
+    ({"eval_set": [{"sampled": {"wall": [0.2, float("nan")]}}]}, "finite"),
     ({"folder": "{guidance}-{seed}"}, "the placeholders are {method}, {seed}, {episodes}, {algorithm}"),
     ({"folder": "{method}-{seed"}, "has a brace without its counterpart"),
     ({"folder": "{method}-{seed:999999999}"}, "an unknown or formatted placeholder"),

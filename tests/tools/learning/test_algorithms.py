@@ -201,6 +201,27 @@ def test_demonstration_fraction_needs_demonstrations():
         resolve_preset(None, "tqc", {"demonstration_fraction": 0.5})
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"demonstration_fraction": 0.5, "demonstration_episodes": 1, "pipelined": True}, "fraction does not work"),
+        ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_named(settings, words):
+    with pytest.raises(InputError, match=words):
+        resolve_preset(None, "tqc", settings)
+
+
+def test_newest_row_of_a_full_buffer_is_the_last_one():
+    box = spaces.Box(-1.0, 1.0, (1,))
+    buffer = DemonstrationReplayBuffer(4, box, box, device="cpu")
+    for step in range(6):
+        buffer.num_demonstrated = min(step, 2)
+        buffer.add(*np.zeros((3, 1, 1)), np.array([float(step)]), np.array([False]), [{}])
+        assert buffer.rewards[buffer.newest] == step
+
+
 @pytest.mark.parametrize("algorithm", ["sac", "tqc"])
 def test_dropout_is_applied_to_the_critics_in_training_only(algorithm):
     config = resolve_preset(None, algorithm, {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "dropout": 0.5})

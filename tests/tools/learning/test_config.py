@@ -8,6 +8,7 @@ from guiderail.tools.learning.learner import LEARNERS
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
+        ("ent_coef", "_0.5"), ("ent_coef", "auto0.5"),
         ("ent_coef", "inf"), ("ent_coef", "auto_nan"), ("ent_coef", "-1"), ("net_arch", "1000000,1000000"),
         ("net_arch", ""),
         ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("layer_norm", "7"),

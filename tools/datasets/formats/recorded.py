@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.poses import SINGULAR
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 COMMANDED = ("command", "desired", "target", "equilibrium", "cmd", "action", "goal", "setpoint", "reference")
@@ -63,6 +64,11 @@ def poses_in_target(
         turn = Rotation.from_euler("xyz", np.asarray(target[3:], dtype=float), degrees=True)
         positions = turn.inv().apply(positions - np.asarray(target[:3], dtype=float))
         rotations = turn.inv() * rotations
+    if np.abs(rotations.as_matrix()[:, 2, 0]).max(initial=0.0) > SINGULAR:
+        raise InputError(
+            "the angles [Rz Ry Rx] of this recording are singular, because Ry comes near ±90°: give a target frame "
+            "(--target) that is turned by 90°"
+        )
     # Rz(a) Ry(b) Rx(c), continuous beyond ±π.
     angles = np.unwrap(rotations.as_euler("ZYX"), axis=0)
     if like is not None:

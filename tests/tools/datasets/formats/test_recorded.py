@@ -1,0 +1,16 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.datasets.formats.recorded import poses_in_target
+
+
+def test_singular_angles_are_refused_and_a_turned_target_makes_them_regular():
+    turns = Rotation.from_euler("y", np.linspace(80.0, 100.0, 21)[:, None], degrees=True)
+    with pytest.raises(InputError, match="Ry comes near ±90°"):
+        poses_in_target(np.zeros((21, 3)), turns, None)
+    poses = poses_in_target(np.zeros((21, 3)), turns, [0.0, 0.0, 0.0, 0.0, 90.0, 0.0])
+    np.testing.assert_allclose(
+        np.rad2deg(poses[:, 3:]), np.column_stack([np.zeros(21), np.arange(-10, 11), np.zeros(21)]), atol=1e-9
+    )
