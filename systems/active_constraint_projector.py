@@ -123,12 +123,12 @@ class ActiveConstraintProjector(LeafSystem):
             reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error
             is_waiting = tracking_error > self._max_tracking_error and not reduces_error
             if not is_waiting and np.isfinite(desired).all():
-                return np.array([*desired, 0.0])
+                return np.append(desired, 0.0)
         # Projecting a command that is already inside would move it by rounding errors at every step.
         if self._violation(context, last) > INSIDE:
             inside = self._constrained(context, last, last)
             last = inside if np.isfinite(inside).all() else last
-        return np.array([*last, 1.0])
+        return np.append(last, 1.0)
 
     def _constrained(self, context: Context, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
         """Return the allowed pose (6,) for a request, reachable in one period."""

@@ -79,13 +79,13 @@ class ContactDetector(LeafSystem):
         for i in range(results.num_hydroelastic_contacts()):
             info = results.hydroelastic_contact_info(i)
             surface = info.contact_surface()
-            bodies = [self._body_of.get(geometry, -1) for geometry in (surface.id_M(), surface.id_N())]
+            bodies = [self._body_of.get(geometry) for geometry in (surface.id_M(), surface.id_N())]
             if self._is_collision(*bodies):
                 f = info.F_Ac_W().translational()
                 largest = max(largest or 0.0, float(f @ f) ** 0.5)
         return largest
 
-    def _is_collision(self, a: int, b: int) -> bool:
+    def _is_collision(self, a: int | None, b: int | None) -> bool:
         return (a in self._bodies and b in self._obstacles) or (b in self._bodies and a in self._obstacles)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

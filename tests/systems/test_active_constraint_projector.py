@@ -146,6 +146,25 @@ def test_command_waits_when_the_tracking_error_is_too_large():
     assert desired[0] < 0.02
 
 
+@pytest.mark.parametrize(("distance", "fallback"), [(0.4999, 0.0), (0.5, 0.0), (0.5001, 1.0)])
+def test_command_waits_above_the_largest_tracking_error_only(distance, fallback):
+    rig = Rig(max_tracking_error=0.5)
+    rig.step(START, measured=START + [distance, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert rig.step(START - [0.1, 0.0, 0.0, 0.0, 0.0, 0.0])[1] == fallback
+
+
+def test_waiting_command_inside_the_constraints_is_repeated_bit_for_bit():
+    """Its projection would differ by rounding errors."""
+    rig, rng = Rig(template=RAISED), np.random.default_rng(0)
+    for _ in range(30):
+        before, fallback = rig.step(START + rng.normal(scale=[0.1] * 3 + [1.0] * 3))
+        assert fallback == 0.0
+        for _ in range(2):
+            desired, fallback = rig.step(NOWHERE)
+            assert fallback == 1.0
+            np.testing.assert_array_equal(desired, before)
+
+
 # The floor of the second state is slightly above the transition's threshold, within reach of one period.
 RAISED = parse_template(
     "name: step"
@@ -197,7 +216,7 @@ def test_waiting_command_is_led_inside_when_an_object_moves():
     assert rig.value("commanded_violation") <= 1e-9
 
 
-@pytest.mark.parametrize("nowhere", [NOWHERE, START + [0.0, 0.0, 0.0, 0.0, np.nan, 0.0]])
+@pytest.mark.parametrize("nowhere", [NOWHERE, *(START + [0.0, 0.0, 0.0, 0.0, bad, 0.0] for bad in (np.nan, np.inf))])
 @pytest.mark.parametrize("max_tracking_error", [0.02, np.inf])
 def test_command_waits_while_the_measured_pose_is_nan(max_tracking_error, nowhere):
     rig = Rig(max_tracking_error=max_tracking_error)

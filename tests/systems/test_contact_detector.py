@@ -33,7 +33,9 @@ def properties(compliant=False, hydroelastic=False):
     return material
 
 
-def drop(x, height=0.05, sampled=False, hydroelastic=False, duration=0.3):
+def drop(
+    x, height=0.05, sampled=False, hydroelastic=False, duration=0.3, mass=0.1, bodies=("ball",), obstacles=("plate",)
+):
     """Return the outputs over time for a ball dropped at `x`; the plate ends at x = 0.1, the floor is lower."""
     builder = DiagramBuilder()
     model = "hydroelastic_with_fallback" if hydroelastic else "point"
@@ -44,7 +46,7 @@ def drop(x, height=0.05, sampled=False, hydroelastic=False, duration=0.3):
         use_sampled_output_ports=sampled,
     )
     plant, _ = AddMultibodyPlant(config, builder)
-    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(0.1, RADIUS))
+    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(mass, RADIUS))
     plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(RADIUS), "ball", properties(True, hydroelastic))
     plate = plant.AddRigidBody("plate", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.02))
     plant.RegisterCollisionGeometry(
@@ -54,7 +56,9 @@ def drop(x, height=0.05, sampled=False, hydroelastic=False, duration=0.3):
     floor = RigidTransform([0, 0, -0.1])
     plant.RegisterCollisionGeometry(plant.world_body(), floor, Box(2, 2, 0.02), "floor", properties())
     plant.Finalize()
-    detector = builder.AddSystem(ContactDetector(plant, [ball], [plate], STEP))
+    named = {"ball": ball, "plate": plate, "world": plant.world_body()}
+    listed = [[named[name] for name in names] for names in (bodies, obstacles)]
+    detector = builder.AddSystem(ContactDetector(plant, *listed, STEP))
     builder.Connect(plant.get_contact_results_output_port(), detector.get_contact_results_input_port())
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
@@ -99,11 +103,21 @@ def test_collision_is_stored_after_the_contact_has_ended():
     assert collision[-1] == 0.0
 
 
-def test_hydroelastic_contact_is_a_collision():
-    _, has_collided, force = drop(x=0.0, hydroelastic=True, duration=1.5).T
-    assert has_collided[-1] == 1.0
-    # At the end the ball rests on the plate, which carries its weight.
-    assert force[-1] == pytest.approx(0.1 * 9.81, rel=0.1)
+@pytest.mark.parametrize("hydroelastic", [False, True])
+@pytest.mark.parametrize("mass", [0.01, 0.3])
+@pytest.mark.parametrize(("body", "obstacle"), [("ball", "plate"), ("plate", "ball")])
+def test_force_is_the_weight_of_a_ball_at_rest(hydroelastic, mass, body, obstacle):
+    outputs = drop(0.0, 0.0, False, hydroelastic, 1.0, mass, [body], [obstacle])
+    np.testing.assert_allclose(outputs[-1], [1.0, 1.0, mass * 9.81], rtol=1e-4)
+
+
+@pytest.mark.parametrize("hydroelastic", [False, True])
+@pytest.mark.parametrize(
+    ("body", "obstacle"), [("ball", "world"), ("world", "ball"), ("plate", "world"), ("world", "plate")]
+)
+def test_contact_with_a_body_in_neither_set_is_no_collision(hydroelastic, body, obstacle):
+    outputs = drop(0.0, 0.0, hydroelastic=hydroelastic, duration=0.05, bodies=[body], obstacles=[obstacle])
+    np.testing.assert_array_equal(outputs, 0.0)
 
 
 def test_constructor_refuses_arguments_out_of_range():

@@ -75,6 +75,27 @@ def test_constructor_refuses_arguments_out_of_range(wrong):
         GripperCommand(valid.pop("lower"), valid.pop("upper"), valid.pop("opening"), **valid)
 
 
+@pytest.mark.parametrize(("limit", "outside"), [(LOWER, -np.inf), (UPPER, np.inf)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_opening_may_be_at_a_limit_but_not_beyond(limit, outside, joint):
+    opening = OPENING.copy()
+    opening[joint] = limit[joint]
+    GripperCommand(LOWER, UPPER, opening, period=0.01)
+    opening[joint] = np.nextafter(limit[joint], outside)
+    with pytest.raises(InputError, match="opening must be within"):
+        GripperCommand(LOWER, UPPER, opening, period=0.01)
+
+
+def test_arguments_are_copied_and_may_be_lists():
+    GripperCommand(LOWER.tolist(), UPPER.tolist(), OPENING.tolist(), period=0.01)
+    lower, upper = LOWER.copy(), UPPER.copy()
+    system = GripperCommand(lower, upper, OPENING, period=0.01)
+    lower[:], upper[:] = 0.0, 0.0
+    context = system.CreateDefaultContext()
+    system.get_position_input_port().FixValue(context, [-5.0, 5.0])
+    np.testing.assert_array_equal(system.get_desired_state_output_port().Eval(context), [0.0, 1.0, 0.0, 0.0])
+
+
 def test_ports():
     system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
     assert system.get_position_input_port().get_name() == "position"

@@ -7,8 +7,8 @@ from guiderail.systems.impedance_monitor import ImpedanceMonitor
 LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
 
 
-def read(wrench):
-    monitor = ImpedanceMonitor(LIMITS)
+def read(wrench, limits=LIMITS):
+    monitor = ImpedanceMonitor(limits)
     context = monitor.CreateDefaultContext()
     monitor.get_impedance_wrench_input_port().FixValue(context, wrench)
     force, saturation = monitor.get_contact_force_output_port(), monitor.get_saturation_output_port()
@@ -23,13 +23,22 @@ def test_contact_force_is_the_norm_of_the_force_alone():
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_saturation_is_reported_when_any_axis_is_at_its_limit(axis, sign):
     wrench = np.zeros(6)
-    wrench[axis] = 0.99 * sign * LIMITS[axis]
-    assert read(wrench)[1] == 0.0
-    wrench[axis] = sign * LIMITS[axis]
-    assert read(wrench)[1] == 1.0
+    for share, expected in ((0.9989, 0.0), (0.9991, 1.0), (1.0, 1.0), (2.0, 1.0)):
+        wrench[axis] = share * sign * LIMITS[axis]
+        assert read(wrench)[1] == expected
 
 
-@pytest.mark.parametrize("limits", [np.ones(5), np.zeros(6), np.full(6, np.nan)])
+def test_saturation_begins_at_exactly_999_thousandths_of_a_limit():
+    limits = np.full(6, 1000.0)
+    assert read([np.nextafter(999.0, 0.0)] + [0.0] * 5, limits)[1] == 0.0
+    assert read([999.0] + [0.0] * 5, limits)[1] == 1.0
+
+
+def test_limits_may_be_a_list_of_numbers_below_one():
+    assert read([0.0] * 5 + [0.01], [0.01] * 6)[1] == 1.0
+
+
+@pytest.mark.parametrize("limits", [np.ones(5), np.zeros(6), np.full(6, np.nan), [1.0] * 5 + [0.0], [-1.0] + [1.0] * 5])
 def test_constructor_refuses_limits_out_of_range(limits):
     with pytest.raises(InputError):
         ImpedanceMonitor(limits)

@@ -99,6 +99,23 @@ def test_unknown_state_has_the_lowest_limits(state):
     np.testing.assert_array_equal(rig.run(2)[-1], LOW)
 
 
+def test_every_state_of_many_has_its_own_limit():
+    limits = np.tile(LOW, (1100, 1))
+    limits[-1] = HIGH
+    np.testing.assert_array_equal(Rig(1099.0, limits=limits).bound, HIGH)
+    np.testing.assert_array_equal(Rig(1098.0, limits=limits).bound, LOW)
+
+
+def test_limits_are_copied_and_may_be_lists():
+    limits = np.array([HIGH, LOW])
+    system = PhaseWrenchLimit(limits, RATE.tolist(), period=PERIOD)
+    limits[:] = 0.0
+    context = system.CreateDefaultContext()
+    system.get_state_input_port().FixValue(context, [0.0])
+    np.testing.assert_array_equal(system.get_phase_max_wrench_output_port().Eval(context), HIGH)
+    PhaseWrenchLimit([HIGH.tolist()], RATE, period=PERIOD)
+
+
 def test_reset_forgets_the_limit_of_last_episode():
     rig = Rig(1.0)
     rig.run(2)
@@ -116,7 +133,11 @@ def test_reset_forgets_the_limit_of_last_episode():
         ({"limits": np.full((2, 8), np.inf)}, "finite and not negative"),
         ({"limits": np.full((2, 8), np.nan)}, "finite and not negative"),
         ({"limits": np.full((2, 8), -1e-9)}, "finite and not negative"),
+        ({"limits": np.r_[np.zeros((1, 8)), [[0.0] * 7 + [np.inf]]]}, "finite and not negative"),
+        ({"limits": np.r_[[[-1e-9] + [0.0] * 7], np.zeros((1, 8))]}, "finite and not negative"),
         ({"max_rate": np.zeros(8)}, "8 positive numbers"),
+        ({"max_rate": np.r_[np.ones(7), 0.0]}, "8 positive numbers"),
+        ({"max_rate": np.r_[np.nan, np.ones(7)]}, "8 positive numbers"),
         ({"max_rate": np.full(8, np.inf)}, "8 positive numbers"),
         ({"max_rate": np.ones(6)}, "8 positive numbers"),
         ({"period": 0.0}, "period must be positive"),
@@ -125,5 +146,6 @@ def test_reset_forgets_the_limit_of_last_episode():
 def test_constructor_refuses_what_is_out_of_range(change, words):
     arguments = {"limits": np.zeros((2, 8)), "max_rate": RATE, "period": PERIOD}
     PhaseWrenchLimit(**arguments)
+    PhaseWrenchLimit(**arguments | {"max_rate": np.full(8, 1e-3)})
     with pytest.raises(InputError, match=words):
         PhaseWrenchLimit(**arguments | change)

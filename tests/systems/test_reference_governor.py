@@ -61,10 +61,13 @@ def test_motion_leaves_less_for_the_spring():
         ({"stiffness": np.full(6, np.inf)}, "all finite"),
         ({"damping": np.full(6, np.inf)}, "all finite"),
         ({"mass": 0.0}, "moving mass must be positive"),
+        ({"mass": np.inf}, "moving mass must be positive and finite"),
+        ({"mass": np.nan}, "moving mass must be positive"),
         ({"step": 0.0}, "period must be positive"),
     ],
 )
 def test_governor_raises_when_an_argument_is_invalid(change, words):
-    arguments = {"stiffness": STIFFNESS, "damping": DAMPING, "mass": 1.5, "step": 0.01, "bound": BOUND} | change
+    arguments = {"stiffness": STIFFNESS, "damping": DAMPING, "mass": 1.5, "step": 0.01, "bound": BOUND}
+    ReferenceGovernor(**arguments | {"mass": 0.01})
     with pytest.raises(InputError, match=words):
-        ReferenceGovernor(**arguments)
+        ReferenceGovernor(**arguments | change)
