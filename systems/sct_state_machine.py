@@ -75,7 +75,7 @@ class SctStateMachine(LeafSystem):
     get_progress_output_port = output_getter("progress", "progress in the task, (1,)")
 
     def _state_pose_frames(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
-        state = int(context.get_discrete_state().value(self._state)[0])
+        state = int(context.get_discrete_state().value(self._state).item())
         return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -8,6 +8,7 @@ from pydrake.systems.analysis import Simulator
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.models.templates import parse_template
+from guiderail.systems import active_constraint_projector
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 
 PERIOD = 2.0**-7
@@ -214,6 +215,14 @@ def test_waiting_command_is_led_inside_when_an_object_moves():
         last = desired
     assert desired[2] == pytest.approx(0.4)
     assert rig.value("commanded_violation") <= 1e-9
+
+
+@pytest.mark.parametrize(("tolerance", "expected"), [(0.1, 0.5), (0.09995, 0.5 + 0.5 * PERIOD)])
+def test_waiting_command_moves_inside_when_its_violation_exceeds_the_tolerance(monkeypatch, tolerance, expected):
+    monkeypatch.setattr(active_constraint_projector, "INSIDE", tolerance)
+    rig = Rig(start=START + [0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+    rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.5])})  # violated by exactly 0.1 m
+    assert rig.step(NOWHERE)[0][2] == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("nowhere", [NOWHERE, *(START + [0.0, 0.0, 0.0, 0.0, bad, 0.0] for bad in (np.nan, np.inf))])

@@ -1,5 +1,8 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from pydrake.multibody.inverse_kinematics import DifferentialInverseKinematicsStatus
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
@@ -13,6 +16,7 @@ from guiderail.systems.support.drake_multibody import pose_to_transform, transfo
 
 READY_POSTURE = np.array(IIWA14.home)
 START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])
+NOWHERE = np.full(6, np.nan)
 GOAL = START + [0.05, -0.08, 0.06, -0.5, 0.1, -0.2]
 
 
@@ -91,6 +95,7 @@ def test_closed_form_is_the_optimum_when_no_limit_is_active(arm, monkeypatch):
     monkeypatch.setattr(cartesian_position_controller, "_within", lambda values, limits: False)
     slow.advance(1.0)
     np.testing.assert_allclose(quick.joints, slow.joints, atol=1e-6)
+    assert quick.stuck == slow.stuck == 0.0
     assert np.abs(quick.joints - quick.q_start).max() > 0.1
 
 
@@ -243,9 +248,102 @@ def test_constructor_refuses_arguments_out_of_range(arm, wrong):
         CartesianPositionController(plant, model.target, model.tool_center, **({"posture": READY_POSTURE} | wrong))
 
 
-def test_speed_limits_refuse_values_out_of_range():
-    with pytest.raises(InputError):
-        SpeedLimits(translational=0.0)
+@pytest.mark.parametrize("speed", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("name", ["translational", "rotational"])
+def test_speed_limits_refuse_values_out_of_range(name, speed):
+    with pytest.raises(InputError, match="positive"):
+        SpeedLimits(**{name: speed})
+
+
+def test_defaults_of_the_controller(arm):
+    explicit = {"speed_limits": SpeedLimits(translational=0.25, rotational=1.0), "posture_gain": 0.5, "timeout": 0.1}
+    for time in (None, 0.0, -5e-5):
+        joints = []
+        for options in ({}, explicit):
+            commanded = Commanded(arm, **options)
+            commanded.command(START + [0.3, 0.0, 0.0, 2.0, 0.0, 0.0], time)
+            commanded.advance(0.145)
+            joints.append(commanded.joints)
+        np.testing.assert_array_equal(*joints)
+    assert SpeedLimits() == explicit["speed_limits"]
+
+
+def test_posture_gain_of_zero_is_accepted(arm):
+    commanded = Commanded(arm, posture_gain=0.0)
+    commanded.command(GOAL)
+    commanded.advance(2.0)
+    np.testing.assert_allclose(commanded.pose, GOAL, atol=1e-5)
+
+
+def test_flags_are_reset_at_initialization(arm):
+    commanded = Commanded(arm, speed_limits=SpeedLimits(translational=2.0, rotational=3.0))
+    commanded.command(START + [2.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    commanded.advance(3.0)
+    assert commanded.stuck == 1.0
+    commanded.command(NOWHERE)
+    commanded.advance(0.02)
+    assert (commanded.stuck, commanded.command_timed_out) == (1.0, 1.0)
+    commanded.simulator.Initialize()
+    assert (commanded.stuck, commanded.command_timed_out) == (0.0, 0.0)
+    np.testing.assert_array_equal(commanded.joints, commanded.q_start)
+
+
+def first_step(arm, monkeypatch, q, velocities, is_regular=True, solution=None):
+    """Return the controller after its first step with the given unlimited velocities, and the calls of the solver."""
+    calls, solve = [], cartesian_position_controller.DoDifferentialInverseKinematics
+
+    def record(*arguments):
+        calls.append(arguments)
+        return solution or solve(*arguments)
+
+    monkeypatch.setattr(cartesian_position_controller, "DoDifferentialInverseKinematics", record)
+    monkeypatch.setattr(
+        cartesian_position_controller, "damped_joint_velocities", lambda *_: (np.array(velocities), is_regular)
+    )
+    commanded = Commanded(arm, q)
+    commanded.command(GOAL)
+    commanded.advance(0.005)
+    return commanded, calls
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("joint", [0, 6])
+@pytest.mark.parametrize(
+    ("steps", "speed", "is_solved"),
+    # Number of steps to the position limit, and speed towards it relative to the velocity limit.
+    [(10.0, 1.0, False), (10.0, 1.0001, True), (1.01, 0.1, False), (0.99, 0.1, True), (0.0, 0.0, False)],
+)
+def test_solver_is_called_only_when_a_limit_is_active(arm, monkeypatch, joint, side, steps, speed, is_solved):
+    plant = arm[0]
+    q, velocities = READY_POSTURE.copy(), np.zeros(7)
+    limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+    velocities[joint] = side * speed * plant.GetVelocityUpperLimits()[joint]
+    q[joint] = limits[int(side > 0)][joint] - steps * 0.01 * velocities[joint]
+    commanded, calls = first_step(arm, monkeypatch, q, velocities)
+    assert len(calls) == is_solved
+    if not is_solved:
+        np.testing.assert_array_equal(commanded.joints, np.clip(q + 0.01 * velocities, *limits))
+        assert commanded.stuck == 0.0
+    else:
+        np.testing.assert_array_equal(calls[0][-1].get_joint_position_limits(), limits)
+
+
+def test_joint_command_is_constant_when_the_solver_fails(arm, monkeypatch):
+    failure = SimpleNamespace(joint_velocities=None, status=DifferentialInverseKinematicsStatus.kNoSolutionFound)
+    commanded, calls = first_step(arm, monkeypatch, READY_POSTURE, np.full(7, 100.0), solution=failure)
+    assert len(calls) == 1
+    np.testing.assert_array_equal(commanded.joints, READY_POSTURE)
+    assert commanded.stuck == 1.0
+
+
+@pytest.mark.parametrize("speed", [-4.0, -1.0, -0.5, 0.5, 1.0, 4.0])
+def test_velocities_are_scaled_down_together_in_a_singular_posture(arm, monkeypatch, speed):
+    limit = arm[0].GetVelocityUpperLimits()
+    velocities = limit * [0.01, speed, 0.02, -0.03, 0.0, 0.0, 0.1]
+    commanded, calls = first_step(arm, monkeypatch, READY_POSTURE, velocities, is_regular=False)
+    expected = READY_POSTURE + 0.01 * velocities / max(1.0, abs(speed))
+    np.testing.assert_allclose(commanded.joints, expected, rtol=0.0, atol=1e-15)
+    assert not calls
 
 
 # With aligned wrist axes an arm of six joints can neither turn its tool about one direction nor move it along another.
@@ -314,6 +412,7 @@ def test_tool_follows_its_path_near_a_singular_posture():
     assert commanded.stuck == 0.0
 
 
-def test_initialization_fails_when_positions_are_not_finite(arm):
+@pytest.mark.parametrize("bad", [np.full(7, np.nan), [np.nan] + [0.0] * 6, [0.0] * 6 + [np.inf]])
+def test_initialization_fails_when_positions_are_not_finite(arm, bad):
     with pytest.raises(InputError, match="measured positions must be finite"):
-        Commanded(arm, q_start=np.full(7, np.nan))
+        Commanded(arm, q_start=bad)

@@ -72,6 +72,23 @@ def test_steps_are_counted_since_the_last_progress():
     assert [episode.step(*u) for u in moves] == [0] * 7 + [BLOCKED]
 
 
+@pytest.mark.parametrize("index", range(3))
+def test_progress_is_recorded_for_each_term(index):
+    stuck = TerminationTerm("blocked", {"u": 2}, lambda u: u[1] > 0, steps=2, progress=lambda u: u[0], min_progress=0.5)
+    other = TerminationTerm("spill", {"u": 2}, lambda u: u[1] > 0, steps=99, progress=lambda u: 0.0)
+    terms = [other] * index + [stuck] + [other] * (2 - index)
+    # Progress by exactly 0.5 does not reset the count; slightly larger progress does.
+    for moves, reason in (([(0, 1), (0.5, 1), (0.5, 1)], BLOCKED), ([(0, 1), (0.5004, 1), (0.5004, 1)], 0)):
+        episode = Episode(*terms, size=2)
+        assert [episode.step(*u) for u in moves] == [0, 0, reason]
+
+
+def test_any_progress_resets_the_count_by_default():
+    stuck = TerminationTerm("blocked", {"u": 1}, lambda u: True, steps=1, progress=lambda u: u[0])
+    episode = Episode(stuck)
+    assert [episode.step(u) for u in (0.0, 1e-6, 2e-6, 2e-6)] == [0, 0, 0, BLOCKED]
+
+
 def test_first_term_takes_precedence():
     success = TerminationTerm("success", {"u": 1}, lambda u: u[0] > 1)
     assert Episode(success, above(1)).step(2) == SUCCESS
@@ -91,11 +108,23 @@ def test_first_term_takes_precedence():
         lambda: above(1, steps=float("inf")),
         lambda: above(1, min_progress=-0.1),
         lambda: above(1, min_progress=float("nan")),
+        lambda: above(1, min_progress=float("inf")),
+        lambda: above(1, steps=0.9995),
     ],
 )
 def test_constructor_refuses_invalid_arguments(make):
     with pytest.raises(InputError):
         make()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("", "'blocked' is called"), ("Pouring", "'blocked' of Pouring is called")]
+)
+@pytest.mark.parametrize("functions", [{"condition": lambda v: True}, {"progress": lambda v: 0.0}])
+def test_function_is_refused_when_its_parameters_are_not_the_signals(functions, name, words):
+    term = TerminationTerm(**{"termination": "blocked", "inputs": {"u": 1}, "condition": lambda u: True} | functions)
+    with pytest.raises(InputError, match=f"condition {words}"):
+        EpisodeMonitor([term], PERIOD, name)
 
 
 def test_each_term_has_its_own_count():

@@ -21,6 +21,17 @@ class Counter(LeafSystem):
         state.set_value([round(context.get_time() / self.period)])
 
 
+def test_history_of_one_output_is_the_last_one():
+    system = HistoryBuffer(1, 1, 0.1)
+    simulator = Simulator(system)
+    port = system.get_output_input_port().FixValue(simulator.get_mutable_context(), [3.0])
+    simulator.Initialize()
+    assert system.get_history_output_port().Eval(simulator.get_context()) == [3.0]
+    port.GetMutableData().set_value([4.0])
+    simulator.AdvanceTo(0.15)
+    assert system.get_history_output_port().Eval(simulator.get_context()) == [4.0]
+
+
 @pytest.fixture
 def system():
     return HistoryBuffer(num_outputs=2, length=3, period=0.1)

@@ -42,8 +42,16 @@ def test_torque_is_not_contact():
     assert lengths_under([0.0] * 5) == [10] * 5
 
 
-def test_force_at_the_threshold_is_not_contact():
+def test_contact_begins_above_2_N_and_ends_at_1_N_by_default():
     assert lengths_under([2.0] * 3) == [10] * 3
+    assert lengths_under([2.001] * 3) == [2, 1, 1]
+    assert lengths_under([3.0, 1.0, 1.5]) == [2, 2, 2]
+    assert lengths_under([3.0, 1.0005, 1.0005]) == [2, 1, 1]
+
+
+def test_length_increases_after_10_free_steps_by_default():
+    # The step at time zero is in free space too.
+    assert lengths_under([3.0] * 3 + [0.0] * 20)[2:] == [1] * 10 + [2] * 10 + [5]
 
 
 def test_nan_force_is_contact():
@@ -71,6 +79,9 @@ def test_initialization_restores_the_longest_length():
     "arguments",
     [
         {"contact_threshold": 1.0, "release_threshold": 2.0},
+        {"contact_threshold": 1.0, "release_threshold": 1.0005},
+        {"contact_threshold": np.nan},
+        {"release_threshold": np.nan},
         {"release_threshold": -0.1},
         {"dwell_steps": 0},
         {"wrench_size": 0},
@@ -88,3 +99,4 @@ def test_constructor_refuses_arguments_out_of_range(arguments):
 
 def test_constructor_accepts_limiting_arguments():
     HistoryLengthSchedule([1], PERIOD, contact_threshold=0.0, release_threshold=0.0, dwell_steps=1, wrench_size=1)
+    HistoryLengthSchedule([1], PERIOD, contact_threshold=1.0, release_threshold=1.0)
