@@ -81,7 +81,7 @@ class ChunkSafetyLimiter(LeafSystem):
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         start = self._guard.constraints.nearest(declare.start_pose(self._pose_port, context))
-        discrete_state.set_value(np.append(np.tile(start, 3 + self._num_steps), [1.0, 0.0, 0.0]))
+        discrete_state.set_value(np.append(np.tile(start, 3 + self._num_steps), np.zeros(3)))
 
     def _calc_plan(self, context: Context) -> _Plan:
         *motion, rate, fallback, step = context.get_discrete_state().value(self._state)

@@ -63,13 +63,14 @@ def test_commands_are_those_of_the_guard_without_a_diagram():
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("entries", [np.s_[:], np.s_[0, 0]])
 def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite(number, entries):
-    chunks = np.zeros((3 * REPLAN, STEPS, 2))
+    chunks = np.zeros((5 * REPLAN, STEPS, 2))
     chunks[(slice(REPLAN, None), *np.atleast_1d(entries))] = number
     chunks[:REPLAN] = [0.03, 0.01]
     commands, rate, fallback = run(chunks)
     expected = guard().guard(chunks[0]).outputs
     assert (commands[:STEPS] == expected).all()
-    assert (fallback == np.repeat([0.0, 1.0, 1.0], REPLAN)).all()
+    assert (commands[STEPS:] == expected[-1]).all()  # at rest
+    assert (fallback == np.repeat([0.0, 1.0, 1.0, 1.0, 1.0], REPLAN)).all()
     assert (rate == 1.0 - fallback).all()
 
 
@@ -82,7 +83,7 @@ def test_motion_starts_at_the_nearest_pose_inside_the_bounds():
 
 
 def test_argument_is_refused_when_it_is_out_of_range():
-    for steps, replan in ((3, 1), (12, 0), (12, 13)):
+    for steps, replan in ((3, 1), (12, 0), (12, 13), (1000, 1001)):
         with pytest.raises(InputError, match="chunk"):
             ChunkSafetyLimiter(guard(), steps, replan, PERIOD)
     with pytest.raises(InputError, match="period"):
