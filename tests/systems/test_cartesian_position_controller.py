@@ -306,6 +306,23 @@ def first_step(arm, monkeypatch, q, velocities, is_regular=True, solution=None):
     return commanded, calls
 
 
+@pytest.mark.parametrize("share", [0.9, 1.0005, 3.0])
+def test_desired_tool_velocity_is_reduced_to_its_limits(arm, monkeypatch, share):
+    desired, limits = [], SpeedLimits(translational=0.2, rotational=0.5)
+    solve = cartesian_position_controller.damped_joint_velocities
+
+    def record(J, V, preferred):
+        desired.append(V)
+        return solve(J, V, preferred)
+
+    monkeypatch.setattr(cartesian_position_controller, "damped_joint_velocities", record)
+    commanded = Commanded(arm, speed_limits=limits)
+    commanded.command(commanded.pose + np.array([0.0, 0.002, 0.0, 0.005, 0.0, 0.0]) * share)
+    commanded.advance(0.005)
+    expected = min(share, 1.0) * np.array([0.0, 0.0, 0.5, 0.0, 0.2, 0.0])
+    np.testing.assert_allclose(desired[0], expected, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("joint", [0, 6])
 @pytest.mark.parametrize(

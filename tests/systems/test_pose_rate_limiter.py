@@ -121,6 +121,30 @@ def test_change_above_a_speed_limit_is_reduced_to_it(linear, angular, limited_li
     np.testing.assert_allclose(pose, expected, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("axis", [3, 4, 5])
+def test_each_angle_is_limited_while_the_position_rests(axis, sign):
+    desired = MEASURED.copy()
+    desired[axis] += 1.0005 * sign * TURN
+    rig = Rig(desired, blend_factor=1.0)
+    expected = MEASURED.copy()
+    expected[axis] += sign * TURN
+    now = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
+    np.testing.assert_allclose(now, expected, rtol=0.0, atol=1e-12)
+
+
+def test_pose_is_output_unchanged_if_its_translation_exceeds_the_angular_step():
+    system = PoseRateLimiter(period=PERIOD, speed=100.0, angular_speed=0.01)
+    context, rng = system.CreateDefaultContext(), np.random.default_rng(0)
+    system.get_blend_factor_input_port().FixValue(context, [1.0])
+    system.get_pose_input_port().FixValue(context, MEASURED)
+    context.SetDiscreteState(MEASURED)
+    for position in rng.uniform(-1e-6, 1e-6, (20, 3)):  # differs from its sum of last pose and change
+        desired = np.concatenate([position, MEASURED[3:]])
+        system.get_desired_pose_input_port().FixValue(context, desired)
+        np.testing.assert_array_equal(system.get_limited_pose_output_port().Eval(context), desired)
+
+
 def first_pose(desired):
     """Return the first output after a start at the pose [0, 0, 0, 3.125, 0, 0]."""
     rig = Rig(np.array(desired), blend_factor=1.0)

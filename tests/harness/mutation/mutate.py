@@ -92,7 +92,7 @@ def graft(mutant: Mutant) -> None:
     _graft_all(vars(module), {key: value for key, value in names.items() if not key.startswith("__")}, name)
 
 
-def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str) -> None:
+def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str, owner: type | None = None) -> None:
     for key, value in new.items():
         before, value = (_function(each) for each in (old.get(key), value))
         if isinstance(value, FunctionType) and isinstance(before, FunctionType) and value.__module__ == module:
@@ -102,7 +102,10 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str) -> N
             before.__kwdefaults__ = {k: v if _is_numeric(v) else kept.get(k, v) for k, v in defaults.items()}
         elif isinstance(value, type) and isinstance(before, type) and value.__module__ == module:
             if not issubclass(value, Enum):
-                _graft_all(vars(before), vars(value), module)
+                _graft_all(vars(before), vars(value), module, before)
+        elif owner is not None and isinstance(value, CONSTANTS):
+            if not key.startswith("__") and not np.array_equal(value, before):
+                setattr(owner, key, value)
         elif isinstance(value, CONSTANTS) and not np.array_equal(value, before):
             for other in list(sys.modules.values()):
                 if vars(other).get(key) is before and other.__name__.split(".")[0] in ("guiderail", *TEST_MODULES):
