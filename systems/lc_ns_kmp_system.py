@@ -76,7 +76,7 @@ class LcNsKmpSystem(LeafSystem):
     ):
         super().__init__()
         outputs = primitive.num_outputs
-        if any(not 0 < other.history < primitive.history for other, _ in shorter):
+        if any(other.history not in range(1, primitive.history) for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
         if len({other.history for other, _ in shorter}) < len(shorter):
             raise InputError("two shorter histories have the same length")

@@ -37,6 +37,13 @@ def test_ports():
         without.get_history_input_port()
 
 
+def test_window_of_three_outputs_has_their_covariances():
+    times, means, covariances = PERIOD * np.arange(50), np.zeros((50, 3)), np.tile(np.eye(3), (50, 1, 1))
+    reference = ReferenceTrajectory(times, means, covariances)
+    three = LcNsKmp(reference, history=0, horizon=8, constraints=LinearConstraints.none(3))
+    assert LcNsKmpSystem(three, None, PERIOD).get_reference_window_input_port().size() == 9 * (3 + 9)
+
+
 def test_command_is_the_prediction_at_the_control_step():
     p = primitive()
     gain = np.array([3.0, 5.0])
