@@ -36,7 +36,7 @@ class Commanded:
             )
         self.q_start = q_start
         self.system = CartesianPositionController(
-            self.plant, model.target, model.tool_center, posture=READY_POSTURE, **options
+            self.plant, model.target, model.tool_center, **{"posture": READY_POSTURE} | options
         )
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
@@ -266,6 +266,17 @@ def test_defaults_of_the_controller(arm):
             joints.append(commanded.joints)
         np.testing.assert_array_equal(*joints)
     assert SpeedLimits() == explicit["speed_limits"]
+
+
+def test_posture_is_copied(arm):
+    posture, joints = READY_POSTURE + 0.2, []
+    for is_changed in (False, True):
+        commanded = Commanded(arm, posture=posture)
+        if is_changed:
+            posture[:] = 0.0
+        commanded.advance(0.1)
+        joints.append(commanded.joints)
+    np.testing.assert_array_equal(*joints)
 
 
 def test_posture_gain_of_zero_is_accepted(arm):
