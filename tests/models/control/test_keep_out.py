@@ -287,3 +287,95 @@ def test_position_that_is_not_finite_is_refused(wrong):
     for position, desired in (positions, positions[::-1]):
         with pytest.raises(UnsolvableError, match="finite"):
             wall.project(position, desired)
+
+
+@pytest.mark.parametrize(
+    ("position", "face", "bound"),
+    [
+        # Faces of the box from (1, 2, 5) to (2, 4, 9): unit normal, bound without the margin.
+        ([0.0, 3.0, 6.0], [-1.0, 0.0, 0.0], -1.0),
+        ([3.0, 3.0, 6.0], [1.0, 0.0, 0.0], 2.0),
+        ([1.5, -1.0, 4.0], [0.0, -1.0, 0.0], -2.0),
+        ([0.5, 7.0, 6.0], [0.0, 1.0, 0.0], 4.0),
+        ([1.5, 3.0, 1.0], [0.0, 0.0, -1.0], -5.0),
+        ([1.5, 5.0, 11.0], [0.0, 0.0, 1.0], 9.0),
+    ],
+)
+def test_half_space_of_a_box_is_outside_the_face_with_most_clearance(position, face, bound):
+    constraints = LinearConstraints(np.array([[3.0, 4.0, 0.0]]), np.array([-70.0]))
+    lower, upper = [[1.0, 2.0, 5.0], [-9.0, -9.0, -9.0]], [[2.0, 4.0, 9.0], [-8.0, -8.0, -8.0]]
+    G, c = KeepOut(lower, upper, constraints, 0.25).half_spaces(np.array(position))
+    np.testing.assert_allclose(G[:2], [[0.6, 0.8, 0.0], face], rtol=1e-15)
+    np.testing.assert_allclose(c[:2], [-14.0 + 0.25, bound + 0.25], rtol=1e-15)
+    axis = int(np.argmax(position))
+    np.testing.assert_array_equal(G[2], np.eye(3)[axis])
+    assert c[2] == -8.0 + 0.25
+
+
+@pytest.mark.parametrize("margin", [-1e-9, np.inf, np.nan])
+def test_margin_is_refused_when_it_is_out_of_range(margin):
+    with pytest.raises(InputError, match="margin must be finite and 0 or more"):
+        KeepOut([[0.0]], [[1.0]], LinearConstraints.none(1), margin)
+
+
+@pytest.mark.parametrize("upper", [1.0, 0.9995])
+def test_box_without_a_volume_is_refused(upper):
+    with pytest.raises(InputError, match="lower corner below its upper"):
+        KeepOut([[0.0, 1.0]], [[2.0, upper]], LinearConstraints.none(2), 0.0)
+    KeepOut([[0.0, 1.0]], [[2.0, np.nextafter(1.0, 2.0)]], LinearConstraints.none(2), 0.0)
+
+
+def test_projection_to_one_constraint_is_refined_if_another_is_violated():
+    constraints = LinearConstraints(np.array([[-1.0, 0.0], [-2.0, -2.0]]), np.array([-1.0, -2.0]))
+    nowhere = np.empty((0, 2))
+    keep_out = KeepOut(nowhere, nowhere, constraints, 0.0)
+    safe, is_changed = keep_out.project(np.zeros(2), np.array([0.5, 1.5]))  # only x + y <= 1 is violated
+    np.testing.assert_allclose(safe, [0.0, 1.0], rtol=0.0, atol=1e-12)
+    assert not is_changed
+    safe, _ = keep_out.project(np.zeros(2), np.array([5.0, 1.0]))  # both are, and meet at (1, 0)
+    np.testing.assert_allclose(safe, [1.0, 0.0], rtol=0.0, atol=1e-6)
+
+
+SQUARE = ([[1.0, 1.0]], [[2.0, 2.0]])
+
+
+def test_constraints_hold_after_a_target_is_moved_out_of_a_box():
+    """The nearest face of the box is outside of the constraint y <= 1.9."""
+    keep_out = KeepOut(*SQUARE, LinearConstraints.box([-np.inf, -np.inf], [np.inf, 1.9]), 0.0)
+    safe, is_blocked = keep_out.project(np.array([0.5, 1.85]), np.array([1.5, 1.9]))
+    assert is_blocked
+    assert safe[0] <= 1.0
+    assert safe[1] <= 1.9
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("start", "target", "expected"), [(4.0, 1.95, 2.25 + 1e-6), (-1.0, 1.05, 0.75 - 1e-6)])
+def test_target_in_a_box_is_moved_to_the_margin_of_its_nearest_face(axis, start, target, expected):
+    keep_out = KeepOut(*SQUARE, LinearConstraints.none(2), 0.25)
+    begin, desired, reached = ([1.4, 1.4], [1.6, 1.6], [1.6, 1.6])
+    begin[axis], desired[axis], reached[axis] = start, target, expected
+    safe, is_blocked = keep_out.project(np.array(begin), np.array(desired))
+    np.testing.assert_allclose(safe, reached, rtol=0.0, atol=1e-9)
+    assert is_blocked
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("face", [1.0, 2.0])
+def test_motion_along_a_face_is_free(axis, face):
+    keep_out = KeepOut(*SQUARE, LinearConstraints.none(2), 0.0)
+    start, desired = np.array([0.5, 0.5]), np.array([1.5, 1.5])
+    start[axis] = desired[axis] = face
+    safe, is_blocked = keep_out.project(start, desired)
+    np.testing.assert_array_equal(safe, desired)
+    assert not is_blocked
+
+
+@pytest.mark.parametrize(("shift", "is_blocked"), [(-4e-4, True), (0.0, False), (4e-4, False)])
+def test_motion_past_a_corner_is_blocked_only_if_it_cuts_the_corner(shift, is_blocked):
+    keep_out = KeepOut(*SQUARE, LinearConstraints.none(2), 0.0)
+    start = np.array([0.0, 1.0 + shift])
+    desired = start + 2.0  # passes the corner (1, 2)
+    safe, blocked = keep_out.project(start, desired)
+    assert blocked == is_blocked
+    expected = [1.0, 2.0 + shift] if is_blocked else desired
+    np.testing.assert_allclose(safe, expected, rtol=0.0, atol=2e-6)
