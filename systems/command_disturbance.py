@@ -76,7 +76,7 @@ class CommandDisturbance(LeafSystem):
             discrete_state.set_value(self._delay_line, np.tile(pose, self._delay))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        count = context.get_discrete_state().value(self._count)[0] + 1.0
+        count = context.get_discrete_state().value(self._count).item() + 1.0
         discrete_state.set_value(self._count, [count])
         # At time zero no period has ended: the value of the port before this instant's updates is not a command.
         has_ended = context.get_time() > 0
@@ -87,13 +87,13 @@ class CommandDisturbance(LeafSystem):
             line = context.get_discrete_state().value(self._delay_line)
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(command) :], command]))
         if self._loss_probability > 0.0:
-            seed = context.get_numeric_parameter(self._seed).value()[0]
+            seed = context.get_numeric_parameter(self._seed).value().item()
             sample = np.random.default_rng([int(seed), int(count)]).uniform()
             discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
 
     def _delivered(self, context: Context) -> np.ndarray:
         last = context.get_discrete_state().value(self._last_delivered)
-        if context.get_discrete_state().value(self._is_lost)[0]:
+        if context.get_discrete_state().value(self._is_lost).item():
             return last
         if self._delay_line is None:
             return self._command_port.Eval(context)

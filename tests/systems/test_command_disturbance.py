@@ -60,7 +60,39 @@ def test_lost_command_is_replaced_by_the_last_delivered_one():
     assert not np.array_equal(delivered(400, loss_probability=0.3, seed=2), outputs)
 
 
-@pytest.mark.parametrize("wrong", [{"loss_probability": 1.0}, {"loss_probability": -0.1}, {"delay": -1}])
+@pytest.mark.parametrize("wrong", [{"loss_probability": 1.0}, {"loss_probability": -0.1}, {"delay": -1}, {"size": 0}])
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
-        CommandDisturbance(1, PERIOD, **wrong)
+        CommandDisturbance(**{"size": 1, "period": PERIOD} | wrong)
+
+
+def test_losses_are_samples_of_seed_and_count_and_repeat_after_a_reset():
+    system = CommandDisturbance(1, PERIOD, loss_probability=0.4)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    command = system.get_command_input_port().FixValue(context, [POSE])
+    system.get_pose_input_port().FixValue(context, [POSE])
+    expected = [np.random.default_rng([0, count]).uniform() < 0.4 for count in range(1, 31)]
+    assert expected[0] != expected[-1]
+    for _ in range(3):  # the default seed is 0
+        context.SetTime(0.0)
+        simulator.Initialize()
+        command.GetMutableData().set_value([1000.0])
+        assert system.get_delivered_command_output_port().Eval(context)[0] == 1000.0  # none is lost before a step
+        lost = []
+        for step in range(30):
+            simulator.AdvanceTo((step + 0.5) * PERIOD)
+            command.GetMutableData().set_value([float(step)])
+            lost.append(system.get_delivered_command_output_port().Eval(context)[0] != step)
+        assert lost == expected
+
+
+@pytest.mark.parametrize(("share", "is_lost"), [(0.9995, False), (1.0005, True)])
+def test_first_command_is_lost_if_its_sample_is_below_the_probability(share, is_lost):
+    sample = np.random.default_rng([3, 1]).uniform()
+    output = delivered(1, seed=3, first=7.0, loss_probability=share * sample)[0]
+    assert output == (POSE if is_lost else 7.0)
+
+
+def test_probability_slightly_below_one_is_accepted():
+    np.testing.assert_array_equal(delivered(3, loss_probability=0.9995), POSE)
