@@ -25,6 +25,7 @@ COMMANDS = {
     "list": ("list",),
 }
 """Names of the commands that each module of this package registers."""
+INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def load_commands(name: str = "") -> typer.Typer:
@@ -63,6 +64,8 @@ def main(arguments: list[str] | None = None) -> None:
     _show_messages()
     try:
         code = load_commands(*arguments[:1])(args=arguments, prog_name="guiderail", standalone_mode=False)
+        if code == INTERRUPTED:  # typer returns this code instead of raising KeyboardInterrupt
+            raise KeyboardInterrupt
     except InputError as error:
         print_message(str(error))
         code = 2
@@ -72,7 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
         code = 1
     except (KeyboardInterrupt, typer.Abort):
         print_message(f"stopped{_resume_hint(arguments)}")
-        code = 130
+        code = INTERRUPTED
     except BrokenPipeError:
         code = 1
     except OSError as error:
