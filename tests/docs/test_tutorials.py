@@ -61,3 +61,10 @@ def test_files_named_in_pages_exist():
             r"`((?:examples|models|diagrams|tests|systems|tools)/[\w./]+)`", page.read_text("utf-8")
         ):
             assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_page_trusts_the_imports_of_its_runs(page):
+    text = page.read_text("utf-8")
+    for run in re.findall(r"guiderail train .*--import .*--out ([\w/]+)", text):
+        assert all("--trust-imports" in rest for rest in re.findall(rf"guiderail evaluate {run}\b(.*)", text))

@@ -9,6 +9,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
 from guiderail.tools.imports import import_modules, import_stored, trust_imports
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import Run
 
 
 @pytest.fixture
@@ -68,6 +69,21 @@ def test_path_is_no_module(name, canary, monkeypatch):
 
 def test_loaded_module_needs_no_trust(tmp_path):
     assert import_stored(["json"], tmp_path / "config.yaml") == ("json",)
+
+
+def test_printed_evaluate_command_is_trusted_and_quoted(bead_run, canary):
+    run = bead_run.rename(bead_run.with_name("run one"))
+
+    def printed():
+        return Run(run).summary["success_in_training"].partition("guiderail evaluate ")[2]
+
+    assert printed() == f"'{run}'"
+    name_imports(run, canary[0])
+    assert printed() == f"'{run}' --trust-imports"
+    assert not canary[1].exists()
+    (run / "task.yaml").touch()
+    name_imports(run, run)  # a task folder holds no code
+    assert printed() == f"'{run}'"
 
 
 COMMANDS = (

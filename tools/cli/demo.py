@@ -1,5 +1,6 @@
 """`guiderail demo`: train a policy in about a minute, and show what the run folder contains."""
 
+import shlex
 import shutil
 import sys
 import time
@@ -79,7 +80,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     ):
         console.print(f"  {path}\n      {content}")
     name = _command_name()
-    console.print(f"\nNext: {name} evaluate {out}, {name} list, {name} train --help")
+    console.print(f"\nNext: {shlex.quote(name)} evaluate {shlex.quote(str(out))}, {name} list, {name} train --help")
 
 
 def _count_violations(rows: pd.DataFrame) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.diagrams.tasks.registry import TASKS, is_task_folder
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import own_episodes, summary
+from guiderail.tools.evaluation.policies import is_policy_file
 from guiderail.tools.evaluation.rollout import EpisodeProgress, check_seed
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
@@ -72,8 +75,17 @@ class Run:
         rows = self.episodes
         recent = own_episodes(rows)["success"].tail(10)
         note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"
-        note += f"; evaluate the deterministic policy with guiderail evaluate {self.path}"
+        trust = " --trust-imports" if _names_code(self.path / "config.yaml") else ""
+        note += f"; evaluate the deterministic policy with guiderail evaluate {shlex.quote(str(self.path))}{trust}"
         return {"run": str(self.path), **summary(rows, SUMMARY), "success_in_training": note, **self.pictures}
+
+
+def _names_code(file: Path) -> bool:
+    """Return True if a new process reads a run's configuration only within `trust_imports`."""
+    config = load_yaml(file, "configuration")
+    base_policy = str(config["environment"].get("base_policy", ""))
+    has_code = is_policy_file(base_policy) and not base_policy.endswith(".onnx")
+    return has_code or not all(map(is_task_folder, config["imports"]))
 
 
 def train(
