@@ -115,7 +115,8 @@ def find_subject(
         trust_policy: True to read a policy file that can execute code.
 
     Raises:
-        InputError: If there is no such policy or task, or a policy without a run has no task.
+        InputError: If there is no such policy or task, the files of a run's task have changed since it began, or a
+            policy without a run has no task.
     """
     if isinstance(policy, os.PathLike):
         policy = Path(policy)
@@ -126,6 +127,7 @@ def find_subject(
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
         run_config = folder.config()
+        run_config.refuse_changed_task(folder.path, "train again; with --task and --env its policy acts in any files")
         # The policy is checked against the environment, which is not necessarily that of the run.
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)

@@ -74,6 +74,7 @@ def evaluate_on_robot(
         raise InputError(f"a number of episodes is at least one, not {episodes}")
     folder = RunFolder(find_run(run))
     config = folder.config()
+    config.refuse_changed_task(folder.path)
     own_policy = Policy.load(folder.path) if make_policy is None else None
     environment = hardware_environment(config.task, config.environment, station)
     if environment.get("reward") != config.environment.get("reward"):

@@ -291,6 +291,7 @@ def deploy(
     """
     folder, recordings = RunFolder(find_run(run)), out or recordings_folder(run)
     config, policy = folder.config(), Policy.load(folder.path)
+    config.refuse_changed_task(folder.path)
     check_writable(step_log_file(recordings, 0))
     environment = hardware_environment(config.task, config.environment, station)
     environment |= connection.environment_options(station)

@@ -50,13 +50,16 @@ class RunConfig:
         """Control steps that an action lasts."""
         return int(self.environment.get("action_repeat", 1))
 
-    def refuse_changed_task(self, path: Path) -> None:
-        """Raise an InputError if the task's files have changed since the run in the folder `path` began."""
+    def refuse_changed_task(self, path: Path, otherwise: str = "train again in another folder") -> None:
+        """Raise an InputError if the task's files have changed since the run in the folder `path` began.
+
+        The message ends with `otherwise`, the alternative to restoring the files.
+        """
         current = task_content(self.task, self.environment, self.imports)
         if self.task_content and self.task_content != current:
             raise InputError(
-                f"the files of {self.task} are not those that the run in {path} began with: restore them, or train "
-                "again in another folder"
+                f"the files of {self.task} are not those that the run in {path} began with: restore them, or "
+                f"{otherwise}"
             )
 
 

@@ -13,8 +13,10 @@ import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.evaluation import episodes_file
+from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.job import Job, digest
 from guiderail.tools.imports import import_modules
@@ -30,6 +32,7 @@ TASK = {
     "motion": {"travel": 0.02, "rim": 0.01},
     "demonstrations": {"components": 1},
 }
+POLICY = {"observation_shape": [1], "action_low": [-1], "action_high": [1]}
 SHIPPED = Path(guiderail.models.objects.bnc_connector.__file__).parent
 
 
@@ -70,6 +73,36 @@ def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, tmp_path)
     begun.write_config(replace(config, task_content=""))  # as it was written before anybody kept this
     (folder / name).write_text(CHANGES[name])
     begun.refuse_another(config)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["evaluate"], ["evaluate", "--station", "hardware", "--sim"], ["robustness"], ["visualize"], ["deploy", "--sim"]],
+    ids=" ".join,
+)
+def test_run_is_not_evaluated_when_its_task_folder_changed(words, folder, tmp_path, capsys):
+    begun = RunFolder(tmp_path / "run")
+    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
+    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(begun.path)
+    (folder / "part.obj").write_text(CHANGES["part.obj"])
+    before = sorted(begun.path.iterdir())
+    with pytest.raises(SystemExit) as end:
+        main([words[0], str(begun.path), *words[1:]])
+    message = capsys.readouterr().err
+    assert end.value.code == 2
+    assert "the files of parts/pin are not those that the run in" in message
+    assert ("--task" in message) == ("--sim" not in words)  # not on a robot
+    assert sorted(begun.path.iterdir()) == before
+
+
+def test_policy_of_a_run_acts_in_changed_files_of_a_named_task(folder, tmp_path):
+    begun = RunFolder(tmp_path / "run")
+    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
+    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(begun.path)
+    (folder / "part.obj").write_text(CHANGES["part.obj"])
+    assert find_subject(begun.path, "parts/pin").folder is None
+    begun.write_config(replace(begun.config(), task_content=""))  # as older versions wrote it
+    assert find_subject(begun.path, None).folder is not None
 
 
 def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
