@@ -82,7 +82,7 @@ def fit_bounds(
     outputs: Annotated[str | None, option("Indices of the bounded outputs, such as 0,1.  [default: all]")] = None,
     draw: Annotated[Path | None, option("Picture of the demonstrations and bounds to write: {pictures}.")] = None,
     out: Annotated[Path | None, option("YAML file of the bounds to write.")] = None,
-    task: Annotated[Path | None, option("Folder of a task; its bounds are replaced.")] = None,
+    task: Annotated[Path | None, option("Folder of a task; the bounds in its task.yaml are replaced.")] = None,
     as_json: cli.Json = False,
 ) -> None:
     """Fit bounds of the commanded pose to demonstrations, phase by phase."""

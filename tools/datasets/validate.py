@@ -48,7 +48,7 @@ def fit_bounds(
         outputs: Indices of the bounded outputs; all by default.
         draw: Picture to write.
         out: YAML file to write; it must not exist.
-        task: Task folder; its bounds are replaced.
+        task: Task folder; the bounds in its `task.yaml` are replaced.
 
     Raises:
         InputError: If an argument is invalid.
@@ -81,7 +81,8 @@ def fit_bounds(
         if np.isfinite(bounds.lower[k, o])
     }
     fastest = [float(f"{speed:.4g}") for speed in bounds.max_rates]
-    written = {"written": str(out or task)} if out or task else {}
+    files = [str(path) for path in (draw, out, None if task is None else task / "task.yaml") if path is not None]
+    written = {"written": ", ".join(files)} if files else {}
     return {"demonstrations": str(file), **rows, "fastest per second": fastest, **written}
 
 

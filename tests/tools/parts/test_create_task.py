@@ -411,6 +411,7 @@ def test_fitted_bounds_become_those_of_the_task(folder, capsys):
         call(
             "dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder
         )
+        assert str(folder / "task.yaml") in capsys.readouterr().out.splitlines()[-1]
         constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
         assert constraints.G.shape[0] > 1
         np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
