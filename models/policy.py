@@ -118,7 +118,10 @@ class Policy:
         weights, description = folder / "policy.safetensors", folder / "policy.json"
         for path in (weights, description):
             if not path.is_file():
-                raise InputError(f"{folder} holds no {path.name}: train it first, or finish it with --resume")
+                raise InputError(
+                    f"{folder} holds no {path.name}: train it first, or finish it with --resume (--episodes ends it "
+                    "early)"
+                )
         try:
             values = json.loads(read_bytes(description, "description of a policy", MAX_DESCRIPTION_SIZE))
             arrays = load(read_bytes(weights, "policy's weights", MAX_WEIGHTS_SIZE))

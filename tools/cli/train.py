@@ -17,7 +17,10 @@ def train(
     algorithm: Annotated[
         str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")
     ] = None,
-    episodes: Annotated[int | None, option("Total number of episodes.  [default: 60]")] = None,
+    episodes: Annotated[
+        int | None,
+        option("Total number of episodes; with --resume also fewer than planned, if not done yet.  [default: 60]"),
+    ] = None,
     seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
     preset: Annotated[
         str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")

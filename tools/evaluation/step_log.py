@@ -67,6 +67,13 @@ def step_log_file(folder: Path, episode: int) -> Path:
     return folder / f"episode-{episode:06d}.parquet"
 
 
+def remove_step_logs(folder: Path, episodes: int) -> None:
+    """Remove the files of all but the first `episodes` episodes; a stopped run may have logged some before its end."""
+    for file in folder.glob("episode-*.parquet"):
+        if int(file.stem.removeprefix("episode-")) >= episodes:
+            file.unlink()
+
+
 def table(trace: EpisodeTrace, episode: int) -> pa.Table:
     """Return an episode's control steps, one row each, with the columns of `MEANINGS` that its trace holds."""
     number = len(trace)

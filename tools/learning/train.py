@@ -119,7 +119,8 @@ def train(
             default.
         callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after the
             episode.
-        resume: Continue a run that was stopped; the result is that of an uninterrupted run.
+        resume: Continue a run that was stopped; the result is that of an uninterrupted run. With fewer `episodes` than
+            planned, it is that of a run of so many episodes, because nothing in training depends on the planned number.
         pictures: Draw the learning curve and the replay page after training.
         **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
 
@@ -158,7 +159,8 @@ def start_or_resume(
 ) -> Run:
     """Train with a progress bar and draw the learning curve and the replay page; None stands for a default.
 
-    A resumed run keeps its configuration; only `episodes` may be larger. The arguments are those of `train` and:
+    A resumed run keeps its configuration; only `episodes` may be another number, at least those done. The arguments are
+    those of `train` and:
 
     - `task`: name of the task; None with `resume`.
     - `environment`: options of the environment by name.
@@ -275,8 +277,8 @@ def resumed_config(
         environment = {key: resolved.get(key, value) for key, value in environment.items()}
     arguments = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in arguments.items():
-        if key == "episodes" and value < config.episodes:
-            raise InputError(f"the run in {folder.path} has {config.episodes} episodes: it can only be given more")
+        if key == "episodes" and value < config.episodes and value < (done := _count_episodes(folder)):
+            raise InputError(f"the run in {folder.path} has done {done} episodes: give at least as many")
         if key != "episodes" and stored.get(key) != value:
             raise InputError(
                 f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train "
@@ -290,6 +292,13 @@ def resumed_config(
         )
     check_episodes(given.get("episodes", config.episodes))
     return replace(config, episodes=given.get("episodes", config.episodes), versions=_merged_versions(folder, config))
+
+
+def _count_episodes(folder: RunFolder) -> int:
+    """Return the number of episodes in a run's checkpoint."""
+    from guiderail.tools.learning.checkpoint import load_checkpoint  # imports PyTorch: slow
+
+    return len(load_checkpoint(folder.checkpoint)[1].get("rows", ())) if folder.checkpoint.exists() else 0
 
 
 def _merged_versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:

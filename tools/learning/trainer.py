@@ -16,7 +16,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.metrics import WORDS
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
-from guiderail.tools.evaluation.step_log import StepLog
+from guiderail.tools.evaluation.step_log import StepLog, remove_step_logs
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import (
@@ -165,6 +165,7 @@ def _train(
     rows: list[dict[str, Any]] = []
     if resume:
         rows, num_written = restore_checkpoint(folder, learner, env)
+        remove_step_logs(folder.steps, config.episodes)
         if num_written < len(rows):
             folder.write_episodes(rows)  # the loop below does not write the table of a complete run
         if len(rows) < config.episodes:

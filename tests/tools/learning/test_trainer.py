@@ -147,6 +147,29 @@ def test_finished_run_continues_with_more_episodes(bead_config, tmp_path):
     assert extended.config() == bead_config
 
 
+@pytest.mark.parametrize("changes", [{}, {"pipelined": True, "constant_episodes": 0}, {"num_envs": 2}], ids=str)
+@pytest.mark.parametrize("episodes", [4, 6])
+def test_stopped_run_is_ended_early(changes, episodes, bead_config, tmp_path, monkeypatch, forkserver):
+    monkeypatch.setattr("guiderail.tools.learning.trainer.MAX_SAVING_FRACTION", np.inf)  # a checkpoint per episode
+    config = replace(bead_config, learner=replace(bead_config.learner, **changes))
+    short, stopped = RunFolder(tmp_path / "short"), RunFolder(tmp_path / "stopped")
+    run_training(short, replace(config, episodes=episodes))
+
+    def stop(row):
+        if row["episode"] == 4:  # the checkpoint holds four episodes
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training(stopped, config, report=stop)
+    with pytest.raises(InputError, match="has done 4 episodes: give at least as many"):
+        resumed_config(stopped, None, {}, {"episodes": 3}, None)
+    with pytest.raises(InputError, match="--episodes ends it early"):
+        Policy.load(stopped.path)
+    run_training(stopped, resumed_config(stopped, None, {}, {"episodes": episodes}, None), resume=True)
+    assert_same_run(short, stopped)
+    assert stopped.config() == short.config()
+
+
 def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
@@ -396,7 +419,7 @@ def test_resume_accepts_the_same_options_and_notes_versions(tmp_path, caplog):
         start_or_resume("NarrowPassage", out, episodes=2, resume=True, **words)
     assert caplog.text.count("continues with other versions: drake 1.0.0, then ") == 1
     assert folder.config().versions["drake"].startswith("1.0.0, then ")
-    with pytest.raises(InputError, match="has 2 episodes"):
+    with pytest.raises(InputError, match="has done 2 episodes"):
         start_or_resume("NarrowPassage", out, episodes=1, resume=True, **words)
 
 
