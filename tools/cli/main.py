@@ -25,6 +25,8 @@ COMMANDS = {
     "list": ("list",),
 }
 """Names of the commands that each module of this package registers."""
+ENVIRONMENT_OPTIONS = ("--guidance", "--station", "--reward", "--observation", "--action-repeat", "--fixture-offset")
+"""Options of `train` that other commands take as `--env NAME=VALUE`."""
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 
@@ -87,7 +89,7 @@ def main(arguments: list[str] | None = None) -> None:
         missing = explain_missing(error) if isinstance(error, ModuleNotFoundError) else None
         if missing is None and not hasattr(error, "format_message"):
             raise
-        print_message(str(missing) if missing is not None else _usage_sentence(error))
+        print_message(str(missing) if missing is not None else _usage_sentence(error, arguments))
         code = 2
     sys.exit(code if isinstance(code, int) else 0)
 
@@ -113,13 +115,22 @@ def _resume_hint(arguments: list[str]) -> str:
     name, *words = map(str, [*arguments, ""])
     if name == "study":
         return "; the same command resumes it"
-    folders = [word.partition("=")[2] or following for word, following in pairwise(words) if word.startswith("--out")]
+    folders = _values(words, "--out")
     if name == "train" and folders and (Path(folders[-1]) / "checkpoint").is_dir():
         return "; resume with --resume"
     return ""
 
 
-def _usage_sentence(error: Any) -> str:
+def _values(words: list[str], option: str) -> list[str]:
+    """Return the values of an option, given as `--option value` or `--option=value`, in their order."""
+    return [
+        word.partition("=")[2] or following
+        for word, following in pairwise([*words, ""])
+        if word.partition("=")[0] == option
+    ]
+
+
+def _usage_sentence(error: Any, arguments: list[str]) -> str:
     """Return the usage error of typer as one sentence with a remedy."""
     message = " ".join(str(error.format_message()).split()).rstrip(".")
     message = message[:1].lower() + message[1:]
@@ -127,6 +138,10 @@ def _usage_sentence(error: Any) -> str:
     path = context.command_path if context is not None else "guiderail"
     if hasattr(error, "possibilities"):
         known = [name for parameter in context.command.params for name in parameter.opts] if context else []
+        if "--env" in known and error.option_name in ENVIRONMENT_OPTIONS:
+            value = (_values(arguments, error.option_name) or [""])[-1] or "VALUE"
+            name = error.option_name.removeprefix("--").replace("-", "_")
+            return f"there is no option {error.option_name} here: give --env {name}={value}"
         return f"there is no option {error.option_name}: {did_you_mean(error.option_name, known)}"
     if "command" in message and context is not None and hasattr(context.command, "list_commands"):
         names = context.command.list_commands(context)
