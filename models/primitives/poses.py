@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
 
 # Importing scipy.spatial takes a fifth of a second, and a primitive does not need it.
@@ -24,6 +24,34 @@ POSE_NAMES: dict[str, tuple[str, ...]] = {
     "rotation_vector": ("x [m]", "y [m]", "z [m]", "r_x [rad]", "r_y [rad]", "r_z [rad]"),
 }
 """Names of the six outputs, by the representation of the orientation."""
+
+# Names of the last three of six outputs, without units; those of Euler angles also as recordings are imported.
+_ANGLE_NAMES = {
+    ("psi_z", "psi_y", "psi_x"): "euler_zyx",
+    ("rz", "ry", "rx"): "euler_zyx",
+    ("r_x", "r_y", "r_z"): "rotation_vector",
+}
+
+
+def check_orientation(orientation: object) -> Orientation:
+    """Return the name of an orientation unchanged.
+
+    Raises:
+        InputError: If there is no such orientation.
+    """
+    if not (isinstance(orientation, str) and orientation in POSE_NAMES):
+        raise InputError(f"there is no orientation {brief(orientation)}: choose {' or '.join(POSE_NAMES)}")
+    return cast(Orientation, orientation)
+
+
+def orientation_of_names(names: Sequence[str]) -> Orientation | None:
+    """Return the orientation that the names of outputs state.
+
+    Names of Euler angles are "Rz [rad]", "Ry [rad]", "Rx [rad]", as `guiderail dataset import` writes them, and those
+    of `POSE_NAMES`. The result is None for other names, and unless there are six.
+    """
+    plain = tuple(name.partition("[")[0].strip().lower() for name in names)
+    return cast("Orientation | None", _ANGLE_NAMES.get(plain[3:])) if len(plain) == 6 else None
 
 
 def pose_outputs(
@@ -51,6 +79,7 @@ def pose_outputs(
     """
     from scipy.spatial.transform import Rotation
 
+    check_orientation(orientation)
     positions, quaternions = np.asarray(positions, dtype=float), np.asarray(quaternions_wxyz, dtype=float)
     if positions.ndim != 2 or positions.shape[1] != 3 or quaternions.shape != (len(positions), 4):
         raise InputError(
@@ -69,9 +98,7 @@ def pose_outputs(
         if np.abs(R_TE.as_matrix()[:, 2, 0]).max() > SINGULAR:
             raise InputError("ZYX Euler angles are singular in this motion: use orientation='rotation_vector'")
         return np.hstack([p_TE, _continued(R_TE.as_euler("ZYX"), near)])
-    if orientation == "rotation_vector":
-        return np.hstack([p_TE, _continued_vectors(R_TE.as_rotvec(), near)])
-    raise InputError(f"there is no orientation '{orientation}': choose euler_zyx or rotation_vector")
+    return np.hstack([p_TE, _continued_vectors(R_TE.as_rotvec(), near)])
 
 
 def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "euler_zyx") -> Rotation:
@@ -80,10 +107,13 @@ def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "e
     Args:
         orientation_numbers: Orientation outputs, (3,) or (N, 3) [rad].
         orientation: As in `pose_outputs`.
+
+    Raises:
+        InputError: If there is no such orientation.
     """
     from scipy.spatial.transform import Rotation
 
-    if orientation == "euler_zyx":
+    if check_orientation(orientation) == "euler_zyx":
         return Rotation.from_euler("ZYX", orientation_numbers)
     return Rotation.from_rotvec(orientation_numbers)
 

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.poses import Orientation
+from guiderail.models.primitives.poses import Orientation, check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.tools.guided.guide import Guide, GuideCommand, GuideSettings, PrimitiveGuide, TemplateGuide, predict
 from guiderail.tools.guided.segment import Constraints, Segment
@@ -54,7 +54,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         history: P, past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
         horizon: H, future points at which the constraints are satisfied.
-        orientation: Meaning of the last three of six outputs: "rotation_vector" or "euler_zyx".
+        orientation: Meaning of the last three of six outputs: "euler_zyx" for angles [Rz Ry Rx], or "rotation_vector".
+            By default, that of the demonstrations' names ("Rz [rad]", "Ry [rad]", "Rx [rad]" are Euler angles), and
+            "rotation_vector" for other names.
         observe: What is appended to the observation: "phase" (1,), scaled to [−1, 1], and "command" (O,), the last
             command in the segment's frame, scaled to the demonstrations' range. The command of a template is in the
             template's first frame, in units of 0.2 m and π.
@@ -87,7 +89,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         history: int = 4,
         history_variance: float = 1e-6,
         horizon: int = 20,
-        orientation: Orientation = "rotation_vector",
+        orientation: Orientation | None = None,
         observe: Sequence[str] = OBSERVED,
     ):
         super().__init__(env)
@@ -98,11 +100,15 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         unknown = [name for name in observe if name not in OBSERVED]
         if unknown or isinstance(observe, str):
             raise InputError(f"observe has some of {', '.join(OBSERVED)}, not {brief(observe)}")
+        if orientation is not None:
+            check_orientation(orientation)
         if isinstance(guidance, Guide):
             self.guide = guidance
         elif guidance == "template":
             if template is None or template_frames is None:
                 raise InputError("guidance by a template needs template= and template_frames=")
+            if orientation == "rotation_vector":
+                raise InputError("poses of a template are [x y z Rz Ry Rx]: leave orientation out")
             if not isinstance(template, SharedControlTemplate):
                 template = load_template(template)
             self.guide = TemplateGuide(template, template_frames, period)

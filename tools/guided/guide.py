@@ -18,7 +18,7 @@ from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveSte
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import Selection, fit
 from guiderail.models.primitives.gains import authority_gains, deviation, residual_gains
-from guiderail.models.primitives.poses import Orientation
+from guiderail.models.primitives.poses import Orientation, check_orientation, orientation_of_names
 from guiderail.models.templates import SharedControlTemplate
 from guiderail.tools.guided.segment import Frame, Segment
 
@@ -167,7 +167,8 @@ class GuideSettings:
     history: int = 4  # P, past outputs that the motion of sKGRL passes through
     history_variance: float = 1e-6  # ρ, variance of the past outputs [output²]
     horizon: int = 20  # H, future points at which the constraints are satisfied
-    orientation: Orientation = "rotation_vector"  # meaning of the last three of six outputs, in frames with a rotation
+    # Meaning of the last three of six outputs; None for that of the demonstrations' names, or else "rotation_vector".
+    orientation: Orientation | None = None
 
 
 class PrimitiveGuide(Guide):
@@ -196,6 +197,7 @@ class PrimitiveGuide(Guide):
             raise InputError(f"all segments need the same outputs, not {sorted(sizes)} of them")
         (self.num_outputs,) = sizes
         self._period = period
+        self._orientation = _orientation_of(segments, settings.orientation)
         self.guidance, self.settings = guidance, settings
         self._dims = list(range(self.num_outputs)) if settings.action_dims is None else list(settings.action_dims)
         self.num_actions = len(self._dims)
@@ -229,7 +231,7 @@ class PrimitiveGuide(Guide):
         near = fitted.reference.means[0]
         recent = self._recent[-max(primitive.history, 1) :]
         recent = [recent[0]] * (max(primitive.history, 1) - len(recent)) + recent
-        past = [self.frame.to_frame(output, self.settings.orientation, near) for output in recent]
+        past = [self.frame.to_frame(output, self._orientation, near) for output in recent]
         start = np.array(past) if primitive.history else past[-1]
         self._stepper: PrimitiveStepper = primitive.start(start, gains, motion=motion_filter)
         self._last = past[-1]
@@ -261,7 +263,7 @@ class PrimitiveGuide(Guide):
                 output = self.constraints.nearest(output, step)
         command = self._stepper.finish(output)
         self._last = command.output
-        world = self.frame.to_world(command.output, self.settings.orientation)
+        world = self.frame.to_world(command.output, self._orientation)
         self._recent = [*self._recent, world][-max(self.settings.history, 1) :]
         extra = self._extra(self._step)
         self._step += 1
@@ -299,6 +301,23 @@ class PrimitiveGuide(Guide):
         """Return the last command (O,) in the frame, relative to the range of the segment's demonstrations."""
         fitted = self.segments[self._index]
         return (self._last - fitted.center) / fitted.half_range
+
+
+def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> Orientation:
+    """Return the orientation `given`, or else that of the outputs' names; refuse names that contradict it."""
+    if given is not None:
+        check_orientation(given)
+    orientation = given
+    for segment in segments:
+        stated = orientation_of_names(segment.recorded.names)
+        if stated is not None and orientation not in (None, stated):
+            other = f"orientation={given!r}" if given is not None else f"the {orientation} of another segment"
+            raise InputError(
+                f"the outputs {', '.join(segment.recorded.names[3:])} of the demonstrations are {stated}, which "
+                f"contradicts {other}: use one orientation, or rename the outputs"
+            )
+        orientation = orientation or stated
+    return orientation or "rotation_vector"
 
 
 class TemplateGuide(Guide):

@@ -88,6 +88,8 @@ def test_pose_outputs_refuse_invalid_poses():
         pose_outputs(positions, 0 * quaternions, np.zeros(3), [1, 0, 0, 0])
     with pytest.raises(InputError, match="choose"):
         pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], "quaternion")
+    with pytest.raises(InputError, match="choose euler_zyx or rotation_vector"):
+        pose_rotation(np.zeros(3), "quaternion")
     with pytest.raises(InputError, match="positions"):
         pose_outputs(positions[:, :2], quaternions, np.zeros(3), [1, 0, 0, 0])
     for where in (positions, quaternions):

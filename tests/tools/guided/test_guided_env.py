@@ -6,14 +6,16 @@ import gymnasium
 import numpy as np
 import pytest
 from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
+from scipy.spatial.transform import Rotation
 
-from guiderail import Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segment
+from guiderail import Demonstrations, Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segment
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.demonstrations import compute_bounds
+from guiderail.models.primitives.poses import pose_rotation
 from guiderail.models.templates import load_template
 from guiderail.tools.guided import guide
 
@@ -208,6 +210,63 @@ def test_frame_transforms_poses_there_and_back(orientation):
     np.testing.assert_allclose(frame.to_world(turned, orientation)[:3], output[:3], atol=1e-12)
 
 
+EULER, VECTOR = ("Rz [rad]", "Ry [rad]", "Rx [rad]"), ("r_x [rad]", "r_y [rad]", "r_z [rad]")
+
+
+def pose_shown(angles):
+    """Return demonstrations of poses with a constant orientation, whose last three outputs have the names `angles`."""
+    outputs = [np.hstack([y, np.tile([0.5, -0.4, 0.3], (len(y), 1))]) for y in SHOWN.outputs]
+    return Demonstrations(SHOWN.times, outputs, ["x [m]", "y [m]", "z [m]", *angles])
+
+
+def guided_poses(angles, **keywords):
+    R = RotationMatrix.MakeZRotation(np.pi / 2).matrix()
+    arguments = {
+        "demonstrations": pose_shown(angles),
+        "frame": lambda env, observation: Frame(env.unwrapped.target, R),
+        "pose": lambda env, observation: np.append(env.unwrapped.p, np.zeros(3)),
+        "to_action": lambda env, observation, command, extra: np.zeros(4),
+    }
+    return guided("kmp", **{"constraints": None, **arguments, **keywords})
+
+
+@pytest.mark.parametrize(
+    ("angles", "orientation", "meaning"),
+    [
+        (EULER, None, "euler_zyx"),
+        (("psi_z [rad]", "psi_y [rad]", "psi_x [rad]"), None, "euler_zyx"),
+        (EULER, "euler_zyx", "euler_zyx"),
+        (VECTOR, None, "rotation_vector"),
+        (("a", "b", "c"), None, "rotation_vector"),
+        (("a", "b", "c"), "euler_zyx", "euler_zyx"),
+    ],
+)
+def test_orientation_has_the_meaning_of_the_names(angles, orientation, meaning):
+    env = guided_poses(angles, orientation=orientation)
+    command = episode(env, lambda k: np.zeros(6))[-1]["command"]
+    expected = Rotation.from_euler("z", np.pi / 2) * pose_rotation(np.array([0.5, -0.4, 0.3]), meaning)
+    assert (pose_rotation(command[3:], meaning).inv() * expected).magnitude() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("angles", "orientation", "message"),
+    [
+        (EULER, "rotation_vector", "Rz .*Rx .* are euler_zyx, which contradicts orientation='rotation_vector'"),
+        (VECTOR, "euler_zyx", "are rotation_vector, which contradicts orientation='euler_zyx'"),
+        (EULER, "quaternion", "no orientation 'quaternion': choose euler_zyx or rotation_vector"),
+        (EULER, ["euler_zyx"], "no orientation"),
+    ],
+)
+def test_orientation_other_than_that_of_the_names_is_refused(angles, orientation, message):
+    with pytest.raises(InputError, match=message):
+        guided_poses(angles, orientation=orientation)
+
+
+def test_segments_with_different_orientations_are_refused():
+    with pytest.raises(InputError, match="contradicts the euler_zyx of another segment"):
+        guided_poses(EULER, demonstrations=[Segment(pose_shown(EULER)), Segment(pose_shown(VECTOR))], frame=None)
+
+
 def test_demonstrated_bounds_and_callables_are_constraints():
     bounds = compute_bounds(SHOWN, phases=3, margin=0.1, min_margin=0.005)
     for constraints in (bounds, lambda env, o: LIMIT, lambda env, o: bounds):
@@ -262,6 +321,7 @@ def test_action_beyond_the_range_is_clipped():
         ({"constraints": LinearConstraints.none(2)}, "2 outputs"),
         ({"constraints": [1.0]}, "constraints of a segment"),
         ({"guidance": "template"}, "template="),
+        ({"orientation": "quaternion"}, "choose euler_zyx or rotation_vector"),
         ({"demonstrations": two_segments()}, "each Segment"),
     ],
 )
