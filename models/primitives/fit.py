@@ -72,6 +72,10 @@ class Selection:
         return LcNsKmp(self.reference, **{**selected, **arguments})
 
 
+MIN_DEMONSTRATIONS = 3
+"""Least number of demonstrations for `fit`."""
+
+
 def fit(
     demonstrations: Demonstrations,
     *,
@@ -111,7 +115,7 @@ def fit(
     if not is_whole(horizon, 0):
         raise InputError(f"the horizon is a number of steps, not {brief(horizon)}")
     horizon = int(horizon)
-    if demonstrations.num_demonstrations < 3:
+    if demonstrations.num_demonstrations < MIN_DEMONSTRATIONS:
         raise InputError(
             f"cross-validation needs at least three demonstrations, and there are {demonstrations.num_demonstrations}: "
             "record more"

@@ -35,7 +35,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: Environment to wrap; its own action is what `to_action` returns.
-        demonstrations: One motion in the world, its file, or segments with frames of their own.
+        demonstrations: One motion in the world, its file, or segments with frames of their own; at least three
+            demonstrations each, from whose spread the kernel is selected.
         pose: (env, observation) → measured outputs (O,) in the world, such as a position, or a position and an
             orientation (see `orientation`).
         to_action: (env, observation, command, extra) → action of `env` that reaches the command (O,); `extra` is the

@@ -16,7 +16,7 @@ from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, tra
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
-from guiderail.models.primitives.fit import Selection, fit
+from guiderail.models.primitives.fit import MIN_DEMONSTRATIONS, Selection, fit
 from guiderail.models.primitives.gains import authority_gains, deviation, residual_gains
 from guiderail.models.primitives.poses import Orientation, check_orientation, orientation_of_names
 from guiderail.models.templates import SharedControlTemplate
@@ -182,7 +182,8 @@ class PrimitiveGuide(Guide):
         period: Control period [s]; required unless every segment has `num_steps`.
 
     Raises:
-        InputError: If an argument is out of range, or segments have different outputs.
+        InputError: If an argument is out of range, a segment has fewer than three demonstrations, or segments have
+            different outputs.
     """
 
     def __init__(
@@ -192,6 +193,13 @@ class PrimitiveGuide(Guide):
             raise InputError(f"there is no guidance {brief(guidance)}: {did_you_mean(guidance, GUIDANCE)}")
         if not segments:
             raise InputError("guidance by demonstrations needs at least one segment")
+        for index, segment in enumerate(segments):
+            if (number := segment.recorded.num_demonstrations) < MIN_DEMONSTRATIONS:
+                raise InputError(
+                    f"guidance by demonstrations needs at least {MIN_DEMONSTRATIONS} in each segment, and segment "
+                    f"{segment.name or index} has {number}: record more, or step a primitive with LcNsKmp.start "
+                    "(ReferenceTrajectory.from_demonstrations takes two, or one with prior_std)"
+                )
         sizes = {segment.recorded.num_outputs for segment in segments}
         if len(sizes) > 1:
             raise InputError(f"all segments need the same outputs, not {sorted(sizes)} of them")

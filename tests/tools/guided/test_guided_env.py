@@ -330,6 +330,16 @@ def test_wrong_argument_is_refused(keywords, message):
         guided(**keywords)
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_fewer_than_three_demonstrations_are_refused(number):
+    segments = [Segment(SHOWN), Segment(SHOWN.first(number), name="insert")]
+    message = f"needs at least 3 in each segment, and segment insert has {number}: record more, or .* prior_std"
+    with pytest.raises(InputError, match=message):
+        guided(demonstrations=segments, constraints=None, frame=None)
+    with pytest.raises(InputError, match=f"segment 0 has {number}"):
+        guided(demonstrations=SHOWN.first(number))
+
+
 @pytest.mark.parametrize("wrong", [lambda e, o: np.full(3, np.nan), lambda e, o: np.zeros(2)])
 def test_wrong_pose_is_refused_at_reset(wrong):
     env = guided(pose=wrong)
