@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.reference import ReferenceTrajectory
@@ -50,7 +50,7 @@ def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.n
     Raises:
         InputError: If κ is not positive, an index does not exist, or the primitive has no null space (β = 0).
     """
-    _check_action_scale(action_scale)
+    check_action_scale(action_scale)
     explored = _explored_mask(primitive, outputs)
     authority = unit_authority(primitive, outputs)
     _check_response(primitive, authority[explored])
@@ -76,7 +76,7 @@ def rms_gains(
         InputError: As `authority_gains`, if `action_repeat` is out of range, or if no gains reach κ in all outputs
             because of their correlations.
     """
-    _check_action_scale(action_scale)
+    check_action_scale(action_scale)
     explored = np.flatnonzero(_explored_mask(primitive, outputs))
     power = _white_power(primitive, action_repeat)[np.ix_(explored, explored)]
     _check_response(primitive, np.sqrt(power.diagonal()))
@@ -130,10 +130,13 @@ def deviation(reference: ReferenceTrajectory) -> np.ndarray:
     return np.sqrt(np.mean(reference.standard_deviations**2, axis=0))
 
 
-def _check_action_scale(action_scale: float) -> None:
-    if not (np.isfinite(action_scale) and action_scale > 0):
+def check_action_scale(action_scale: float) -> None:
+    """Raise an InputError if κ is not a positive number."""
+    scale = as_numbers(action_scale, "action_scale")
+    if scale.ndim or not 0.0 < scale < np.inf:
         raise InputError(
-            f"action_scale is a number of demonstration standard deviations and must be positive, not {action_scale}"
+            "action_scale is a number of demonstration standard deviations and must be positive, not "
+            f"{brief(action_scale)}"
         )
 
 

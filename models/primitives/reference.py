@@ -123,7 +123,13 @@ class ReferenceTrajectory:
             )
         demonstrations = demonstrations.resampled(num_steps)
         times, outputs = demonstrations.times[0], np.stack(demonstrations.outputs)
-        floor = np.broadcast_to(np.asarray(floor, dtype=float), outputs.shape[-1:])
+        floor = as_numbers(floor, "floor")
+        if floor.shape not in ((), (1,), outputs.shape[-1:]):
+            raise InputError(
+                f"floor is one standard deviation, or one for each of the {outputs.shape[-1]} outputs, not of shape "
+                f"{floor.shape}"
+            )
+        floor = np.broadcast_to(floor, outputs.shape[-1:])
         if not (np.isfinite(floor).all() and (floor >= 0).all()):
             raise InputError(f"floor is a standard deviation and must not be negative: {floor}")
         if model == "promp":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from numbers import Real
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -18,7 +19,15 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.poses import Orientation, check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
-from guiderail.tools.guided.guide import Guide, GuideCommand, GuideSettings, PrimitiveGuide, TemplateGuide, predict
+from guiderail.tools.guided.guide import (
+    PRIMITIVE_GUIDANCE,
+    Guide,
+    GuideCommand,
+    GuideSettings,
+    PrimitiveGuide,
+    TemplateGuide,
+    predict,
+)
 from guiderail.tools.guided.segment import Constraints, Segment
 
 OBSERVED = ("phase", "command")
@@ -98,6 +107,11 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
         if not is_whole(history, 1):
             raise InputError(f"history is a number of outputs, at least 1, not {brief(history)}")
+        if period is not None and not (isinstance(period, Real) and 0.0 < period < np.inf):
+            raise InputError(f"the period of the environment must be a positive number of seconds, not {brief(period)}")
+        for what, function in (("pose", pose), ("to_action", to_action), ("template_frames", template_frames)):
+            if not callable(function) and not (what == "template_frames" and function is None):
+                raise InputError(f"{what} is a function of the environment and its observation, not {brief(function)}")
         unknown = [name for name in observe if name not in OBSERVED]
         if unknown or isinstance(observe, str):
             raise InputError(f"observe has some of {', '.join(OBSERVED)}, not {brief(observe)}")
@@ -110,9 +124,14 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                 raise InputError("guidance by a template needs template= and template_frames=")
             if orientation == "rotation_vector":
                 raise InputError("poses of a template are [x y z Rz Ry Rx]: leave orientation out")
+            others = {"demonstrations": demonstrations, "constraints": constraints, "frame": frame}
+            if superfluous := [name for name, value in others.items() if value is not None]:
+                raise InputError(f"guidance by a template does not use {superfluous[0]}: leave it out")
             if not isinstance(template, SharedControlTemplate):
                 template = load_template(template)
             self.guide = TemplateGuide(template, template_frames, period)
+        elif guidance in PRIMITIVE_GUIDANCE and (template is not None or template_frames is not None):
+            raise InputError(f"guidance={guidance!r} does not use a template: leave it out, or use guidance='template'")
         else:
             settings = GuideSettings(action_scale, action_dims, int(history), history_variance, horizon, orientation)
             self.guide = PrimitiveGuide(_segments(demonstrations, constraints, frame), guidance, settings, period)
@@ -120,12 +139,14 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._pose, self._to_action = pose, to_action
         self._command: GuideCommand | None = None
         self._observation: Any = None
+        self._terminated = self._truncated = False
         self.action_space = Box(-1.0, 1.0, (self.guide.num_actions,), np.float32)
         self.observation_space = self._extended_space(env.observation_space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment and begin the motion at the measured pose."""
         self._observation, info = self.env.reset(seed=seed, options=options)
+        self._terminated = self._truncated = False
         measured = self._measured()
         self.guide.reset(self.env, self._observation, measured)
         return self._extended(), {**info, "phase": self.guide.phase, "segment": self.guide.segment_name}
@@ -142,16 +163,17 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             InputError: If the action is not (A,) finite numbers; one outside [−1, 1] is clipped.
-            ResetNeeded: If no episode has begun.
+            ResetNeeded: If no episode has begun, or the episode has ended.
         """
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset() first")
+        if self._terminated or self._truncated:
+            raise gymnasium.error.ResetNeeded("the episode has ended: call reset() first")
         checked = as_numbers(action, "an action")
         if checked.shape != (self.guide.num_actions,) or not np.isfinite(checked).all():
             raise InputError(f"an action must be {self.guide.num_actions} finite numbers, not {brief(action)}")
         self._action, self._count, self._reward = checked, 0, 0.0
         self._violation, self._fallbacks = -np.inf, 0
-        self._terminated = self._truncated = False
         self._info: dict[str, Any] = {}
 
     @property
@@ -258,7 +280,14 @@ class GuidedVectorEnv(SyncVectorEnv):
         super().__init__([lambda: first, *map(wrap, env_fns[1:])], autoreset_mode=AutoresetMode.NEXT_STEP)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Apply actions (B, A); return observations, rewards (B,), terminations (B,), truncations (B,) and infos."""
+        """Apply actions (B, A); return observations, rewards (B,), terminations (B,), truncations (B,) and infos.
+
+        Raises:
+            InputError: If the actions are not (B, A) finite numbers; no environment has moved then.
+        """
+        actions = as_numbers(actions, "actions")
+        if actions.shape != self.action_space.shape:
+            raise InputError(f"actions must be of shape {self.action_space.shape}, not {actions.shape}")
         stepped = [i for i in range(self.num_envs) if not self._autoreset_envs[i]]
         guided: list[Any] = [self.envs[i] for i in stepped]
         for env, i in zip(guided, stepped, strict=True):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
@@ -17,10 +18,10 @@ from guiderail.models.control.motion_constraints import MotionConstraintFilter, 
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import MIN_DEMONSTRATIONS, Selection, fit
-from guiderail.models.primitives.gains import authority_gains, deviation, residual_gains
+from guiderail.models.primitives.gains import authority_gains, check_action_scale, deviation, residual_gains
 from guiderail.models.primitives.poses import Orientation, check_orientation, orientation_of_names
 from guiderail.models.templates import SharedControlTemplate
-from guiderail.tools.guided.segment import Frame, Segment
+from guiderail.tools.guided.segment import Frame, Segment, as_bool
 
 PRIMITIVE_GUIDANCE = ("kgrl", "skgrl", "kmp", "residual", "clipped_residual")
 GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
@@ -149,7 +150,7 @@ class _FittedSegment:
     def _make_gains(self, primitive: LcNsKmp) -> np.ndarray:
         if self.guidance == "kmp":
             return np.zeros(self.num_outputs)
-        dims = list(range(self.num_outputs)) if self.settings.action_dims is None else list(self.settings.action_dims)
+        dims = _checked_dims(self.settings.action_dims, self.num_outputs)
         if "residual" in self.guidance:
             groups = (range(3), range(3, 6)) if self.num_outputs == 6 else ()
             gains = residual_gains(self.reference, self.settings.action_scale, groups)
@@ -207,7 +208,8 @@ class PrimitiveGuide(Guide):
         self._period = period
         self._orientation = _orientation_of(segments, settings.orientation)
         self.guidance, self.settings = guidance, settings
-        self._dims = list(range(self.num_outputs)) if settings.action_dims is None else list(settings.action_dims)
+        check_action_scale(settings.action_scale)
+        self._dims = _checked_dims(settings.action_dims, self.num_outputs)
         self.num_actions = len(self._dims)
         self.segments = [_FittedSegment(segment, guidance, settings, period) for segment in segments]
         self.num_steps = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments)
@@ -250,7 +252,7 @@ class PrimitiveGuide(Guide):
         segment = fitted.segment
         is_over = self._step >= fitted.num_steps + segment.dwell
         if not is_over and segment.until is not None and self._step > 0:
-            is_over = bool(segment.until(env, observation))
+            is_over = as_bool(segment.until(env, observation), "until of a segment")
         if is_over and self._index + 1 < len(self.segments):
             self._begin(self._index + 1, env, observation)
         elif is_over:
@@ -309,6 +311,18 @@ class PrimitiveGuide(Guide):
         """Return the last command (O,) in the frame, relative to the range of the segment's demonstrations."""
         fitted = self.segments[self._index]
         return (self._last - fitted.center) / fitted.half_range
+
+
+def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[int]:
+    """Return the indices of the outputs that an action moves; refuse others than distinct indices."""
+    if action_dims is None:
+        return list(range(num_outputs))
+    given = list(action_dims) if isinstance(action_dims, Sequence | np.ndarray) and np.ndim(action_dims) == 1 else [-1]
+    if len(set(given)) < len(given) or not all(is_whole(o, 0) and o < num_outputs for o in given):
+        raise InputError(
+            f"action_dims are distinct indices of the outputs, from 0 to {num_outputs - 1}, not {brief(action_dims)}"
+        )
+    return [int(o) for o in given]
 
 
 def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> Orientation:

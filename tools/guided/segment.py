@@ -18,6 +18,7 @@ from guiderail.models.primitives import Demonstrations, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds
 from guiderail.models.primitives.poses import Orientation, pose_rotation
 
+MIN_PERIODS = 4  # minimum duration of a segment's demonstrations [control periods]
 MIN_STEPS = 12  # minimum control steps of a segment, for the fit of the Gaussian mixture
 
 
@@ -119,7 +120,8 @@ class Segment:
         discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
             the most frequent value of the demonstrations at its phase.
         until: (env, observation) → true to end the segment early; by default it ends with its steps.
-        num_steps: Control steps; the mean duration of the demonstrations divided by the period by default.
+        num_steps: Control steps, at least 12; by default, the mean duration of the demonstrations divided by the
+            period. A shorter segment of at least four periods is slowed down to 12 steps.
         dwell: Control steps for which the last point is held after `num_steps`.
         floor: Standard deviation (O,) or scalar whose square is added to every variance [unit of the output].
         name: Name of the segment, in `info`.
@@ -143,6 +145,11 @@ class Segment:
         for what, value, least in (("num_steps", self.num_steps, MIN_STEPS), ("dwell", self.dwell, 0)):
             if value is not None and not is_whole(value, least):
                 raise InputError(f"{what} of a segment is a whole number of at least {least}, not {brief(value)}")
+        for what, function, returned in (("frame", self.frame, "Frame or origin"), ("until", self.until, "bool")):
+            if function is not None and not callable(function):
+                raise InputError(
+                    f"{what} of a segment is a function (env, observation) → {returned}, not {brief(function)}"
+                )
         if self.discrete is not None and self.extra is not None:
             raise InputError("a segment has extra or discrete, not both")
 
@@ -156,13 +163,19 @@ class Segment:
         """Return the number of control steps.
 
         Raises:
-            InputError: If neither `num_steps` nor a positive period [s] is known.
+            InputError: If neither `num_steps` nor a positive period [s] is known, or the demonstrations are shorter
+                than four periods.
         """
         if self.num_steps is not None:
             return int(self.num_steps)
         if period is None or not 0.0 < period < np.inf:
             raise InputError("give the period of the environment [s], or num_steps of every segment")
         duration = float(np.mean([t[-1] - t[0] for t in self.recorded.times]))
+        if round(duration / period) < MIN_PERIODS:
+            raise InputError(
+                f"demonstrations of {duration:.3g} s are shorter than {MIN_PERIODS} periods of {period:.3g} s: give as "
+                "period the duration of a step of the environment [s], or num_steps of the segment"
+            )
         return max(round(duration / period) + 1, MIN_STEPS)
 
     def discrete_values(self, num_steps: int) -> list[Any] | None:
@@ -185,6 +198,13 @@ class Segment:
         return values
 
 
+def as_bool(value: Any, what: str) -> bool:
+    """Return what the function named `what` has returned as True or False; raise an InputError for an array."""
+    if np.ndim(value):
+        raise InputError(f"{what} must return True or False, not {brief(value)}")
+    return bool(value)
+
+
 def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[int]]) -> list[Demonstrations]:
     """Cut demonstrations at events into segments; a sample at a cut belongs to both sides.
 
@@ -198,13 +218,19 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
     Raises:
         InputError: If there is not one list for each demonstration, or a part has fewer than two samples.
     """
-    if len(cuts) != demonstrations.num_demonstrations or len({len(each) for each in cuts}) != 1:
+    try:
+        lists = [list(each) for each in cuts]
+    except TypeError as error:
+        raise InputError(f"cuts are a list of sample indices for each demonstration, not {brief(cuts)}") from error
+    if len(lists) != demonstrations.num_demonstrations or len({len(each) for each in lists}) != 1:
         raise InputError("cuts need one list for each demonstration, all of one length")
-    parts: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in range(len(cuts[0]) + 1)]
-    for m, (t, y, at) in enumerate(zip(demonstrations.times, demonstrations.outputs, cuts, strict=True)):
-        edges = [0, *(int(k) for k in at), len(t) - 1]
-        if min(np.diff(edges)) < 1 or edges[-2] >= len(t):
-            raise InputError(f"the cuts of demonstration {m} must increase inside of it, not {brief(list(at))}")
+    parts: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in range(len(lists[0]) + 1)]
+    for m, (t, y, at) in enumerate(zip(demonstrations.times, demonstrations.outputs, lists, strict=True)):
+        edges = [0, *(int(k) if is_whole(k, 0) else -1 for k in at), len(t) - 1]
+        if min(np.diff(edges)) < 1:
+            raise InputError(
+                f"the cuts of demonstration {m} must be indices that increase inside of it, not {brief(at)}"
+            )
         for (times, outputs), first, last in zip(parts, edges[:-1], edges[1:], strict=True):
             times.append(t[first : last + 1] - t[first])
             outputs.append(y[first : last + 1])
@@ -222,13 +248,22 @@ def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np
             `cut_demonstrations` cannot cut.
 
     Raises:
-        InputError: If an event does not occur in a recording.
+        InputError: If an argument has another type or shape, or an event does not occur in a recording.
     """
+    if not isinstance(conditions, Sequence) or not all(map(callable, conditions)):
+        raise InputError(f"conditions are a list of functions of a sample, not {brief(conditions)}")
+    try:
+        signals = list(signals)
+        is_table = all(np.ndim(signal) == 2 for signal in signals)
+    except (TypeError, ValueError):  # not a list, or ragged
+        is_table = False
+    if not is_table:
+        raise InputError("signals are a list of arrays (N, S), one for each recording, with one row per sample")
     event_lists = []
     for m, signal in enumerate(signals):
         at, events = -1, []
         for number, condition in enumerate(conditions):
-            at = next((k for k in range(at + 1, len(signal)) if condition(signal[k])), -1)
+            at = next((k for k in range(at + 1, len(signal)) if as_bool(condition(signal[k]), "a condition")), -1)
             if at < 0:
                 raise InputError(f"event {number} does not occur in recording {m}")
             events.append(at)

@@ -322,6 +322,25 @@ def test_action_beyond_the_range_is_clipped():
         ({"constraints": [1.0]}, "constraints of a segment"),
         ({"guidance": "template"}, "template="),
         ({"orientation": "quaternion"}, "choose euler_zyx or rotation_vector"),
+        ({"period": 50.0}, r"demonstrations of 1.2 s are shorter than 4 periods of 50 s: give as period"),
+        ({"period": 0.35}, "shorter than 4 periods"),
+        ({"period": "0.05"}, "period of the environment"),
+        ({"action_dims": [0, 0]}, r"action_dims are distinct indices of the outputs, from 0 to 2, not \[0, 0\]"),
+        ({"action_dims": 1}, "action_dims .* not 1"),
+        ({"action_dims": [0.5]}, "action_dims"),
+        ({"action_dims": [True, False, True]}, "action_dims"),
+        ({"action_scale": [1] * 6}, r"action_scale is a number .* not \[1, 1"),
+        ({"action_scale": "large"}, "action_scale is not an array of numbers"),
+        ({"guidance": "residual", "action_scale": -1.0}, "action_scale .* must be positive"),
+        (
+            {"demonstrations": [Segment(SHOWN, floor=[0.1] * 2)], "constraints": None, "frame": None},
+            "floor .* 3 outputs",
+        ),
+        ({"frame": np.zeros(3)}, r"frame of a segment is a function \(env, observation\) → Frame or origin, not array"),
+        ({"pose": np.zeros(3)}, "pose is a function of the environment and its observation"),
+        ({"to_action": None}, "to_action is a function"),
+        ({"template": "pouring"}, "guidance='kgrl' does not use a template"),
+        ({"guidance": "template", "template": "pouring", "template_frames": pose}, "does not use demonstrations"),
         ({"demonstrations": two_segments()}, "each Segment"),
     ],
 )
@@ -451,6 +470,38 @@ def test_constraints_of_the_motion_need_a_period():
     with pytest.raises(InputError, match="period"):
         env.reset(seed=0)
     guided(demonstrations=[segment], constraints=None, frame=None).reset(seed=0)
+
+
+@pytest.mark.parametrize("actions", [np.zeros((3, 3)), np.zeros((1, 3)), np.zeros((2, 2)), [[0.0] * 3, [0.0] * 2]])
+def test_vector_environment_refuses_other_numbers_of_actions(actions):
+    vector = GuidedVectorEnv([PointEnv] * 2, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+    vector.reset(seed=0)
+    before = [env.unwrapped.p.copy() for env in vector.envs]
+    with pytest.raises(InputError, match="actions"):
+        vector.step(actions)
+    np.testing.assert_array_equal([env.unwrapped.p for env in vector.envs], before)
+
+
+@pytest.mark.parametrize("reason", ["terminated", "truncated"])
+def test_step_after_the_end_of_an_episode_is_refused(reason):
+    segments = two_segments() if reason == "terminated" else [Segment(SHOWN, frame=at_target)]
+    env = guided(demonstrations=segments, constraints=None, frame=None, action_repeat=60)
+    env.reset(seed=0)
+    _, _, terminated, truncated, _ = env.step(np.zeros(3))
+    assert (terminated, truncated) == (reason == "terminated", reason == "truncated")
+    before = env.unwrapped.p.copy()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="the episode has ended: call reset"):
+        env.step(np.zeros(3))
+    np.testing.assert_array_equal(env.unwrapped.p, before)
+    env.reset(seed=0)
+    env.step(np.zeros(3))
+
+
+def test_condition_that_returns_an_array_is_refused():
+    segments = two_segments(until=lambda env, observation: np.zeros(3))
+    env = guided(demonstrations=segments, constraints=None, frame=None)
+    with pytest.raises(InputError, match="until of a segment must return True or False, not array"):
+        episode(env, lambda k: np.zeros(3))
 
 
 def test_step_needs_a_reset():

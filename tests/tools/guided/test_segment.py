@@ -24,6 +24,27 @@ def test_events_are_found_one_after_the_other():
         find_events(signals, [lambda s: s[0] == 2, lambda s: s[0] == 1])
 
 
+@pytest.mark.parametrize(
+    ("signals", "conditions", "message"),
+    [
+        (np.zeros((5, 2)), [lambda s: s[0] > 0], r"signals are a list of arrays \(N, S\)"),
+        ([np.zeros(5)], [lambda s: s > 0], "signals are a list"),
+        ([[[0.0], [0.0, 1.0]]], [lambda s: s[0] > 0], "signals are a list"),
+        (recordings(), [lambda s: s[0] > 0], "signals are a list"),
+        ([np.zeros((5, 2))], lambda s: s[0] > 0, "conditions are a list of functions"),
+        ([np.zeros((5, 2))], [0.5], "conditions are a list of functions"),
+        ([np.zeros((5, 2))], [lambda s: s > 0], r"a condition must return True or False, not array"),
+    ],
+)
+def test_wrong_argument_of_the_search_for_events_is_refused(signals, conditions, message):
+    with pytest.raises(InputError, match=message):
+        find_events(signals, conditions)
+
+
+def test_events_are_found_in_an_array_of_recordings():
+    assert find_events(np.arange(10.0).reshape(2, 5, 1), [lambda s: s[0] in (3, 7)]) == [[3], [2]]
+
+
 def test_cut_parts_share_the_sample_and_begin_at_zero():
     parts = cut_demonstrations(recordings(), [[10, 30], [12, 25], [9, 20]])
     assert [len(part.times[0]) for part in parts] == [11, 21, 10]
@@ -33,7 +54,17 @@ def test_cut_parts_share_the_sample_and_begin_at_zero():
 
 
 @pytest.mark.parametrize(
-    "cuts", [[[10]], [[10], [10], [0]], [[10], [10], [39]], [[10, 5], [5, 10], [5, 10]], [[1], [1, 2], [1]]]
+    "cuts",
+    [
+        [[10]],
+        [[10], [10], [0]],
+        [[10], [10], [39]],
+        [[10, 5], [5, 10], [5, 10]],
+        [[1], [1, 2], [1]],
+        [5] * 3,
+        5,
+        [[5.5]] * 3,
+    ],
 )
 def test_wrong_cut_is_refused(cuts):
     with pytest.raises(InputError, match="cuts"):
@@ -56,10 +87,12 @@ def test_discrete_output_is_the_most_frequent_at_each_phase():
         ({"num_steps": 11}, "at least 12"),
         ({"num_steps": np.nan}, "at least 12, not nan"),
         ({"dwell": -1}, "at least 0"),
+        ({"frame": np.zeros(3)}, "frame of a segment is a function"),
+        ({"until": True}, "until of a segment is a function"),
         ({"dwell": np.inf}, "at least 0, not inf"),
     ],
 )
-def test_wrong_number_of_steps_is_refused(keywords, message):
+def test_wrong_argument_of_a_segment_is_refused(keywords, message):
     with pytest.raises(InputError, match=message):
         Segment(recordings(), **keywords)
 
@@ -68,6 +101,9 @@ def test_number_of_steps_follows_from_the_period():
     segment = Segment(recordings())
     assert segment.steps_of(0.1) == 40
     assert segment.steps_of(0.05) == 79
+    assert segment.steps_of(0.9) == 12
+    with pytest.raises(InputError, match=r"shorter than 4 periods of 1\.2 s"):
+        segment.steps_of(1.2)
     assert Segment(recordings(), num_steps=20).steps_of(None) == 20
 
 
