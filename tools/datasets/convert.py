@@ -57,7 +57,7 @@ def import_recording(
         recorded, kind = read_lerobot(source, signal), "a LeRobot dataset"
         if target is not None:
             raise InputError("a LeRobot dataset does not state which numbers are a pose: leave --target out")
-    elif source.suffix == ".mcap" or (source.is_dir() and find_bags(source)):
+    elif find_bags(source):
         recorded, kind = read_bags(source, signal, target), "ROS 2 bags"
     elif source.suffix == ".csv" or (source.is_dir() and any(source.glob("*.csv"))):
         if signal is not None:

@@ -112,6 +112,21 @@ def test_import_reads_the_bag_of_an_arm(topic, frame, tmp_path):
     np.testing.assert_allclose(moved[2], [0, -0.02, 0.1, np.deg2rad(-70), 0, 0], atol=1e-12)
 
 
+def test_import_reads_an_export_whose_folder_ends_in_mcap(tmp_path):
+    pytest.importorskip("rosbags")
+    t = 0.1 * np.arange(5)
+    shown = Demonstrations([t] * 2, [np.outer(t, [1.0, m]) for m in range(2)], ["x [m]", "y [m]"])
+    shown.save(tmp_path / "shown.npz")
+    export_demonstrations(tmp_path / "shown.npz", tmp_path / "a.mcap", "mcap")
+    import_recording(tmp_path / "a.mcap", tmp_path / "back.npz")
+    back = Demonstrations.load(tmp_path / "back.npz")
+    assert back.names == shown.names
+    np.testing.assert_array_equal(back.outputs, shown.outputs)
+    (tmp_path / "empty.mcap").mkdir()
+    with pytest.raises(InputError, match="is not a LeRobot dataset, a bag"):
+        import_recording(tmp_path / "empty.mcap", tmp_path / "none.npz")
+
+
 def test_import_refuses_two_measured_poses_without_signal(tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {"/a/pose": "base", "/b/pose": "base"})

@@ -42,10 +42,14 @@ _MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bit
 
 
 def find_bags(path: Path) -> list[Path]:
-    """Return the bag at a path, or all bags in the folder, sorted by name."""
-    if path.suffix == ".mcap" or (path / "metadata.yaml").is_file():
+    """Return the bag at a path, or all bags in the folder, sorted by name; a folder's name may also end in .mcap."""
+    if _is_bag(path):
         return [path]
-    return in_order(one for one in path.iterdir() if one.suffix == ".mcap" or (one / "metadata.yaml").is_file())
+    return in_order(filter(_is_bag, path.iterdir())) if path.is_dir() else []
+
+
+def _is_bag(path: Path) -> bool:
+    return (path.suffix == ".mcap" and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
