@@ -155,6 +155,42 @@ def test_csv_import_needs_no_option_when_columns_are_named(tmp_path):
     np.testing.assert_allclose(loaded.outputs[0][3], [0.004, 0.002, 0.003, 0.6, 0, 0], atol=1e-12)
 
 
+def imported_table(folder):
+    """Write three recordings, and import them into `shown.csv` in the same folder."""
+    for number in range(3):
+        rows = [(n * 10, 1 + n, number, 3, 0, 0, np.sin(0.1 * n), np.cos(0.1 * n)) for n in range(20)]
+        write_table(folder / f"a_{number}.csv", "time_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw", rows)
+    assert import_recording(folder, folder / "shown.csv")["demonstrations"] == 3
+    return folder / "shown.csv"
+
+
+def test_csv_import_reads_the_file_that_it_has_written(tmp_path):
+    shown = imported_table(tmp_path)
+    assert import_recording(shown, tmp_path / "back.csv")["assumed"] == "nothing"
+    assert (tmp_path / "back.csv").read_bytes() == shown.read_bytes()
+    with pytest.raises(InputError, match=r"shown.csv holds demonstrations, .* leave --time-unit out"):
+        import_recording(shown, tmp_path / "x.csv", time_unit="s")
+
+
+def test_csv_import_moves_its_own_file_into_the_target(tmp_path):
+    shown, target = imported_table(tmp_path), (0.001, 0.002, 0.0, 10.0, 20.0, 30.0)
+    import_recording(shown, tmp_path / "moved.npz", target=target)
+    shown.unlink()
+    import_recording(tmp_path, tmp_path / "expected.npz", target=target)
+    moved, expected = (Demonstrations.load(tmp_path / f"{name}.npz") for name in ("moved", "expected"))
+    np.testing.assert_allclose(moved.outputs, expected.outputs, atol=1e-12)
+    Demonstrations(moved.times, [y[:, :2] for y in moved.outputs], ["x [m]", "y [m]"]).save(tmp_path / "plane.csv")
+    with pytest.raises(InputError, match=r"plane.csv has the outputs x \[m\] and y \[m\], and --target needs"):
+        import_recording(tmp_path / "plane.csv", tmp_path / "x.npz", target=target)
+
+
+def test_csv_import_refuses_its_own_file_among_recordings(tmp_path):
+    imported_table(tmp_path)
+    with pytest.raises(InputError, match=r"shown.csv holds demonstrations, next to recordings such as a_0.csv"):
+        import_recording(tmp_path, tmp_path / "again.csv")
+    assert not (tmp_path / "again.csv").exists()
+
+
 @pytest.mark.parametrize(
     ("header", "row", "asks", "remedy"),
     [

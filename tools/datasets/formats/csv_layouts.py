@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import in_order, read_bytes
 from guiderail.models.common.transforms import POSE_NAMES
+from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
 from guiderail.tools.datasets.formats.recorded import UNITS, Recorded, poses_in_target, rotations_of
 
@@ -73,7 +74,7 @@ def read_csv_files(
     angles: str | None = None,
     target: Sequence[float] | None = None,
 ) -> Recorded:
-    """Return one demonstration per file.
+    """Return one demonstration per file, or all demonstrations of files that guiderail has written.
 
     Args:
         path: File, or a folder of files.
@@ -84,7 +85,8 @@ def read_csv_files(
         target: See `poses_in_target`.
 
     Raises:
-        InputError: If a file is invalid, a unit is neither stated nor given, or the stated and the given unit differ.
+        InputError: If a file is invalid, a unit is neither stated nor given, the stated and the given unit differ, or
+            recordings are mixed with a file that guiderail has written, which may hold the same motions.
     """
     for option, given, known in (
         ("--unit", unit, UNITS),
@@ -98,9 +100,22 @@ def read_csv_files(
     if not files:
         raise InputError(f"there is no .csv file in {path}: name a file, or a folder of them")
     recorded = Recorded([], [], ())
+    first_of_kind: dict[bool, Path] = {}  # first file that guiderail has written, and first one of another origin
     for file in files:
         like = recorded.outputs[0] if recorded.outputs else None
-        part = _read(file, unit, time_unit, quaternion, angles, target, like)
+        columns = _table(file)
+        is_written = [one.name for one in columns[:2]] == ["demonstration", "time"]
+        first_of_kind.setdefault(is_written, file)
+        if len(first_of_kind) > 1:
+            raise InputError(
+                f"{first_of_kind[True]} holds demonstrations, next to recordings such as {first_of_kind[False].name}, "
+                "and may hold the same motions: name one file, or move it to another folder"
+            )
+        if is_written:
+            given = {"unit": unit, "time-unit": time_unit, "quaternion": quaternion, "angles": angles}
+            part = _read_written(file, [name for name, value in given.items() if value is not None], target, like)
+        else:
+            part = _read(file, columns, unit, time_unit, quaternion, angles, target, like)
         if recorded.names and part.names != recorded.names:
             raise InputError(f"{file} has other columns than {files[0].name}: record the same ones in all of them")
         recorded.times += part.times
@@ -110,8 +125,26 @@ def read_csv_files(
     return recorded
 
 
+def _read_written(
+    file: Path, given: Sequence[str], target: Sequence[float] | None, like: np.ndarray | None
+) -> Recorded:
+    """Read a file that `Demonstrations.save` has written; `given` has the names of options that it does not need."""
+    if given:
+        raise InputError(f"{file} holds demonstrations, whose conventions are known: leave --{given[0]} out")
+    demonstrations = Demonstrations.load(file)
+    outputs, names = list(demonstrations.outputs), demonstrations.names
+    if target is not None:
+        if names != POSE_NAMES:
+            raise InputError(f"{file} has the outputs {_listed(names)}, and --target needs {_listed(POSE_NAMES)}")
+        for m, y in enumerate(outputs):
+            outputs[m] = poses_in_target(y[:, :3], Rotation.from_euler("ZYX", y[:, 3:]), target, like)
+            like = outputs[0] if like is None else like
+    return Recorded(list(demonstrations.times), outputs, names)
+
+
 def _read(
     file: Path,
+    columns: Sequence[_Column],
     unit: str | None,
     time_unit: str | None,
     quaternion: str | None,
@@ -119,7 +152,6 @@ def _read(
     target: Sequence[float] | None,
     like: np.ndarray | None,
 ) -> Recorded:
-    columns = _table(file)
     if len(columns[0].values) < 2:
         raise InputError(f"{file} has fewer than two lines of numbers: a motion needs at least two")
     assumptions: list[str] = []
