@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Iterable
-from numbers import Real
+from numbers import Integral, Real
+from typing import SupportsInt, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -26,11 +27,24 @@ def is_finite(values: np.ndarray) -> bool:
     return all(map(math.isfinite, values.tolist()))
 
 
-def is_whole(value: object, least: int) -> bool:
+def is_whole(value: object, least: float) -> bool:
     """Return True for a whole number of at least `least`; False for bools, NaN, infinity and what is no real number."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return False
+    if isinstance(value, Integral):
+        return int(value) >= least
     return float(value).is_integer() and float(value) >= least
+
+
+def as_whole(value: object, what: str) -> int:
+    """Return a whole number of Python or NumPy as an int; `what` is its name for the message.
+
+    Raises:
+        InputError: If it is not a whole number, such as 1.5, "3" and True.
+    """
+    if not is_whole(value, -math.inf):
+        raise InputError(f"{what} must be a whole number, not {brief(value)}")
+    return int(cast(SupportsInt, value))
 
 
 _EXACT = 2**53  # a double represents smaller whole numbers exactly

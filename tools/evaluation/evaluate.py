@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
@@ -91,10 +92,7 @@ def evaluate_policies(
     Raises:
         InputError: If a number is out of range.
     """
-    if episodes < 1:
-        raise InputError(f"an evaluation needs at least one episode, not {episodes}")
-    check_seed(seed)
-    processes = check_processes(processes)
+    episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
     names = list(policies)
@@ -230,8 +228,7 @@ def evaluate(
             the run.
     """
     _check_saved(save, signal)
-    check_seed(seed)
-    check_processes(processes)
+    episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
     subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
     config, folder = subject.config, subject.folder
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
@@ -293,6 +290,14 @@ def evaluate(
     if describe_differences is not None and config is not None:
         result["differences"] = list(describe_differences(replace(config, environment=where)))
     return Evaluation(result, rows_of)
+
+
+def _check_episodes(episodes: object) -> int:
+    """Return a number of episodes as an int; raise an InputError if it is no whole number, or less than 1."""
+    number = as_whole(episodes, "the number of episodes")
+    if number < 1:
+        raise InputError(f"an evaluation needs at least one episode, not {number}")
+    return number
 
 
 def _check_saved(save: Path | None, signal: str) -> None:

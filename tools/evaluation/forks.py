@@ -16,6 +16,7 @@ from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 
 Result = TypeVar("Result")
@@ -28,13 +29,14 @@ def num_cores() -> int:
 
 
 def check_processes(processes: int | None) -> int:
-    """Return `processes` unchanged, or the number of cores for None.
+    """Return `processes` as an int, or the number of cores for None.
 
     Raises:
-        InputError: If `processes` is less than 1.
+        InputError: If `processes` is no whole number, or less than 1.
     """
     if processes is None:
         return num_cores()
+    processes = as_whole(processes, "the number of processes")
     if processes < 1:
         raise InputError(f"an evaluation needs at least one process, not {processes}")
     return processes

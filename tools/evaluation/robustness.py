@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import MM
@@ -22,7 +23,7 @@ from guiderail.tools.evaluation.evaluate import evaluate_once
 from guiderail.tools.evaluation.evaluation import POLICY
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.subject import (
     Subject,
     default_baselines,
@@ -280,9 +281,10 @@ def robustness(
     Raises:
         InputError: If there is no trained run, runs are of different tasks, or an argument is invalid.
     """
+    episodes, seed = as_whole(episodes, "the number of episodes"), check_seed(seed)
     if episodes < 1:
         raise InputError(f"robustness needs at least one episode at each point, not {episodes}")
-    check_processes(processes)
+    processes = check_processes(processes)
     subjects = [find_subject(policy, task, environment, trust_policy=trust_policy) for policy in policies]
     compared = _actors(subjects, dict(environment or {}), log)
     first, folder = compared[0].config, subjects[0].folder if subjects[0].is_stored else None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 
 if TYPE_CHECKING:
@@ -81,10 +82,12 @@ class EnvCallback(Callback):
         self.base: Any = env.unwrapped
 
 
-def check_seed(seed: int) -> None:
-    """Raise an InputError if a seed is negative or does not fit into 31 bits."""
-    if not 0 <= seed < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
+def check_seed(seed: object) -> int:
+    """Return a seed as an int; raise an InputError if it is no whole number, negative or does not fit into 31 bits."""
+    number = as_whole(seed, "a seed")
+    if not 0 <= number < 2**31:
+        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {number}")
+    return number
 
 
 def has_image(space: Any) -> bool:

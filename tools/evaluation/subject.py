@@ -231,7 +231,7 @@ class EpisodeSpec:
         )
 
     def __post_init__(self) -> None:
-        check_seed(self.seed)
+        object.__setattr__(self, "seed", check_seed(self.seed))
 
     @property
     def heading(self) -> str:

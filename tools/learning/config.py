@@ -16,6 +16,7 @@ from pydantic.dataclasses import dataclass
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.rollout import check_seed
@@ -361,12 +362,14 @@ def check_choices(
     check_seed(0 if seed is None else seed)
 
 
-def check_episodes(episodes: int) -> None:
-    """Raise an InputError if a run has no episode, or too many."""
+def check_episodes(episodes: object) -> int:
+    """Return a number of episodes as an int; raise an InputError if it is no whole number, or a run has too many."""
+    episodes = as_whole(episodes, "the number of episodes")
     if episodes < 1:
         raise InputError(f"a run needs at least one episode, not {episodes}")
     if episodes > MAX_EPISODES:
         raise InputError(f"a run has at most {MAX_EPISODES} episodes, not {episodes}")
+    return episodes
 
 
 def config_values(config: LearnerConfig) -> dict[str, Any]:

@@ -6,13 +6,16 @@ import logging
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from inspect import signature
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
@@ -130,13 +133,29 @@ def train(
     Raises:
         InputError: If a name is unknown, a value is out of range, or the folder holds another run.
     """
-    name, imports = task_named(task)
+    if not isinstance(task, str | PathLike):
+        raise InputError(
+            f"training needs the name of a task or its folder, not {brief(task)}: register an environment of your own "
+            "with gymnasium.register as guiderail/NAME-v0, and give NAME"
+        )
+    name, imports = task_named(str(task))
     environment = options if guidance is None else {"guidance": guidance, **options}
+    _refuse_misspelled(name, environment, options)
     return start_or_resume(
         name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
         episodes=episodes, seed=seed, log=log, resume=resume, imports=imports, sb3_callbacks=callbacks,
         pictures=pictures,
     )  # fmt: skip
+
+
+def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+    """Raise an InputError for an option that the environment does not have, and whose name is nearly an argument's."""
+    for name in options:
+        if near := get_close_matches(name.lower(), signature(train).parameters.keys() - {"task", "options"}, 1, 0.8):
+            try:
+                check_environment(task, environment)
+            except InputError:
+                raise InputError(f"train has no argument {name!r}: did you mean {near[0]}?") from None
 
 
 def start_or_resume(
@@ -174,6 +193,8 @@ def start_or_resume(
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
     folder = RunFolder(out)
+    episodes = None if episodes is None else check_episodes(episodes)
+    seed = None if seed is None else check_seed(seed)
     imports, formats = import_modules(imports), check_log_formats(log)
     choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
     choices["human_in_the_loop"] = None if make_supervisor is None else True
@@ -222,8 +243,7 @@ def configure(
     Raises:
         InputError: If a name is unknown or a value is out of range.
     """
-    check_episodes(episodes)
-    check_seed(seed)
+    episodes, seed = check_episodes(episodes), check_seed(seed)
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(
@@ -290,8 +310,8 @@ def resumed_config(
         raise InputError(
             f"the run in {folder.path} has other learner settings: leave --set out, or train again in another folder"
         )
-    check_episodes(given.get("episodes", config.episodes))
-    return replace(config, episodes=given.get("episodes", config.episodes), versions=_merged_versions(folder, config))
+    episodes = check_episodes(given.get("episodes", config.episodes))
+    return replace(config, episodes=episodes, versions=_merged_versions(folder, config))
 
 
 def _count_episodes(folder: RunFolder) -> int:

@@ -27,7 +27,16 @@ def test_objects_that_are_numbers_are_converted_to_doubles():
 
 @pytest.mark.parametrize(
     ("value", "is_accepted"),
-    [(1, True), (2.0, True), (np.int64(3), True), (0, False), (True, False), (1.5, False), (np.nan, False)]
+    [
+        (1, True),
+        (2.0, True),
+        (np.int64(3), True),
+        (10**400, True),
+        (0, False),
+        (True, False),
+        (1.5, False),
+        (np.nan, False),
+    ]
     + [(np.inf, False), ("1", False), (None, False)],
 )
 def test_whole_number_is_no_bool(value, is_accepted):

@@ -1,3 +1,4 @@
+import json
 from functools import partial
 
 import numpy as np
@@ -32,6 +33,23 @@ def test_episode_conditions_depend_on_its_seed_alone():
 def test_evaluate_policy_refuses_numbers_out_of_range(wrong):
     with pytest.raises(InputError):
         evaluate_policy(make_environment("Bead", {}), lambda observation: np.zeros(2), **wrong)
+
+
+@pytest.mark.parametrize("wrong", [1.5, "3", True, np.nan, None])
+@pytest.mark.parametrize("name", ["episodes", "seed", "processes"])
+def test_evaluate_refuses_numbers_that_are_not_whole(name, wrong):
+    if (name, wrong) == ("processes", None):
+        return
+    with pytest.raises(InputError, match=f"must be a whole number, not {wrong!r}"):
+        evaluate(lambda observation: np.zeros(2), "Bead", **{"episodes": 1, name: wrong})
+
+
+def test_evaluate_takes_whole_numbers_of_numpy():
+    own, other = (
+        evaluate(lambda observation: np.zeros(2), "Bead", number(2), seed=number(5), processes=number(1), baselines=())
+        for number in (int, np.int64)
+    )
+    assert json.dumps(other.statistics) == json.dumps(own.statistics)
 
 
 def test_load_or_compute_computes_once(tmp_path):

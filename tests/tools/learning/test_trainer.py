@@ -20,7 +20,7 @@ from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, resumed_config, start_or_resume, with_defaults
+from guiderail.tools.learning.train import configure, resumed_config, start_or_resume, train, with_defaults
 from guiderail.tools.learning.trainer import run_training
 
 # Trains the run of the fixture and prints the number of each finished episode; the parent kills it then.
@@ -472,3 +472,48 @@ def test_run_folder_refuses_an_impossible_path(tmp_path):
         folder.refuse_existing()
     with pytest.raises(InputError, match="cannot be read"):
         folder.config()
+
+
+@pytest.fixture
+def trained_config(monkeypatch, tmp_path):
+    """Return a function that returns the configuration which `train` passes on; nothing is trained."""
+    passed = []
+    monkeypatch.setattr(
+        "guiderail.tools.learning.trainer.run_training", lambda folder, config, **_: passed.append(config)
+    )
+
+    def configuration(task="Bead", **arguments):
+        train(task, out=tmp_path / "run", pictures=False, **arguments)
+        assert not list(tmp_path.iterdir())
+        return passed.pop()
+
+    return configuration
+
+
+def test_train_takes_whole_numbers_of_numpy(trained_config):
+    config = trained_config(episodes=np.int64(2), seed=np.uint8(3))
+    assert (type(config.episodes), type(config.seed)) == (int, int)
+    assert config == trained_config(episodes=2, seed=3)
+
+
+@pytest.mark.parametrize("wrong", [1.5, "3", True])
+@pytest.mark.parametrize("name", ["episodes", "seed"])
+def test_train_refuses_numbers_that_are_not_whole(name, wrong, trained_config):
+    with pytest.raises(InputError, match=f"must be a whole number, not {wrong!r}"):
+        trained_config(**{name: wrong})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"episode": 3}, "no argument 'episode': did you mean episodes"),
+        ({"preSets": "a"}, "did you mean preset"),
+        ({"wal": 2.0}, "did you mean wall"),
+        ({"episode": 3, "task": "NarrowPassage"}, "no argument 'episode': did you mean episodes"),
+        ({"task": gymnasium.Env()}, r"name of a task or its folder, not <gymnasium.* gymnasium.register"),
+        ({"task": None}, "name of a task or its folder, not None"),
+    ],
+)
+def test_train_names_the_argument_that_was_meant(options, message, trained_config):
+    with pytest.raises(InputError, match=message):
+        trained_config(**options)
