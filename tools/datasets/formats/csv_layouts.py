@@ -112,8 +112,8 @@ def read_csv_files(
                 "and may hold the same motions: name one file, or move it to another folder"
             )
         if is_written:
-            given = {"unit": unit, "time-unit": time_unit, "quaternion": quaternion, "angles": angles}
-            part = _read_written(file, [name for name, value in given.items() if value is not None], target, like)
+            options = {"unit": unit, "time-unit": time_unit, "quaternion": quaternion, "angles": angles}
+            part = _read_written(file, [name for name, value in options.items() if value is not None], target, like)
         else:
             part = _read(file, columns, unit, time_unit, quaternion, angles, target, like)
         if recorded.names and part.names != recorded.names:
