@@ -23,6 +23,7 @@ from guiderail.tools.evaluation.evaluation import (
     LABELS,
     POLICY,
     POLICY_FOLDER,
+    REPORTS_SUCCESS,
     Evaluation,
     compare,
     episodes_file,
@@ -33,8 +34,10 @@ from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.rollout import (
     HELD_OUT_SEED,
+    Callback,
     EpisodeProgress,
     PolicyFn,
+    Transition,
     check_seed,
     has_image,
     is_compatible,
@@ -44,6 +47,7 @@ from guiderail.tools.evaluation.subject import (
     Subject,
     counts_collisions,
     evaluation_scope,
+    find_environment,
     find_subject,
     make_baselines,
 )
@@ -56,6 +60,22 @@ SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
 # Function from an environment and an episode's row to the data that is kept of the episode.
 Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
+
+
+class _SuccessReport(Callback):
+    """Callback that adds to an episode's row whether the environment reports success."""
+
+    def on_episode_start(self) -> None:
+        """Begin an episode without a report."""
+        self._is_reported = False
+
+    def on_step(self, transition: Transition) -> None:
+        """Look for a success in `info`, true or not."""
+        self._is_reported |= not {"is_success", "success"}.isdisjoint(transition.info)
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the column."""
+        return {REPORTS_SUCCESS: int(self._is_reported)}
 
 
 def evaluate_policies(
@@ -96,12 +116,13 @@ def evaluate_policies(
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
     names = list(policies)
+    callbacks = () if hasattr(env.unwrapped, "trace") else (_SuccessReport(),)
 
     def run(number: int) -> tuple[dict[str, Any], Any]:
         act, index = policies[names[number // episodes]], number % episodes
         if (start := getattr(act, "start_episode", None)) is not None:
             start(index)
-        row = rollout(env, act, index=index, seed=seed + index, held_out=True, options=options)
+        row = rollout(env, act, *callbacks, index=index, seed=seed + index, held_out=True, options=options)
         return row, None if collect is None else collect(env, row)
 
     results = forked_map(run, len(names) * episodes, processes)
@@ -196,9 +217,10 @@ def evaluate(
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
             baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
             a model of Stable-Baselines3.
-        env: Name of the task, or an environment, that a policy without a run is evaluated in. An environment that is
-            not of this package is reset with the seed of the episode and reports success as `info["is_success"]` or
-            `info["success"]`.
+        env: Name of the task, an environment, or the id of one that is registered with Gymnasium, that a policy
+            without a run is evaluated in. An environment that is not of this package is reset with the seed of the
+            episode and reports success as `info["is_success"]` or `info["success"]`. If it reports none, the statistics
+            of success are None.
         episodes: Number of held-out episodes.
         baselines: Baseline policies: their names, or functions that make them for an environment, by name; None for the
             default set of the task. The demonstration alone is always evaluated if the guidance has one.
@@ -229,6 +251,7 @@ def evaluate(
     """
     _check_saved(save, signal)
     episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
+    given, env = env, find_environment(env)
     subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
     config, folder = subject.config, subject.folder
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
@@ -252,8 +275,8 @@ def evaluate(
     others = {"demonstration": zero_policy} if is_demonstrated(where.get("guidance")) else {}
     others |= make_baselines(config, where, baselines)
     opened: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
-    if config is not None:
-        opened = closing(make_environment(config.task, where))
+    if config is not None or env is not given:
+        opened = closing(cast(gymnasium.Env, env) if config is None else make_environment(config.task, where))
     with opened as evaluation_env:
         if config is not None:
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
@@ -289,7 +312,7 @@ def evaluate(
         result["saved"] = _save_demonstrations(motions, save)
     if describe_differences is not None and config is not None:
         result["differences"] = list(describe_differences(replace(config, environment=where)))
-    return Evaluation(result, rows_of)
+    return Evaluation(result, rows_of, is_held_out=config is not None)
 
 
 def _check_episodes(episodes: object) -> int:

@@ -21,6 +21,9 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.tables import read_table, table_text
 
+REPORTS_SUCCESS = (
+    "reports_success"  # column of an environment of another origin: 1 if `info` had a success, true or not
+)
 POLICY = "policy"  # name of the run's own policy
 POLICY_FOLDER = "held_out"  # folder of the policy's episodes, in the run
 BASELINES_FOLDER = "baselines"  # folder of the baseline policies' episodes, in the run
@@ -107,10 +110,12 @@ class Evaluation(Mapping[str, Any]):
     Attributes:
         statistics: Statistics, as `guiderail evaluate --json` prints them.
         rows: Episodes by name of the policy, one row each; the first policy is the evaluated one.
+        is_held_out: False for an environment that was given as an object, which has no held-out conditions.
     """
 
     statistics: Mapping[str, Any]
     rows: Mapping[str, pd.DataFrame]
+    is_held_out: bool = True
 
     def __getitem__(self, name: str) -> Any:
         return self.statistics[name]
@@ -139,11 +144,15 @@ class Evaluation(Mapping[str, Any]):
     @property
     def sentence(self) -> str:
         """Result in one sentence."""
-        rows, low, high = self.rows[POLICY], *(self.statistics[f"success_{end}"] for end in ("low", "high"))
-        text = (
-            f"The policy succeeds in {int(rows['success'].sum())} of {len(rows)} held-out episodes "
-            f"(95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
-        )
+        rows = self.rows[POLICY]
+        episodes = f"{len(rows)} held-out episodes" if self.is_held_out else f"{len(rows)} episodes"
+        if reports_success(rows):
+            low, high = (100 * self.statistics[f"success_{end}"] for end in ("low", "high"))
+            text = f"The policy succeeds in {int(rows['success'].sum())} of {episodes} "
+            text += f"(95 % interval {low:.0f} to {high:.0f} %)"
+        else:
+            text = f"The environment reports no success; the policy's mean return of {episodes} is "
+            text += f"{self.statistics['mean_return']:.4g}"
         if self.comparison is not None:
             baseline, successes, p = self.comparison
             verdict = "better than" if p < SIGNIFICANT else "not shown to be better than"
@@ -170,15 +179,22 @@ class Evaluation(Mapping[str, Any]):
         return LABELS.get(policy, policy.replace("_", " "))
 
 
+def reports_success(rows: pd.DataFrame) -> bool:
+    """Return False for episodes of an environment whose `info` has neither `is_success` nor `success`."""
+    return REPORTS_SUCCESS not in rows or bool((rows[REPORTS_SUCCESS] > 0).any())
+
+
 def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of the policy named `POLICY` with that of baseline policies under the same conditions.
 
     The test is McNemar's, exact and one-sided. It uses only the episodes in which exactly one of the two policies
     succeeds: a policy that is not better succeeds in at most half of these on average. The result has the largest
     p-value of all baseline policies, so that "better than the best baseline" means better than each of them
-    (intersection-union test). No correction for the number of baseline policies is needed. Without a baseline policy
-    the result is None.
+    (intersection-union test). No correction for the number of baseline policies is needed. Without a baseline policy,
+    and in an environment that reports no success, the result is None.
     """
+    if not reports_success(rows[POLICY]):
+        return None
     won = rows[POLICY]["success"].to_numpy(float)
     others = {name: table["success"].to_numpy(float) for name, table in rows.items() if name != POLICY}
     if not others:
@@ -194,9 +210,14 @@ def _mcnemar(won: Any, other: Any) -> float:
 
 
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
-    """Return the statistics `COMPARED` of episodes; a statistic is None without rows or without its column."""
+    """Return the statistics `COMPARED` of episodes; a statistic is None without rows or without its column.
+
+    Those of success are also None if the environment reports no success.
+    """
     result: dict[str, Any] = dict.fromkeys(prefix + name for name in COMPARED)
     for name in COMPARED if len(rows) else ():
+        if name.startswith("success") and not reports_success(rows):
+            continue
         with suppress(KeyError):
             result[prefix + name] = STATISTICS[name].compute(rows)
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 import gymnasium
 
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
@@ -100,6 +101,41 @@ class Subject:
         if self.folder is not None:
             refuse_guidance_change(self.config.environment, changed)
         return changed
+
+
+def find_environment(env: Any) -> Any:
+    """Return an environment or the name of a task unchanged; make the environment of an id of another package.
+
+    Args:
+        env: Environment, name or folder of a task, id of an environment registered with Gymnasium, or None.
+
+    Raises:
+        InputError: If it is none of these, or an environment cannot be made.
+    """
+    if env is None or isinstance(env, gymnasium.Env | os.PathLike):
+        return env
+    if isinstance(env, gymnasium.vector.VectorEnv):
+        raise InputError(f"a policy is evaluated in a single environment, and {brief(env)} is a vector environment")
+    if isinstance(env, type) and issubclass(env, gymnasium.Env):
+        raise InputError(f"{env.__name__} is a class: give an environment, such as {env.__name__}()")
+    if not isinstance(env, str):
+        raise InputError(
+            f"an evaluation needs a policy and then the name of a task, the id of an environment registered with "
+            f"Gymnasium, or an environment, not {brief(env)}"
+        )
+    if env in known_tasks() or not re.fullmatch(r"([\w.:-]+/)?[\w.:-]+-v\d+", env):
+        return env
+    spec = gymnasium.registry.get(env)
+    if spec is None:
+        raise InputError(
+            f"no environment {brief(env)} is registered with Gymnasium: check the id, or import its package"
+        )
+    if spec.namespace == "guiderail":
+        return spec.name
+    try:
+        return gymnasium.make(spec)
+    except Exception as error:  # the constructor of another package can raise any exception
+        raise InputError(f"the environment {env} cannot be made: {brief(str(error))}") from error
 
 
 def find_subject(

@@ -251,6 +251,63 @@ def test_environment_of_another_origin_is_evaluated():
         evaluate("zero", Pointer(), 2, environment={"station": "arm"})
 
 
+class Still(gymnasium.Wrapper):
+    """Environment that reports no success."""
+
+    def step(self, action):
+        return *self.env.step(action)[:4], {}
+
+
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_environment_without_success_has_no_success_rate(episodes):
+    result = evaluate(lambda point: -3.0 * point, Still(Pointer()), episodes)
+    mean = result["mean_return"]
+    assert result.sentence == (
+        f"The environment reports no success; the policy's mean return of {episodes} episodes is {mean:.4g}."
+    )
+    assert {result[name] for name in ("success_rate", "success_low", "success_high", "zero_success_rate")} == {None}
+    assert result.comparison is None
+    assert "success_rate" not in result.table
+
+
+def test_sentence_has_no_held_out_episodes_for_an_environment():
+    result = evaluate(lambda point: -3.0 * point, Pointer(), 4)
+    assert "succeeds in 4 of 4 episodes (95 % interval" in result.sentence
+    assert "succeeds in 0 of 4 episodes" in evaluate(lambda point: 3.0 * point, Pointer(), 4).sentence
+
+
+def test_registered_environment_is_evaluated_by_its_id():
+    result = evaluate(lambda observation: 0, "CartPole-v1", 2)
+    assert dict(result) == dict(evaluate(lambda observation: 0, gymnasium.make("CartPole-v1"), 2))
+    own, named = (evaluate("zero", name, 1, baselines=()) for name in ("guiderail/NarrowPassage-v0", "NarrowPassage"))
+    assert dict(own) == dict(named)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("zero", gymnasium.vector.SyncVectorEnv([Pointer] * 2)), "single environment, and .* is a vector environment"),
+        (("zero", Pointer), r"Pointer is a class: give an environment, such as Pointer\(\)"),
+        ((Pointer(), lambda point: point), "needs a policy and then the name of a task, .*, not <function"),
+        (("NarrowPassage", lambda point: point), "needs a policy and then the name of a task"),
+        (("zero", "CartPole-v99"), "no environment 'CartPole-v99' is registered with Gymnasium: check the id"),
+        (("zero", "NarowPassage"), "did you mean NarrowPassage"),
+    ],
+)
+def test_evaluation_in_something_else_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        evaluate(*arguments, episodes=1)
+
+
+def test_environment_that_cannot_be_made_is_refused():
+    gymnasium.register("Broken-v0", entry_point="package_that_does_not_exist:Broken")
+    try:
+        with pytest.raises(InputError, match=r"environment Broken-v0 cannot be made: .*package_that_does_not_exist"):
+            evaluate("zero", "Broken-v0", 1)
+    finally:
+        gymnasium.registry.pop("Broken-v0")
+
+
 def test_pretrained_name_that_does_not_exist_is_refused():
     with pytest.raises(InputError, match="there is no pretrained policy 'toaster'"):
         find_run("pretrained:toaster")
