@@ -11,6 +11,7 @@ import json
 import sys
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib import import_module
 from itertools import islice, product
 from pathlib import Path
@@ -301,9 +302,15 @@ def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping
         for name, value in (learned_in or {}).items()
         if name in options and options[name] != value
     ][:_MAX_DIFFERENCES]
-    hint = f"; it learned with {', '.join(changed)}: change --env" if changed else ": change --env"
-    if not changed and task and (fitting := fitting_options(task, options, policy)):
+    expected = env.action_space.shape
+    if changed:
+        hint = f"; it learned with {', '.join(changed)}: change --env"
+    elif task and (fitting := fitting_options(task, options, policy)):
         hint = f"; it fits with {' or '.join(f'--env {one}' for one in fitting)}"
+    elif observation_shape == env.observation_space.shape and action_shape not in (None, expected):
+        hint = f": it must return {f'an array of shape {expected}' if expected else 'one number'}"
+    else:
+        hint = f", and no options of {task} fit it: give another policy" if task else ": give another policy"
     return (
         f"the policy {takes}{returns}, and this environment has observations {env.observation_space.shape} and actions "
         f"{env.action_space.shape}{hint}"
@@ -311,7 +318,11 @@ def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping
 
 
 def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
-    """Return the shapes of a policy's observation and action; None if a shape is unknown."""
+    """Return the shapes of a policy's observation and action; None if a shape is unknown.
+
+    If a policy states no shape and cannot take the environment's observations, flat observations of other sizes are
+    tried, up to `_MAX_SIZE`: a network takes exactly one size.
+    """
     if isinstance(policy, Policy):
         return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
     given, action_shape = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
@@ -320,8 +331,22 @@ def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None
         try:
             action_shape = np.shape(policy(np.zeros(observation_shape, np.float32)))
         except (IndexError, ValueError):
-            return given, None
+            return (given, None) if given is not None else _only_shapes(policy)
     return observation_shape, action_shape
+
+
+_MAX_SIZE = 256  # largest size of a flat observation that is tried
+
+
+def _only_shapes(policy: PolicyFn) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
+    """Return the only flat shape that a policy takes and the shape of its action; None without one or with several."""
+    found = []
+    for size in range(1, _MAX_SIZE + 1):
+        with suppress(Exception):  # code of others can raise any exception
+            found.append(((size,), np.shape(policy(np.zeros(size, np.float32)))))
+        if len(found) > 1:
+            break
+    return found[0] if len(found) == 1 else (None, None)
 
 
 def _task_options(env: gymnasium.Env) -> tuple[str, dict[str, Any]]:

@@ -216,6 +216,32 @@ def test_spaces_that_differ_are_named_with_options_that_fit():
     assert "it fits with --env difficulty=hard or --env observation=center_of_pressure" in str(error.value)
 
 
+def test_mismatch_names_the_only_size_that_a_network_takes(env, tmp_path):
+    torch.jit.script(torch.nn.Linear(5, 2)).save(tmp_path / "policy.pt")
+    message = r"takes observations \({}\) and returns actions \({}\), .* observations \(3,\) and actions \(2,\)"
+    with pytest.raises(InputError, match=message.format("5,", "2,") + ": give another policy"):
+        check_compatible(load_policy(tmp_path / "policy.pt", trust_policy=True), env)
+    with pytest.raises(InputError, match=message.format("7,", "4,")):
+        check_compatible(lambda observation: np.ones((4, 7)) @ observation, env)
+    with pytest.raises(InputError, match=r"cannot take these observations, .* observations \(3,\)") as error:
+        check_compatible(lambda observation: observation[40:42] + observation[40], env)
+    assert "--env" not in str(error.value)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (1, 2)])
+def test_mismatch_of_the_action_names_the_shape_to_return(shape, env):
+    with pytest.raises(InputError, match=r"takes observations \(3,\) .*: it must return an array of shape \(2,\)$"):
+        check_compatible(lambda observation: np.zeros(shape), env)
+
+
+def test_mismatch_with_every_option_does_not_name_options():
+    env = make_environment("NarrowPassage", {})
+    with pytest.raises(InputError, match=r"returns actions \(1, 2\), .*: it must return an array of shape \(2,\)$"):
+        check_compatible(lambda observation: np.zeros((1, 2)), env)
+    with pytest.raises(InputError, match=r"takes observations \(77,\) .* no options of NarrowPassage fit it"):
+        check_compatible(lambda observation: np.ones((2, 77)) @ observation, env)
+
+
 class Pointer(gymnasium.Env):
     """Environment of another origin: the action moves a point to the origin."""
 
