@@ -266,10 +266,11 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Narrow passage, hard",
             [
-                Row("KGRL, 10 demonstration episodes", "narrow_passage_hard", "kgrl"),
-                Row("sKGRL, 10 demonstration episodes", "narrow_passage_hard", "skgrl"),
-                Row("residual RL", "narrow_passage_hard", "residual"),
-                Row("safe residual RL", "narrow_passage_hard", "safe_residual"),
+                Row("KGRL, 10 demonstration episodes", "peers_narrow_passage_hard", "kgrl"),
+                Row("sKGRL, 10 demonstration episodes", "peers_narrow_passage_hard", "skgrl"),
+                Row("residual RL", "peers_narrow_passage_hard", "residual"),
+                Row("safe residual RL", "peers_narrow_passage_hard", "safe_residual"),
+                Row("residual RL, covariance without constraints", "peers_narrow_passage_hard", "residual_covariance"),
                 *_baselines("narrow_passage_hard_baselines", [f"skgrl_{name}" for name in _ALL]),
             ],
             guided=("sKGRL, 10 demonstration episodes", "KGRL, 10 demonstration episodes"),
