@@ -150,7 +150,7 @@ def _import_or_refuse(name: str, load: Callable[[], Any]) -> Any:
         return load()
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
         words = " ".join(str(error).split())

@@ -118,3 +118,9 @@ def test_trust_ends_with_the_command(bead_run, canary, capsys, tmp_path):
     assert executed.exists()
     with pytest.raises(InputError, match="--trust-imports"):
         import_stored(["another_module"], file)
+
+
+def test_file_that_ends_the_program_is_an_error(tmp_path):
+    (tmp_path / "ends.py").write_text("import sys\nsys.exit(0)\n")
+    with pytest.raises(InputError, match=r"importing ends.py failed: ends.py, line 2: SystemExit: 0"):
+        import_modules([str(tmp_path / "ends.py")])

@@ -163,8 +163,6 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
     outputs = np.stack(common.outputs)
     spread = outputs.std(axis=0) if len(outputs) > 1 else np.zeros(outputs.shape[1:])
     durations = [float(t[-1] - t[0]) for t in demonstrations.times]
-    if draw is not None:
-        draw_demonstrations(common, draw)
     summary = {
         "file": str(file),
         "demonstrations": demonstrations.num_demonstrations,
@@ -177,8 +175,11 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         "tightest": spread.min(axis=0).round(6).tolist(),
         "widest": spread.max(axis=0).round(6).tolist(),
     }
-    summary |= {} if draw is None else {"picture": str(draw)}
-    summary |= fit_primitive(demonstrations) if fit else _default_deviation(common)
+    fitted = fit_primitive(demonstrations) if fit else _default_deviation(common)
+    if draw is not None:
+        draw_demonstrations(common, draw)
+        summary["picture"] = str(draw)
+    summary |= fitted
     remarks = [*_other_units(outputs), *([summary["remark"]] if "remark" in summary else [])]
     return summary | ({"remark": "; ".join(remarks)} if remarks else {})
 

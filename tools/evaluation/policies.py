@@ -10,6 +10,7 @@ import inspect
 import json
 import sys
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from importlib import import_module
@@ -213,7 +214,7 @@ def _load_sb3(path: Path) -> PolicyFn:
     try:
         with zipfile.ZipFile(path) as archive:
             module = json.loads(archive.read("data"))["policy_class"]["__module__"]
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no model of Stable-Baselines3: give a file that model.save wrote") from error
     if module not in _SB3_ALGORITHMS:
         raise InputError(
@@ -244,7 +245,10 @@ def _load_torchscript(path: Path) -> PolicyFn:
 
     def act(observation: np.ndarray) -> np.ndarray:
         with torch.inference_mode():
-            return module(torch.as_tensor(observation, dtype=torch.float32)[None]).numpy()
+            action = module(torch.as_tensor(observation, dtype=torch.float32)[None])
+        if not isinstance(action, torch.Tensor):
+            raise InputError(f"{path} returns {brief(action)} instead of a tensor of actions")
+        return action.numpy()
 
     return ForeignPolicy(act, errors=(RuntimeError,))
 

@@ -85,7 +85,10 @@ def load_scenario(path: Path) -> Scenario:
         raise InputError(
             f"{path}: {scenario.robot}'s driver is on the bus {driver.lcm_bus!r}, which lcm_buses does not define"
         )
-    url = urlsplit(scenario.robot_url)
+    try:
+        url = urlsplit(scenario.robot_url)
+    except ValueError:
+        raise InputError(f"{path}: {brief(scenario.robot_url)} is no address: give udpm://ADDRESS:PORT") from None
     if url.scheme not in ("", "udpm", "memq") or parse_qs(url.query).get("ttl", ["0"])[-1] not in ("0", "1"):
         raise InputError(
             f"{path}: messages to {brief(scenario.robot_url)} leave the local network: give a udpm:// address with a "

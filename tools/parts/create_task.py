@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from guiderail.diagrams.tasks.options import COLLISION_FORCE
+from guiderail.diagrams.tasks.options import COLLISION_FORCE, FORCE_LIMITS
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
@@ -45,11 +45,10 @@ AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+
 DENSITY = 2700.0  # assumed density of the parts, that of aluminum [kg/m³]; a gantry has no gravity
 CLEAR = 3.0 * MM  # height of the start above the rim
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
-MAX_TURN = 360.0  # largest rotation at the bottom, either way [degrees]
+MAX_TURN = 180.0  # largest rotation at the bottom, either way [degrees]
 MAX_PITCH = 0.1  # largest advance per turn, either way [m]
 MAX_SEARCH_TURN = 10.0  # largest unknown turn of the socket [degrees]
 COMMANDED_TURN = 1.5  # bound of the commanded turn, as a multiple of the unknown turn of the socket
-MAX_FORCE = 1e4  # largest force limit [N]
 MAX_SEATED_TURN = 20.0  # largest turn of a seated plug if the insertion has no turn [degrees]
 MAX_EPISODES = 100  # largest number of episodes of a calibration
 MAX_CENTER = 1.0  # largest distance of the insertion axis from the plug's center of mass [m]
@@ -258,8 +257,8 @@ def _check_arguments(
         )
     if not 0.0 <= search_turn <= MAX_SEARCH_TURN:
         raise InputError(f"--search-turn is from 0 to {MAX_SEARCH_TURN:g} degrees, not {search_turn:g}")
-    if not 0.0 < force_limit <= MAX_FORCE:
-        raise InputError(f"--force-limit is positive and at most {MAX_FORCE:g} N, not {force_limit:g}")
+    if not FORCE_LIMITS[0] <= force_limit <= FORCE_LIMITS[1]:
+        raise InputError("--force-limit is from {:g} to {:g} N, not {:g}".format(*FORCE_LIMITS, force_limit))
     if not 0.0 <= shrink <= MAX_SHRINK:
         raise InputError(f"--shrink is from 0 to {1e3 * MAX_SHRINK:g} mm, not {1e3 * shrink:g}")
     if not 0 <= hard_episodes <= MAX_EPISODES:

@@ -1,6 +1,7 @@
 """Policies of other origin: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
 
 import math
+import zipfile
 from pathlib import Path
 
 import gymnasium
@@ -76,6 +77,31 @@ def test_torchscript_acts_if_code_is_allowed(env, tmp_path):
         load_policy(file)
     act = load_policy(file, trust_policy=True)
     np.testing.assert_allclose(check_compatible(act, env)(OBSERVATION), [0.2, -0.4])
+
+
+class Pair(torch.nn.Module):
+    """Return two tensors."""
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return observation, observation
+
+
+def test_torchscript_that_returns_no_tensor_is_named(tmp_path):
+    file = tmp_path / "pair.pt"
+    torch.jit.trace(Pair(), torch.zeros(1, 3)).save(file)
+    with pytest.raises(InputError, match=r"pair\.pt returns .* instead of a tensor"):
+        load_policy(file, trust_policy=True)(OBSERVATION)
+
+
+def test_damaged_model_of_sb3_is_named(tmp_path):
+    file = tmp_path / "damaged.zip"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data", "x" * 5000)
+    content = bytearray(file.read_bytes())
+    content[40:50] = bytes(10)
+    file.write_bytes(content)
+    with pytest.raises(InputError, match="is no model of Stable-Baselines3"):
+        load_policy(file, trust_policy=True)
 
 
 @pytest.mark.parametrize("batch", [1, "batch", None])

@@ -62,6 +62,7 @@ def test_shipped_scenario_has_a_simulated_driver():
         ("station: !python/object:os.system x\n", "the tag"),
         (BUS.replace("ttl=0", "ttl=32") + DRIVER, "leave the local network"),
         (BUS.replace("udpm://239.255.76.67:7668?ttl=0", "tcpq://192.0.2.1:7700") + DRIVER, "leave the local network"),
+        (BUS.replace("udpm://239.255.76.67:7668?ttl=0", "udpm://[abc") + DRIVER, "is no address"),
         ("nonsense: 1\n", "nonsense"),
         (BUS.replace("'}}", "', channel_suffix: _LEFT}}") + DRIVER, "channel_suffix is '_LEFT'"),
         (BUS + OF_BUS % "lcm_status_period: 0.001", "lcm_status_period is 0.001"),
