@@ -43,8 +43,14 @@ def is_trusted() -> bool:
     return _TRUSTED.get()
 
 
-def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
+def import_modules(
+    modules: Iterable[str], otherwise: str = ": restore it, or give another --import"
+) -> tuple[str, ...]:
     """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
+
+    Args:
+        modules: Names of modules, or paths of files or task folders.
+        otherwise: End of the message about a missing module, file or folder.
 
     Returns:
         Names with which the modules can be imported again. Files and folders have absolute paths, so that a run can be
@@ -66,7 +72,7 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
         else:
             kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
             shown = module if module.isprintable() else brief(module)
-            raise InputError(f"there is no {kind} {shown} to import: restore it, or give another --import")
+            raise InputError(f"there is no {kind} {shown} to import{otherwise}")
     return tuple(names)
 
 
@@ -87,7 +93,9 @@ def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
             f"{source} imports {' and '.join([*names, *more])}, which would execute code: read it first, then give "
             "--trust-imports"
         )
-    return import_modules(modules)
+    is_run = source.name == "config.yaml" and not all(module.endswith(".py") for module in modules)
+    moved = ", or evaluate the policy in its new place with --task NEW_FOLDER and the run's --env options" * is_run
+    return import_modules(modules, f", which {source} names: restore it{moved}")
 
 
 def _executes(module: str) -> bool:

@@ -33,6 +33,14 @@ TASK = {
     "demonstrations": {"components": 1},
 }
 POLICY = {"observation_shape": [1], "action_low": [-1], "action_high": [1]}
+NAMES_TASK = """
+import sys
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.tools.cli.app import find_task
+from guiderail.tools.evaluation.subject import find_subject
+subject = find_subject(sys.argv[1], find_task(sys.argv[2])[0])
+print(subject.config.task, TASKS.get(subject.config.task).folder)
+"""
 SHIPPED = Path(guiderail.models.objects.bnc_connector.__file__).parent
 
 
@@ -103,6 +111,23 @@ def test_policy_of_a_run_acts_in_changed_files_of_a_named_task(folder, tmp_path)
     assert find_subject(begun.path, "parts/pin").folder is None
     begun.write_config(replace(begun.config(), task_content=""))  # as older versions wrote it
     assert find_subject(begun.path, None).folder is not None
+
+
+def test_moved_task_folder_is_named_with_its_remedy(folder, tmp_path, capsys, forks):
+    begun, moved = RunFolder(tmp_path / "run"), tmp_path / "moved pin"
+    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
+    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(begun.path)
+    folder.rename(moved)
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate", str(begun.path)])
+    message = capsys.readouterr().err
+    assert end.value.code == 2
+    assert f"there is no file or task folder {folder} to import, which {begun.path / 'config.yaml'} names" in message
+    assert "--task NEW_FOLDER" in message
+    assert "--import" not in message
+    # Another process, because in this one the task's name belongs to the old folder.
+    result = forks.run("-c", NAMES_TASK, begun.path, moved)
+    assert (result.returncode, result.stdout) == (0, f"parts/pin {moved}\n"), result.stderr
 
 
 def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
