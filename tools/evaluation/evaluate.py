@@ -274,6 +274,8 @@ def evaluate(
             )
     others = {"demonstration": zero_policy} if is_demonstrated(where.get("guidance")) else {}
     others |= make_baselines(config, where, baselines)
+    if POLICY in others:
+        raise InputError(f"a baseline policy cannot be called {POLICY!r}, which is the evaluated policy")
     opened: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
     if config is not None or env is not given:
         opened = closing(cast(gymnasium.Env, env) if config is None else make_environment(config.task, where))

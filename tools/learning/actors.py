@@ -85,6 +85,7 @@ class ParallelLearner(Learner):
         self._learned = self._assigned = 0  # numbers of episodes learned from and assigned
         self._simulated: dict[int, SimulatedEpisode] = {}
         self._snapshots = {0: _snapshot(learner)}  # by the number of episodes learned from
+        self._earlier_episodes = 0  # episodes of the run that `init_from` names
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the action (A,) of the learner for an observation."""
@@ -99,6 +100,7 @@ class ParallelLearner(Learner):
 
     def _learn(self, index: int) -> dict[str, Any]:
         if self._forks is None:
+            self._earlier_episodes = self._learner.episodes - index
             self._forks = Forks(self._simulate, min(self._num_envs, self._num_episodes - index))
         while index not in self._simulated:
             self._exchange(None)
@@ -140,7 +142,7 @@ class ParallelLearner(Learner):
         learner.random = np.random.default_rng(exploration)
         set_random_seed(int(process.generate_state(1)[0]))  # global generators, which Stable-Baselines3 uses
         load_weights(learner, snapshot.weights)
-        learner.episodes, learner.transitions = index, snapshot.transitions
+        learner.episodes, learner.transitions = self._earlier_episodes + index, snapshot.transitions
         learner.greedy_successes, learner.selection = snapshot.greedy_successes, None
         act: PolicyFn = learner.act
         if self._demonstrator is not None and index < self._demonstrator[1]:

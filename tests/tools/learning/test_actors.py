@@ -110,3 +110,16 @@ def test_actors_are_refused_when_they_cannot_be(parallel_config, tmp_path):
     with pytest.raises(InputError, match="callbacks need model and episodes"):
         run_training(folder, parallel_config(2), sb3_callbacks=[])
     assert not folder.path.exists()
+
+
+def test_actors_continue_the_count_of_episodes_of_the_first_run(parallel_config, bead_run, monkeypatch, tmp_path):
+    simulate = ParallelLearner._simulate
+
+    def say(self, assignment):
+        simulate(self, assignment)
+        raise InputError(f"the actor is in episode {self._learner.episodes}")
+
+    monkeypatch.setattr(ParallelLearner, "_simulate", say)
+    episodes = len(RunFolder(bead_run).episodes())
+    with pytest.raises(InputError, match=f"in episode {episodes + 1}$"):
+        run_training(RunFolder(tmp_path / "second"), parallel_config(1, init_from=str(bead_run)))
