@@ -39,7 +39,8 @@ def study(
 
     declared = declaration.load_study(file)
     import_stored(declared.imports, file)
-    chosen = declared.subset(None if methods is None else [name.strip() for name in methods.split(",")], cli.parse_integers(seeds, "--seeds"))
+    names = None if methods is None else [name.strip() for name in methods.split(",")]
+    chosen = declared.subset(names, cli.parse_integers(seeds, "--seeds"))
     running = make_engine(engine or "process", processes, address)
     result = study_command(chosen, out, running, declared.subset_name(chosen))
     print_result(result, as_json)
