@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
@@ -11,6 +12,7 @@ from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
+from guiderail.tools.evaluation.policies import ENDINGS
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn
 
 HOLD = 10  # number of times that `random_hold` applies each action
@@ -118,8 +120,17 @@ def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> Po
     if name == "scripted" and policies:
         return next(iter(policies.values()))
     if name not in policies:
-        raise InputError(f"{task} has no policy {name!r}: {did_you_mean(name, [*policies, *BASELINES])}")
+        hint = _file_hint(name) or did_you_mean(name, [*policies, *BASELINES])
+        raise InputError(f"{task} has no policy {name!r}: {hint}")
     return policies[name]
+
+
+def _file_hint(name: str) -> str:
+    """Return how to name the file of a policy that the user seems to mean; empty without such a file."""
+    if name.endswith(".py"):
+        return f"give the function in a file too, as {name}:FUNCTION"
+    file = next((name + ending for ending in ENDINGS if Path(name + ending).is_file()), None)
+    return "" if file is None else f"to evaluate the file {file}, give its whole name"
 
 
 def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:

@@ -201,7 +201,7 @@ def _function_of(source: str) -> tuple[str, str] | None:
 
 
 def _load_function(module: str, name: str) -> PolicyFn:
-    (imported,) = import_modules([module])
+    (imported,) = import_modules([module], f" for {module}:{name}: give MODULE:FUNCTION or FILE.py:FUNCTION")
     loaded = sys.modules.get(module_name(Path(imported)) if imported.endswith(".py") else imported)
     if not hasattr(loaded, name):
         names = [one for one in vars(loaded or object) if not one.startswith("_")]

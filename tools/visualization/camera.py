@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from guiderail.tools.evaluation.rollout import EnvCallback, Transition, rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_picture, check_video, write_atomically
 from guiderail.tools.visualization.style import new_figure, save_figure
+
+_LOGGER = logging.getLogger(__name__)
 
 ROWS, COLUMNS = 2, 3
 MAX_FRAMES = 24  # frames stored for a picture
@@ -119,8 +122,9 @@ def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]
     """Run an episode; return its row and at most `max_frames` camera frames."""
     env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
     env.reset(seed=episode.run_seed)
-    frames = Frames(env, max_frames)
-    row = rollout(env, episode.policy(env), frames, seed=episode.seed, held_out=True)
+    frames, policy = Frames(env, max_frames), episode.policy(env)
+    _LOGGER.info("simulating a held-out episode, then writing its camera frames")
+    row = rollout(env, policy, frames, seed=episode.seed, held_out=True)
     env.close()
     return row, frames
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html as markup
 import json
+import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -29,6 +30,8 @@ from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.visualization.style import is_demonstrated
+
+_LOGGER = logging.getLogger(__name__)
 
 POINTS = 400  # largest number of samples of an episode, about the width of a page in pixels
 DRAWN = "/drake/visualizer"  # path of Drake's visualizer in Meshcat's tree
@@ -205,6 +208,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         Side("before", "before: demonstration alone" if is_demonstration else "before: random actions", BLACK): before,
         Side("after", episode.acting, GREEN): episode.policy(env),
     }
+    _LOGGER.info("simulating held-out episodes (%d) before and after learning, then writing %s", episodes, html)
     motion = Motion(env)
     rows, recorded = [], []
     for side, act in sides.items():

@@ -7,6 +7,7 @@ import typer
 
 import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.app import to_json
 from guiderail.tools.cli.main import COMMANDS, load_commands, main
 from guiderail.tools.environments import as_value
@@ -77,6 +78,8 @@ def trained(bead_run):
             for words in (["--signal", "measured"], ["--processes", "2"], ["--trust-policy"])
         ),
         (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
+        (["evaluate", "mypol.py", "--task", "Bead"], "mypol.py:FUNCTION"),
+        (["evaluate", "nomod:zero", "--task", "Bead"], "to import for nomod:zero: give MODULE:FUNCTION or FILE.py"),
         (["evaluate", "Bead", "--policy", "scripted"], "Bead has no policy 'scripted'"),
         (["evaluate", "Bead"], "Bead is a task: name the policy that acts in it"),
         (["evaluate", "NarrowPassage", "--policy", "scripted"], "'scripted' does not fit the observations"),
@@ -430,6 +433,25 @@ def test_evaluate_imports_the_station_before_it_is_used(capsys, tmp_path, monkey
     file.write_text(STATION)
     assert call(capsys, "evaluate", trained, "--station", "desk", "--import", file, "--rate", "0.5")[0] == 0
     assert asked["station"] == "desk"
+
+
+def test_policy_file_without_its_ending_is_named(capsys, tmp_path):
+    (tmp_path / "sac.zip").touch()
+    code, _, err = call(capsys, "evaluate", tmp_path / "sac", "--task", "Bead")
+    assert code == 2
+    assert f"to evaluate the file {tmp_path / 'sac.zip'}, give its whole name" in err
+
+
+def test_visualize_prints_what_it_does_before_it_simulates(capsys, tmp_path, monkeypatch):
+    def simulate(*given, **named):
+        raise InputError("stopped")
+
+    monkeypatch.setattr("guiderail.tools.visualization.replay.rollout", simulate)
+    words = ["visualize", "NarrowPassage", "--policy", "zero", "--html", tmp_path / "replay.html"]
+    code, _, err = call(capsys, *words)
+    assert code == 2
+    assert err.startswith("guiderail: simulating held-out episodes (1) before and after learning, then writing ")
+    assert err.endswith("\nguiderail: stopped\n")
 
 
 @pytest.mark.parametrize(
