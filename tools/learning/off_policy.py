@@ -20,7 +20,6 @@ import torch
 from gymnasium import spaces
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from torch.nn.utils import parameters_to_vector
 
@@ -131,8 +130,7 @@ class OffPolicyLearner(Learner):
         if config.privileged_critic:
             env, policy, self._num_privileged = observe_privileged(env, algorithm, self.symmetry)
         self.model = algorithm(policy, env, **{k: v for k, v in arguments.items() if k in accepted})
-        buffer = DemonstrationReplayBuffer if config.demonstration_fraction else NStepReplayBuffer
-        self.model.replay_buffer = buffer(
+        self.model.replay_buffer = DemonstrationReplayBuffer(
             self._copies * self.model.buffer_size,
             self.model.observation_space,
             self.model.action_space,
@@ -214,8 +212,7 @@ class OffPolicyLearner(Learner):
         if "simulation_failure" in transition.info:
             if self._has_transition:
                 buffer = self.model.replay_buffer
-                newest = getattr(buffer, "newest", buffer.pos - 1)
-                buffer.dones[newest] = buffer.timeouts[newest] = 1.0
+                buffer.dones[buffer.newest] = buffer.timeouts[buffer.newest] = 1.0
             return
         self.store(transition)
         self.learn()

@@ -52,10 +52,11 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
         return self.buffer_size - 1 if is_wrapped else self.pos - 1
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        if not self.num_demonstrated:
+            return super()._get_samples(batch_inds, env)
         # The row after the last one is a demonstration: a return of several steps ends at the last row.
         kept = self.timeouts[-1].copy()
-        if self.num_demonstrated:
-            self.timeouts[-1] = np.logical_or(kept, np.logical_not(self.dones[-1]))
+        self.timeouts[-1] = np.logical_or(kept, np.logical_not(self.dones[-1]))
         samples = super()._get_samples(batch_inds, env)
         self.timeouts[-1] = kept
         return samples
