@@ -5,7 +5,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 DRIFT_TIME = 10.0
 """Time after which a drift has the given standard deviation [s]."""
@@ -54,7 +54,6 @@ class SensorDisturbance(LeafSystem):
         configuration_size: int = 0,
     ):
         super().__init__()
-        check_period(period)
         self._noise = np.array(noise, dtype=float)
         if self._noise.ndim != 1 or not _are_magnitudes(self._noise, self._noise.shape):
             raise InputError(f"a sensor's noise is a standard deviation for each of its numbers, not {noise}")
@@ -66,7 +65,6 @@ class SensorDisturbance(LeafSystem):
         for name, values in (("drift", self._drift), ("resolution", self._resolution)):
             if not _are_magnitudes(values, (size,)):
                 raise InputError(f"a sensor's {name} is a number from 0 for each of its numbers, not {values}")
-        self._step = np.sqrt(period / DRIFT_TIME)
         self._has_noise, self._has_drift = bool(self._noise.any()), bool(self._drift.any())
         self._is_rounded = self._resolution > 0.0
         self._rounds_any, self._unit = bool(self._is_rounded.any()), np.where(self._is_rounded, self._resolution, 1.0)
@@ -93,6 +91,7 @@ class SensorDisturbance(LeafSystem):
         )
         self._set_default = declare.reset_to_default(self)
         declare.update(self, period, self._update, self._reset)
+        self._step = np.sqrt(period / DRIFT_TIME)
 
     get_measurement_input_port = input_getter("measurement", "undisturbed measurement, (n,)")
     get_configuration_input_port = input_getter("configuration", "configuration, (m,), if its size is not 0")
@@ -129,8 +128,8 @@ class SensorDisturbance(LeafSystem):
         count = context.get_discrete_state().value(self._count) + 1.0
         discrete_state.set_value(self._count, count)
         if self._has_noise or self._has_drift:
-            seed = context.get_numeric_parameter(self._seed).value()[0]
-            rng = np.random.default_rng([int(seed), int(count[0])])
+            seed = context.get_numeric_parameter(self._seed).value().item()
+            rng = np.random.default_rng([int(seed), int(count.item())])
             discrete_state.set_value(self._noise_sample, rng.standard_normal(len(self._noise)))
             if self._has_drift:
                 walk = context.get_discrete_state().value(self._walk)
@@ -145,7 +144,7 @@ class SensorDisturbance(LeafSystem):
         if self._delay_line is None:
             measured = self._measurement_port.Eval(context)
         else:
-            skipped = self._delay - int(context.get_numeric_parameter(self._used_delay).value()[0])
+            skipped = self._delay - int(context.get_numeric_parameter(self._used_delay).value().item())
             size = len(self._noise)
             measured = context.get_discrete_state().value(self._delay_line)[skipped * size :][:size]
         scale, bias = (context.get_numeric_parameter(index).value() for index in (self._scale, self._bias))

@@ -69,10 +69,12 @@ def test_initialization_restarts_noise_and_delay():
     np.testing.assert_allclose(episodes[1], episodes[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [{"noise": np.array([-1.0])}, {"noise": np.zeros(1), "delay": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"noise": np.array([-1.0])}, {"noise": np.zeros(1), "delay": -1}, {"noise": np.zeros(1), "period": 0.0}]
+)
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
-        SensorDisturbance(PERIOD, **wrong)
+        SensorDisturbance(**{"period": PERIOD, **wrong})
 
 
 def test_delay_of_an_episode_is_at_most_the_largest():
@@ -113,6 +115,28 @@ def test_bias_depends_on_the_configuration():
     configuration.GetMutableData().set_value([1.5, 2.0, 4.0])
     expected = 1.0 + gradient @ [0.5, 0.0, 1.0]
     np.testing.assert_allclose(sensor.get_disturbed_measurement_output_port().Eval(context), expected)
+
+
+def test_numbers_of_a_sensor_have_errors_of_their_own():
+    """Noise, drift and rounding of one number each, as computed from the seed."""
+    noise, drift, resolution = np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.2, 0.0]), np.array([0.0, 0.0, 0.25])
+    sensor = SensorDisturbance(PERIOD, noise, drift=drift, resolution=resolution)
+    simulator = Simulator(sensor)
+    context = simulator.get_mutable_context()
+    sensor.get_measurement_input_port().FixValue(context, [1.0, 2.0, 3.3])
+    sensor.set_error(context, np.array([2.0, 0.5, 1.0]), np.array([0.1, -0.2, 0.0]), 7)
+    parameters = noise.copy(), drift.copy()
+    for given in (noise, drift, resolution):
+        given[:] = 9.0  # the sensor has copies
+    walk = np.zeros(3)
+    for step in range(1, 6):
+        simulator.AdvanceTo((step - 0.5) * PERIOD)
+        rng = np.random.default_rng([7, step])
+        sample = parameters[0] * rng.standard_normal(3)
+        walk += np.sqrt(PERIOD / 10.0) * parameters[1] * rng.standard_normal(3)
+        expected = np.array([2.1, 0.8, 3.25]) + sample + walk
+        disturbed = sensor.get_disturbed_measurement_output_port().Eval(context)
+        np.testing.assert_allclose(disturbed, expected, rtol=1e-12)
 
 
 def test_measurement_is_rounded_to_the_resolution():
