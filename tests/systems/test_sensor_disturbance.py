@@ -129,7 +129,7 @@ def test_numbers_of_a_sensor_have_errors_of_their_own():
     for given in (noise, drift, resolution):
         given[:] = 9.0  # the sensor has copies
     walk = np.zeros(3)
-    for step in range(1, 6):
+    for step in range(1, 121):
         simulator.AdvanceTo((step - 0.5) * PERIOD)
         rng = np.random.default_rng([7, step])
         sample = parameters[0] * rng.standard_normal(3)
@@ -143,7 +143,33 @@ def test_measurement_is_rounded_to_the_resolution():
     np.testing.assert_allclose(readings(resolution=np.array([0.3]), bias=0.01), np.round((TIMES + 0.01) / 0.3) * 0.3)
 
 
-@pytest.mark.parametrize("wrong", [{"drift": np.array([-1.0])}, {"resolution": np.array([np.nan])}])
-def test_constructor_refuses_negative_magnitudes(wrong):
+@pytest.mark.parametrize("name", ["noise", "drift", "resolution"])
+@pytest.mark.parametrize("magnitudes", [[-1.0, 1.0], [1.0, np.nan], [1.0, np.inf]])
+def test_constructor_refuses_magnitudes_out_of_range(name, magnitudes):
     with pytest.raises(InputError):
-        SensorDisturbance(PERIOD, np.zeros(1), **wrong)
+        SensorDisturbance(PERIOD, **{"noise": np.zeros(2), name: np.array(magnitudes)})
+
+
+def test_noise_of_one_number_needs_no_drift():
+    sensor = SensorDisturbance(PERIOD, np.array([0.1, 0.0]))
+    simulator = Simulator(sensor)
+    context = simulator.get_mutable_context()
+    sensor.get_measurement_input_port().FixValue(context, np.zeros(2))
+    simulator.AdvanceTo(0.5 * PERIOD)
+    expected = [0.1 * np.random.default_rng([0, 1]).standard_normal(2)[0], 0.0]
+    np.testing.assert_allclose(sensor.get_disturbed_measurement_output_port().Eval(context), expected)
+
+
+def test_constant_measurement_arrives_after_the_delay():
+    sensor = SensorDisturbance(PERIOD, np.zeros(1), delay=3, configuration_size=2)
+    simulator = Simulator(sensor)
+    context = simulator.get_mutable_context()
+    sensor.get_measurement_input_port().FixValue(context, [5.0])
+    configuration = sensor.get_configuration_input_port().FixValue(context, [1.0, 2.0])
+    values = []
+    for step in range(1, 5):
+        simulator.AdvanceTo((step - 0.5) * PERIOD)
+        values.append(sensor.get_disturbed_measurement_output_port().Eval(context)[0])
+    assert values == [0.0, 0.0, 5.0, 5.0]
+    configuration.GetMutableData().set_value([3.0, 4.0])  # without a gradient
+    assert sensor.get_disturbed_measurement_output_port().Eval(context)[0] == 5.0
