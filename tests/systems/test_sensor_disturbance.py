@@ -129,7 +129,7 @@ def test_numbers_of_a_sensor_have_errors_of_their_own():
     for given in (noise, drift, resolution):
         given[:] = 9.0  # the sensor has copies
     walk = np.zeros(3)
-    for step in range(1, 121):
+    for step in range(1, 1002):
         simulator.AdvanceTo((step - 0.5) * PERIOD)
         rng = np.random.default_rng([7, step])
         sample = parameters[0] * rng.standard_normal(3)
