@@ -47,6 +47,6 @@ class ProgressClock(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         clock = round(context.get_time() / self._period)
         if clock > 0:  # no command has been executed at time zero
-            step = round(context.get_discrete_state().value(self._time)[0] / self._period)
+            step = round(context.get_discrete_state().value(self._time).item() / self._period)
             command, pose = self._command_port.Eval(context), self._pose_port.Eval(context)
             discrete_state.set_value([self._period * self._rule.next_step(step, clock, command, pose)])

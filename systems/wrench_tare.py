@@ -54,12 +54,12 @@ class WrenchTare(LeafSystem):
 
     def is_tared(self, context: Context) -> bool:
         """Return True if all samples of the mean have been taken; `context` is this system's."""
-        return context.get_discrete_state().value(self._count)[0] >= self._skipped + self._averaged
+        return context.get_discrete_state().value(self._count).item() >= self._skipped + self._averaged
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self.is_tared(context):
             return
-        count = context.get_discrete_state().value(self._count)[0]
+        count = context.get_discrete_state().value(self._count).item()
         if count >= self._skipped:
             offset = context.get_discrete_state().value(self._offset)
             sample = self._measured_wrench_port.Eval(context)

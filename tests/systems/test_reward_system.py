@@ -74,3 +74,30 @@ def test_each_term_is_evaluated_once_for_all_ports():
 def test_constructor_refuses_invalid_terms(terms):
     with pytest.raises(InputError):
         RewardSystem(terms)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, "reward term 'a' of own is not finite, but nan"),
+        (-np.inf, "reward term 'a' of own is not finite, but -inf"),
+        ([1.0, 2.0], r"reward term 'a' of own must be one number, and it is \[1.0, 2.0\]"),
+        ("1", "reward term 'a' of own must be one number, and it is '1'"),
+        (None, "reward term 'a' of own must be one number, and it is None"),
+    ],
+)
+def test_evaluation_refuses_a_term_that_is_not_one_finite_number(value, message):
+    system = RewardSystem([RewardTerm("a", {}, lambda: value)], "own")
+    with pytest.raises(InputError, match=message):
+        system.get_reward_output_port().Eval(system.CreateDefaultContext())
+
+
+def test_term_may_be_an_array_with_one_number():
+    system = RewardSystem([RewardTerm("a", {}, lambda: [[2]])])
+    assert system.get_reward_output_port().Eval(system.CreateDefaultContext()) == [2.0]
+
+
+@pytest.mark.parametrize(("name", "words"), [("", "reward term 'a' is called"), ("own", "reward term 'a' of own is")])
+def test_constructor_refuses_a_function_with_other_parameters(name, words):
+    with pytest.raises(InputError, match=words):
+        RewardSystem([RewardTerm("a", {"pose": 2}, lambda position: 0.0)], name)

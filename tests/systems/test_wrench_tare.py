@@ -68,3 +68,4 @@ def test_initialization_tares_again(tare):
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         WrenchTare(*wrong)
+    WrenchTare(PERIOD, 0, 1)
