@@ -85,7 +85,7 @@ class FunctionGuidanceSystem(LeafSystem):
 
     def _evaluate(self, context: Context) -> Any:
         ports = (self._action_port, self._pose_port, self._wrench_port)
-        return self._function(*(port.Eval(context).copy() for port in ports))
+        return self._function(*(port.Eval(context) for port in ports))  # copies, which the function may modify
 
     def _set(self, context: Context, discrete_state: DiscreteValues, returned: Any) -> None:
         desired = _numbers(returned, self._desired_pose_port.size())

@@ -74,13 +74,14 @@ def test_system_raises_when_the_period_is_not_positive():
         ProgressClock(RULE, 2, 0.0)
 
 
-def test_steps_are_whole_for_a_period_that_is_not_exact_in_binary():
+@pytest.mark.parametrize(("pose", "lag"), [([0.0, 0.0], 0), ([1.0, 0.0], 4)])
+def test_steps_are_whole_for_a_period_that_is_not_exact_in_binary(pose, lag):
     period = 0.02  # 29 * period / period is less than 29
     system = ProgressClock(RULE, 2, period)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_command_input_port().FixValue(context, [0.0, 0.0])
-    system.get_pose_input_port().FixValue(context, [0.0, 0.0])
+    system.get_pose_input_port().FixValue(context, pose)
     for k in range(31):
         simulator.AdvanceTo((k + 0.5) * period)
-        assert system.get_motion_time_output_port().Eval(context)[0] == period * k
+        assert system.get_motion_time_output_port().Eval(context)[0] == period * max(k - lag, 0)
