@@ -171,8 +171,7 @@ def create_task(
         log=(lambda text: None) if as_json else print_progress,
     )
     if not as_json:
-        hard = created.pop("hard", {})
-        created |= {f"hard_{name}": value for name, value in hard.items()}
-        for name, unit in (("modulus", "Pa"), ("force", "N"), ("hard_force_limit", "N")):
-            created = {f"{name.replace('_', ' ')} [{unit}]" if key == name else key: created[key] for key in created}
+        created |= {f"hard_{name}": value for name, value in created.pop("hard", {}).items()}
+        labels = {"modulus": "modulus [Pa]", "force": "force [N]", "hard_force_limit": "hard force limit [N]"}
+        created = {labels.get(name, name): value for name, value in created.items()}
     print_result(created, as_json)

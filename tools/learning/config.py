@@ -34,7 +34,7 @@ MAX_EPISODES = 10**9  # largest number of episodes of a run
 
 def _check_ent_coef(ent_coef: str) -> str:
     initial = ent_coef.removeprefix("auto_")
-    if ent_coef != "auto" and (initial.startswith("_") or not 0 < float(initial) < math.inf):
+    if ent_coef != "auto" and not 0 < float(initial) < math.inf:
         raise ValueError("it is auto, auto_<initial value> or a positive number")
     return ent_coef
 

@@ -180,6 +180,18 @@ def test_demonstrations_that_fill_the_buffer_are_refused():
     assert learner.model.replay_buffer.num_demonstrated == 8
 
 
+def test_action_before_a_failed_simulation_is_not_paired_with_a_later_transition():
+    learner = make(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
+    learner.on_episode_start()
+    action = learner.act(OBSERVATION)
+    failed = {"simulation_failure": "no solution"}
+    learner.on_step(Transition(OBSERVATION, action, 0.0, OBSERVATION, False, True, failed))
+    learner.on_episode_start()
+    corrected = np.ones(2, np.float32)  # a supervisor's action, for which the learner is not asked
+    learner.on_step(Transition(OBSERVATION, corrected, 0.0, OBSERVATION, False, False, {}))
+    assert learner.model.rollout_buffer.pos == 0
+
+
 def test_returns_of_a_full_buffer_do_not_continue_in_the_demonstrations():
     box = spaces.Box(-1.0, 1.0, (1,))
     buffer = DemonstrationReplayBuffer(8, box, box, device="cpu", n_steps=3, gamma=1.0)
