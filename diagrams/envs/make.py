@@ -108,6 +108,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     exported = render_mode if render_mode == "rgb_array" else None
     declared = config.make_task()
     key = _key(declared, exported)
+    # A diagram that a user has added to another diagram cannot be simulated alone any more.
+    _IDLE[key][:] = [one for one in _IDLE[key] if one.diagram.diagram.GetSystemPathname().count("::") == 1]
     built = _IDLE[key].pop() if _IDLE[key] else _build(declared, exported)
     # A reset sets episode constants, which are systems of the diagram: the new task uses those of the task that built
     # the diagram. The hidden values of a run belong to the new task alone.

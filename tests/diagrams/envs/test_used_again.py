@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.envs.make import make_env
 
@@ -33,3 +34,13 @@ def test_reset_values_reach_a_reused_diagram(case):
         np.testing.assert_equal(other, one)
     (*_, before), (*_, after) = expected
     assert not all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_diagram_inside_another_one_is_not_used_again():
+    env = make_env("NarrowPassage", gap_width=0.041)
+    builder = DiagramBuilder()
+    builder.AddSystem(env.task.diagram)
+    outer = builder.Build()
+    env.close()
+    make_env("NarrowPassage", gap_width=0.041).reset(seed=0)
+    assert outer.num_input_ports() == 0
