@@ -301,6 +301,7 @@ def _find_subject(subject: str, environment: Mapping[str, Any]) -> tuple[str, di
         about = {"task": subject, "environment": {key: str(value) for key, value in environment.items()}}
         return subject, dict(environment), about
     config = RunFolder(Path(subject)).config()
+    config.refuse_changed_task(Path(subject), "certify the task by its name")
     content = (Path(subject) / "config.yaml").read_bytes()
     about = {"task": config.task, "config.yaml": hashlib.sha256(content).hexdigest()}
     return config.task, changed_environment(config.task, config.environment, environment), about

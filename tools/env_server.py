@@ -38,6 +38,7 @@ def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
     """
     if (Path(name) / "config.yaml").is_file():
         config = RunFolder(name).config()
+        config.refuse_changed_task(Path(name), "open the task by its name")
         name, options = config.task, config.environment | options
     if "task" in options:
         raise InputError("the task is given as the name, and not as the option 'task'")

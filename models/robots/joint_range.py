@@ -61,14 +61,16 @@ class JointRange:
             raise InputError(f"the posture is not within the joint limits and a margin of {margin} rad")
 
     def solve(self, pose: np.ndarray) -> np.ndarray | None:
-        """Return the joint positions (n,) [rad] of a finite pose (6,), nearest to the posture; None if none is found.
+        """Return the joint positions (n,) [rad] of a pose (6,), nearest to the posture; None if none is found.
 
-        Results are cached: the caller must not modify the array.
+        None is found for a pose that is not finite. The array is read-only, because results are cached.
         """
         return self._solve_once(np.asarray(pose, dtype=float).tobytes())
 
     def _solve(self, coordinates: bytes) -> np.ndarray | None:
         pose = np.frombuffer(coordinates)
+        if not np.isfinite(pose).all():
+            return None
         X = RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
         q = self._posture.copy()
         for _ in range(_ITERATIONS):
@@ -80,11 +82,12 @@ class JointRange:
             change *= min(1.0, _MAX_CHANGE / max(float(np.abs(change).max()), 1e-12))
             q = q + change
             if np.linalg.norm(error) < _TOLERANCE and np.abs(change).max() < 1e-7:
+                q.setflags(write=False)
                 return q
         return None
 
     def linearize(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows G (F, 6) of unit norm and c (F,) of constraints G y ≥ c near a finite pose (6,).
+        """Return rows G (F, 6) of unit norm and c (F,) of constraints G y ≥ c near a pose (6,).
 
         There are no rows if the pose cannot be reached.
         """
@@ -104,7 +107,7 @@ class JointRange:
         return G, G @ output + c[used] / norms[used]
 
     def violation(self, output: np.ndarray) -> float:
-        """Return the largest violation of a finite pose (6,), negative inside; infinite if it cannot be reached.
+        """Return the largest violation of a pose (6,), negative inside; infinite if it cannot be reached.
 
         The violation of a joint limit is an angle [rad]. The violation of the singular value [m] is converted to an
         angle by `LEVER`, like rotations in the scaled Jacobian.

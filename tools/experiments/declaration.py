@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import task_named
@@ -32,7 +32,7 @@ FolderName = Annotated[str, Field(pattern=r"^[\w-][\w.-]*\z", max_length=100)]
 LEARNED = "learned"
 
 
-def _with_placeholders(**examples: Any) -> AfterValidator:
+def _placeholder_check(**examples: Any) -> Callable[[str], str]:
     """Return a validator of file names with placeholders in braces; `examples` has a value of each."""
 
     def check(name: str) -> str:
@@ -49,11 +49,24 @@ def _with_placeholders(**examples: Any) -> AfterValidator:
             raise ValueError(f"{name!r} would be outside the study's folder: name a path inside it")
         return name
 
-    return AfterValidator(check)
+    return check
 
 
-RunName = Annotated[str, _with_placeholders(method="skgrl", seed=0, episodes=60, algorithm="tqc")]
-EvaluatedFile = Annotated[str, _with_placeholders(name="held_out", after_episodes=60, episodes=100, digest="0a")]
+_check_run_name = _placeholder_check(method="skgrl", seed=0, episodes=60, algorithm="tqc")
+_check_file = _placeholder_check(name="held_out", after_episodes=60, episodes=100, digest="0a")
+_check_init_from = _placeholder_check(seed=0)
+RunName = Annotated[str, AfterValidator(_check_run_name)]
+EvaluatedFile = Annotated[str, AfterValidator(_check_file)]
+
+
+def _are_distinct(seeds: tuple[int, ...]) -> tuple[int, ...]:
+    if repeated := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise ValueError(f"the seed {repeated[0]} is given twice: give each seed once")
+    return seeds
+
+
+Seed = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_are_distinct)]
 
 
 class _Strict(BaseModel):
@@ -70,6 +83,15 @@ class LearnerChoice(_Strict):
     settings: dict[str, Any] = {}  # settings that override the preset's
     episodes: Integer | None = Field(default=None, ge=1)  # training episodes; default: the largest of after_episodes
 
+    @field_validator("settings")
+    @classmethod
+    def _check_settings(cls, settings: dict[str, Any]) -> dict[str, Any]:
+        if "init_from" in settings:
+            if not isinstance(settings["init_from"], str):
+                raise ValueError(f"init_from names the folder of a run, not {brief(settings['init_from'])}")
+            _check_init_from(settings["init_from"])
+        return settings
+
 
 class Method(_Strict):
     """Environment and policy that a study compares with others."""
@@ -78,7 +100,7 @@ class Method(_Strict):
     learner: LearnerChoice = LearnerChoice()  # choices that override the study's; null stands for the task's own
     policy: str = LEARNED  # "learned", "best_constant", or the name of a baseline or scripted policy
     grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each action component that best_constant tries
-    seeds: tuple[Integer, ...] | None = None  # default: the study's; one seed is enough for a policy without learning
+    seeds: Seeds | None = None  # default: the study's; one seed is enough for a policy without learning
 
 
 class EvalSet(_Strict):
@@ -136,7 +158,7 @@ class Study(_Strict):
     env: dict[str, Any] = {}  # options of the environment of every method
     learner: LearnerChoice = LearnerChoice()  # learner of every method that learns
     methods: dict[FolderName, Method] = Field(min_length=1)  # by name, used in folders and legends
-    seeds: tuple[Integer, ...] = Field(min_length=1)  # seeds of training
+    seeds: Seeds  # seeds of training
     after_episodes: tuple[Annotated[Integer, Field(ge=1)], ...] = ()  # when policies are evaluated; default: at the end
     eval_set: tuple[EvalSet, ...] = (EvalSet(),)  # evaluation sets
     sweeps: tuple[Sweep, ...] = ()  # quantities whose values are evaluation sets too

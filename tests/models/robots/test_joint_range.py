@@ -35,6 +35,15 @@ def test_solution_has_the_pose_and_is_nearest_to_the_posture(model):
     np.testing.assert_allclose(q, model.solve(POSE, model.posture), atol=1e-3)  # by another solver
     assert joints.solve(POSE + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]) is None
     assert joints.violation(POSE + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]) == np.inf
+    with pytest.raises(ValueError, match="read-only"):
+        q[0] = 0.0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_pose_that_is_not_finite_is_not_reached(model, value):
+    joints, pose = joint_range(model), np.r_[value, POSE[1:]]
+    assert joints.solve(pose) is None
+    assert joints.violation(pose) == np.inf
 
 
 def test_rows_are_the_limits_up_to_the_second_order(model):

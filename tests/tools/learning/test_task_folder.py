@@ -13,7 +13,9 @@ import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.certify import certify_skill
 from guiderail.tools.cli.main import main
+from guiderail.tools.env_server import open_environment
 from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.subject import find_subject
@@ -101,6 +103,15 @@ def test_run_is_not_evaluated_when_its_task_folder_changed(words, folder, tmp_pa
     assert "the files of parts/pin are not those that the run in" in message
     assert ("--task" in message) == ("--sim" not in words)  # not on a robot
     assert sorted(begun.path.iterdir()) == before
+
+
+def test_run_is_not_certified_or_served_when_its_task_folder_changed(folder, tmp_path):
+    begun = RunFolder(tmp_path / "run")
+    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
+    (folder / "part.obj").write_text(CHANGES["part.obj"])
+    for refused in (lambda: certify_skill(str(begun.path), {}), lambda: open_environment(str(begun.path), {})):
+        with pytest.raises(InputError, match="the files of parts/pin are not those that the run in"):
+            refused()
 
 
 def test_policy_of_a_run_acts_in_changed_files_of_a_named_task(folder, tmp_path):
