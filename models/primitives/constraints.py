@@ -41,6 +41,8 @@ class LinearConstraints:
                 f"constraints need G of shape (F, O) with c of shape (F,), or (N, F, O) with (N, F), "
                 f"not {self.G.shape} with {self.c.shape}"
             )
+        if 0 in (self.G.shape[0] if self.G.ndim == 3 else 1, self.G.shape[-1]):
+            raise InputError(f"constraints need at least one output and one step, not G of shape {self.G.shape}")
         if not (np.isfinite(self.G).all() and np.isfinite(self.c).all()):
             raise InputError("constraints must be finite: leave out the rows that do not constrain anything")
         self._normalize()
@@ -66,6 +68,8 @@ class LinearConstraints:
             raise InputError(f"box bounds must have the same shape, not {lower.shape} and {upper.shape}") from error
         if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
             raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
+        if lower.size == 0:
+            raise InputError(f"box bounds need at least one output and one step, not the shape {lower.shape}")
         if (lower > upper).any():
             where = f" at step {np.argwhere(lower > upper)[0, 0]}" if lower.ndim == 2 else ""
             raise InputError(

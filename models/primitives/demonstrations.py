@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
 
@@ -117,9 +117,9 @@ class Demonstrations:
             num_steps: Number of steps N, at least 2; that of the longest recording by default.
 
         Raises:
-            InputError: If `num_steps` is less than 2.
+            InputError: If `num_steps` is less than 2 or not a whole number.
         """
-        num_steps = max(len(t) for t in self.times) if num_steps is None else num_steps
+        num_steps = max(len(t) for t in self.times) if num_steps is None else as_whole(num_steps, "num_steps")
         if num_steps < 2:
             raise InputError(f"a clock needs at least two steps, not {num_steps}")
         first = self.times[0]
@@ -301,11 +301,13 @@ def compute_bounds(
     common = demonstrations.resampled()
     outputs = np.stack(common.outputs)
     steps = outputs.shape[1]
+    phases = as_whole(phases, "the number of phases")
     if not 1 <= phases <= steps // 2:
         raise InputError(f"there are from 1 to {steps // 2} phases in {steps} samples, not {phases}")
     if not (np.isfinite([margin, min_margin]).all() and margin >= 0 and min_margin >= 0):
         raise InputError(f"margins must be finite and not negative, not {margin} and {min_margin}")
-    indices = list(range(outputs.shape[2])) if bounded is None else list(bounded)
+    chosen = range(outputs.shape[2]) if bounded is None else bounded
+    indices = [as_whole(index, "an index of an output") for index in chosen]
     if not indices or not all(0 <= index < outputs.shape[2] for index in indices):
         raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {indices}")
     starts = np.arange(phases) / phases

@@ -49,7 +49,8 @@ class Kmp:
     ):
         inputs = _rows(inputs)
         means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
-        if means.ndim != 2 or len(inputs) != len(means) or covariances.shape != (*means.shape, means.shape[1]):
+        is_matrix = means.ndim == 2 and means.size > 0
+        if not is_matrix or len(inputs) != len(means) or covariances.shape != (*means.shape, means.shape[1]):
             raise InputError(
                 f"a primitive needs inputs (N, I), means (N, O) and covariances (N, O, O), not {inputs.shape}, "
                 f"{means.shape} and {covariances.shape}"

@@ -81,7 +81,8 @@ def pose_outputs(
 
     check_orientation(orientation)
     positions, quaternions = np.asarray(positions, dtype=float), np.asarray(quaternions_wxyz, dtype=float)
-    if positions.ndim != 2 or positions.shape[1] != 3 or quaternions.shape != (len(positions), 4):
+    number = len(positions)
+    if number == 0 or positions.shape != (number, 3) or quaternions.shape != (number, 4):
         raise InputError(
             f"poses need positions (N, 3) and quaternions (N, 4), not {positions.shape} and {quaternions.shape}"
         )
@@ -139,8 +140,12 @@ def pose_demonstrations(
     Raises:
         InputError: As `pose_outputs` and `Demonstrations`.
     """
+    if len(positions) != len(quaternions_wxyz):
+        raise InputError(f"there are {len(positions)} arrays of positions and {len(quaternions_wxyz)} of quaternions")
     outputs: list[np.ndarray] = []
     for p, q in zip(positions, quaternions_wxyz, strict=True):
+        if len(p) == 0 or len(q) == 0:
+            raise InputError(f"demonstration {len(outputs)} has no poses")
         target_p = p[-1] if target_position is None else target_position
         target_q = q[-1] if target_quaternion_wxyz is None else target_quaternion_wxyz
         near = outputs[0][0, 3:] if outputs else None

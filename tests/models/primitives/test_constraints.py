@@ -306,3 +306,14 @@ def test_steps_outside_of_the_motion_have_the_constraints_of_the_nearest_step():
     assert [box.violation(np.array([0.0]), step) for step in (-2, 0, 2, 5)] == [0.0, 0.0, -2.0, -2.0]
     _, c = box.window(np.array([-1, 0, 1, 3]))
     np.testing.assert_array_equal(c[:, 0], [0.0, 0.0, -1.0, -2.0])
+
+
+@pytest.mark.parametrize("shape", [(0,), (2, 0), (0, 2)])
+def test_constraints_need_an_output_and_a_step(shape):
+    with pytest.raises(InputError, match="at least one output and one step"):
+        LinearConstraints.box(np.zeros(shape), np.ones(shape))
+    if shape != (0, 2):
+        with pytest.raises(InputError, match="at least one output and one step"):
+            LinearConstraints(np.zeros((*shape[:-1], 1, 0)), np.zeros((*shape[:-1], 1)))
+    with pytest.raises(InputError, match="at least one output and one step"):
+        LinearConstraints(np.zeros((0, 1, 2)), np.zeros((0, 1)))

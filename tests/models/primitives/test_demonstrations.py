@@ -162,3 +162,16 @@ def test_max_rates_use_the_clock_of_each_demonstration():
 def test_compute_bounds_refuses_invalid_arguments(arguments):
     with pytest.raises(InputError):
         compute_bounds(make_demonstrations(), **arguments)
+
+
+@pytest.mark.parametrize("value", [2.5, "3", True])
+def test_numbers_of_steps_and_phases_are_whole(value):
+    given = Demonstrations([np.arange(10.0)], [np.zeros((10, 2))])
+    for refused in (
+        lambda: given.resampled(value),
+        lambda: compute_bounds(given, value),
+        lambda: compute_bounds(given, bounded=[value]),
+    ):
+        with pytest.raises(InputError, match="must be a whole number"):
+            refused()
+    assert len(given.resampled(np.int64(4)).times[0]) == 4

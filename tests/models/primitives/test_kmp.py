@@ -106,6 +106,8 @@ def test_kmp_refuses_unknown_via_points_and_invalid_arguments():
     with pytest.raises(InputError, match="lambda_"):
         Kmp(*data(20, 2), lambda_=0.0)
     with pytest.raises(InputError, match="means"):
+        Kmp(np.zeros((0, 1)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    with pytest.raises(InputError, match="means"):
         Kmp(np.zeros(3), np.zeros((2, 1)), np.ones((2, 1, 1)))
     t, means, covariances = data(20, 2)
     for broken in (np.where(t == t[3], np.nan, t), means), (t, np.where(means == means[3], np.nan, means)):

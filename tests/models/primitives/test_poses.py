@@ -103,3 +103,13 @@ def test_pose_outputs_refuse_invalid_poses():
     with pytest.raises(InputError, match="length zero"):
         pose_outputs(positions, quaternions, np.zeros(3), [1e-7, 0, 0, 0])
     pose_outputs(positions, quaternions, np.zeros(3), [1e-5, 0, 0, 0])
+
+
+def test_poses_need_a_sample():
+    p, q = np.zeros((0, 3)), np.zeros((0, 4))
+    with pytest.raises(InputError, match="positions"):
+        pose_outputs(p, q, np.zeros(3), [1.0, 0.0, 0.0, 0.0])
+    with pytest.raises(InputError, match="demonstration 0 has no poses"):
+        pose_demonstrations([np.zeros(0)], [p], [q])
+    with pytest.raises(InputError, match="1 arrays of positions and 2 of quaternions"):
+        pose_demonstrations([np.zeros(1)], [np.zeros((1, 3))], [q, q])
