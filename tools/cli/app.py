@@ -31,8 +31,15 @@ def print_progress(text: str) -> None:
 
 def to_json(result: Mapping[str, Any]) -> str:
     """Return a result as JSON, with null for NaN and infinite numbers, which JSON does not have."""
-    text = json.dumps(dict(result), default=lambda value: dict(value) if isinstance(value, Mapping) else str(value))
+    text = json.dumps(dict(result), default=_plain)
     return json.dumps(json.loads(text, parse_constant=lambda name: None))
+
+
+def _plain(value: Any) -> Any:
+    """Return a mapping, number or array of NumPy as an object that JSON has, and anything else as text."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

@@ -50,6 +50,8 @@ def visualize(
     elif not Path(name).is_dir() and name in cli.CHOICES["tasks"]():
         name, task = policy or "scripted", name
     episode = EpisodeSpec.of_policy(name, environment, seed, task=task, trust_policy=trust_policy)
+    if episodes is not None and html is None and (image is not None or video is not None):
+        raise InputError("--episodes are those of the page: add --html, or leave --episodes out")
     if image is not None:
         check_picture(image)
     if video is not None:

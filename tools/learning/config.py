@@ -44,7 +44,7 @@ BatchSize = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(reject_bool)]
 NumUnits = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(reject_bool)]
 Fraction = Annotated[float, Field(ge=0, le=1), BeforeValidator(reject_bool)]
 Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
-Noise = Annotated[float, Field(ge=0, le=10)]
+Noise = Annotated[float, Field(ge=0, le=10), BeforeValidator(reject_bool)]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
 EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
 # Absolute, so that a run can be resumed from another folder.
@@ -199,7 +199,7 @@ class DistillationConfig(ChunkConfig):
     algorithm: str = "distillation"
     demonstration_episodes: NonNegative = 0  # always 0: the teacher acts in every episode
     teacher: str = ""  # folder of the teacher's run, or pretrained:NAME
-    action_noise: Annotated[float, Field(ge=0, le=1)] = 0.2  # standard deviation added to the teacher's actions
+    action_noise: Fraction = 0.2  # standard deviation added to the teacher's actions
     noisy_copies: NonNegative = 4  # noisy copies of each observation, labeled by the teacher
     copy_noise: Noise = 0.2  # noise of a copy, in standard deviations of each entry
     members: Annotated[Positive, Field(le=50)] = 1  # E, networks of the ensemble

@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer
 
@@ -90,6 +91,7 @@ def trained(bead_run):
         (["visualize", "new", "--image", "picture.png"], "not a run"),
         (["visualize", "Bead", "--policy", "scripte", "--image", "picture.png"], "no policy 'scripte'"),
         (["visualize", "Bead", "--policy", "zero", "--image", "picture.gif"], "a picture is .png"),
+        (["visualize", "Bead", "--policy", "zero", "--image", "picture.png", "--episodes", "2"], "add --html"),
         (["visualize", "Bead", "--policy", "zero", "--video", "video.png"], "a video is .webp, .gif"),
         (["replay", "new"], "there is no command replay"),
         (["dataset"], "guiderail dataset needs a command: choose one of"),
@@ -164,7 +166,7 @@ def test_evaluate_refuses_unknown_policy_when_on_hardware(policy, capsys, traine
 
 
 def test_json_has_null_for_nan_and_infinity_at_any_depth():
-    rows = [{"part": "round trip", "worst_ms": float("inf"), "median_ms": 1.5, "number": 3}]
+    rows = [{"part": "round trip", "worst_ms": float("inf"), "median_ms": 1.5, "number": np.int64(3)}]
     (row,) = json.loads(to_json({"rows": rows}), parse_constant=pytest.fail)["rows"]
     assert row == {"part": "round trip", "worst_ms": None, "median_ms": 1.5, "number": 3}
 

@@ -21,6 +21,12 @@ def test_config_refuses_values_out_of_range(setting, value):
     assert len(str(error.value)) < 300
 
 
+@pytest.mark.parametrize("setting", ["observation_noise", "action_noise", "copy_noise"])
+def test_noise_is_not_a_bool(setting):
+    with pytest.raises(InputError, match=f"learner's {setting} cannot be"):
+        resolve_preset(None, "distillation", {setting: True})
+
+
 def test_config_accepts_large_networks():
     assert resolve_preset("tqc_contact", "tqc", {"net_arch": "4096,4096", "batch_size": "8192"}).net_arch == (
         4096,
