@@ -272,6 +272,8 @@ class GuidedVectorEnv(SyncVectorEnv):
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
         if not env_fns:
             raise InputError("a vector environment needs at least one environment")
+        if not all(map(callable, env_fns)):
+            raise InputError("env_fns are functions that return an environment, such as lambda: env")
         first = GuidedEnv(env_fns[0](), **keywords)
 
         def wrap(make: Callable[[], gymnasium.Env[Any, Any]]) -> Callable[[], gymnasium.Env[Any, Any]]:

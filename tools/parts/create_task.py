@@ -273,6 +273,8 @@ def _check_arguments(
             raise InputError(f"there is no scenario {file}")
         if file.suffix.lower() not in (".yaml", ".yml") or file.name == FILE_NAME:
             raise InputError(f"{file} is not a scenario: name a .yaml file of Drake model directives, not {FILE_NAME}")
+        if "," in file.name:
+            raise InputError(f"{file} has a comma in its name, which separates scenarios: rename it")
         if names.count(file.name) > 1:
             raise InputError(f"two scenarios are called {file.name}, and both go into one folder: rename one")
 
@@ -358,7 +360,8 @@ def _write_task(
     from guiderail.tools.parts.trial import demonstrate, write_preview
 
     duration = float(file.motion.plan_search()[0][-1])
-    log(f"recording demonstrations: about {NUM_DEMONSTRATIONS * duration / measured['real_time_factor']:.0f} s")
+    factor = max(measured["real_time_factor"], 0.01)  # it is rounded
+    log(f"recording demonstrations: about {NUM_DEMONSTRATIONS * duration / factor:.0f} s")
     succeeded = demonstrate(folder, file)
     if not succeeded:
         raise InputError(

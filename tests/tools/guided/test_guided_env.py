@@ -482,6 +482,12 @@ def test_vector_environment_refuses_other_numbers_of_actions(actions):
     np.testing.assert_array_equal([env.unwrapped.p for env in vector.envs], before)
 
 
+@pytest.mark.parametrize("env_fns", [[], [PointEnv()], [PointEnv, None]])
+def test_vector_environment_needs_functions(env_fns):
+    with pytest.raises(InputError, match=r"at least one environment|env_fns are functions"):
+        GuidedVectorEnv(env_fns, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+
+
 @pytest.mark.parametrize("reason", ["terminated", "truncated"])
 def test_step_after_the_end_of_an_episode_is_refused(reason):
     segments = two_segments() if reason == "terminated" else [Segment(SHOWN, frame=at_target)]
