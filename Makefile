@@ -91,10 +91,10 @@ motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, m
 outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, in an environment of its own, hours (downloads 3 GB)
 	$(OUTSIDE)/bin/python -m pytest -q -c /dev/null --noconftest tests/research/outside_envs
 	for method in kgrl residual clipped_residual tqc rlpd; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 10 11 12 13 14 --out runs/outside; done
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 20 21 22 23 24 --out runs/outside; done
 	for task in peg assembly nut; do \
 	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method baselines --out runs/outside; \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 10 --out runs/outside; done
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 20 --out runs/outside; done
 	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13

@@ -16,6 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from guiderail.tools.files import write_atomically
@@ -33,11 +34,24 @@ LEARNING_STARTS = 120  # transitions with random actions
 GRADIENT_STEPS = 2  # per transition
 NUM_RETURN_STEPS = 5  # transitions of a return: the reward of a success comes after some forty decisions
 TARGET_ENTROPY_PER_ACTION = -2.0  # Stable-Baselines3's default is −1; less noise spoils fewer attempts
-LEARNING_RATE, LAST_LEARNING_RATE = 1e-3, 1e-4  # falls in the second half of the training
+LEARNING_RATE, LAST_LEARNING_RATE = 5e-4, 1e-4  # falls in the second half of the training
 AVERAGE_DECAY = 0.999  # per transition, of the running average of the actor's weights that is evaluated
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
+
+
+class WithHidden(gymnasium.ObservationWrapper):
+    """Environment whose observation ends with the environment's `hidden` values, for a privileged critic."""
+
+    def __init__(self, env: gymnasium.Env):
+        super().__init__(env)
+        size = env.observation_space.shape[0] + len(env.get_wrapper_attr("hidden"))
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Return the observation of the critic."""
+        return np.concatenate([observation, self.env.get_wrapper_attr("hidden")]).astype(np.float32)
 
 
 def run_episode(env: Any, policy: PolicyFn, seed: int, side: float) -> Row:
@@ -89,17 +103,21 @@ def train(
 ) -> tuple[Any, list[Row]]:
     """Train TQC; return the model, with the averaged actor, and the row of every episode.
 
+    The critics also observe the hidden values (asymmetric actor-critic); the actor does not.
+
     Args:
-        env: Environment.
+        env: Environment with `hidden` values.
         episodes: Number of training episodes.
         seed: Seed of the learner.
-        demonstrated: Transitions that are half of every batch (RLPD), as arguments of a replay buffer's `add`.
+        demonstrated: Transitions of `WithHidden` that are half of every batch (RLPD), as arguments of a replay
+            buffer's `add`.
     """
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import configure
     from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
     from guiderail.tools.learning.fast_sb3 import FastTqc
+    from guiderail.tools.learning.networks import NormalizedReLU, asymmetric_policy
     from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
     rows: list[Row] = []
@@ -126,12 +144,16 @@ def train(
         remaining = 1.0 - len(rows) / episodes
         return max(LEARNING_RATE * min(1.0, 2.0 * remaining), LAST_LEARNING_RATE)
 
+    policy = asymmetric_policy(FastTqc.policy_aliases["MlpPolicy"], env.observation_space.shape[0])
     model = FastTqc(
-        "MlpPolicy", env, seed=seed, learning_rate=learning_rate, gamma=0.98, batch_size=64,
+        policy, WithHidden(env), seed=seed, learning_rate=learning_rate, gamma=0.98, batch_size=64,
         learning_starts=LEARNING_STARTS, train_freq=1, gradient_steps=GRADIENT_STEPS, n_steps=NUM_RETURN_STEPS,
         target_entropy=TARGET_ENTROPY_PER_ACTION * env.action_space.shape[0],
         top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
-        policy_kwargs={"net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15},
+        policy_kwargs={
+            "net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15, "activation_fn": NormalizedReLU,
+            "share_features_extractor": False,
+        },
     )  # fmt: skip
     if demonstrated:
         model.replay_buffer = buffer = DemonstrationReplayBuffer(
@@ -152,15 +174,26 @@ def train(
     return model, rows
 
 
+def policy_of(model: Any) -> PolicyFn:
+    """Return the deterministic policy of a model of `train`; its actor ignores the hidden values, which are zeros."""
+
+    def policy(observation: np.ndarray, _: dict[str, Any]) -> np.ndarray:
+        unknown = np.zeros(model.observation_space.shape[0] - len(observation), np.float32)
+        action, _ = model.predict(np.concatenate([observation, unknown]), deterministic=True)
+        return np.asarray(action)
+
+    return policy
+
+
 def demonstrate_transitions(task: OutsideTask, env: Any, count: int, seed: int = 1000) -> list[tuple[Any, ...]]:
     """Return the transitions of `count` successful episodes of the scripted policy in the bare environment."""
     transitions: list[tuple[Any, ...]] = []
-    successes = 0
+    successes, env = 0, WithHidden(env)
     for attempt in range(10 * count):
         observation, info = env.reset(seed=seed + attempt, options={"side": (-1.0) ** successes})
         episode, done = [], False
         while not done:
-            action = task.scripted(env.env)
+            action = task.scripted(env.env.env)
             following, reward, terminated, truncated, info = env.step(action)
             done = terminated or truncated
             infos = [{"TimeLimit.truncated": truncated and not terminated}]
@@ -243,8 +276,7 @@ def main() -> None:
             demonstrated = demonstrate_transitions(task, env, NUM_DEMONSTRATIONS) if label == "rlpd" else None
             model, rows = train(env, args.episodes, seed, demonstrated)
             result |= {"training": summarize(rows), "curve": [int(row["success"]) for row in rows]}
-            policy: PolicyFn = lambda o, _, model=model: model.predict(o, deterministic=True)[0]  # noqa: E731
-            result["held_out"] = {"learned": evaluate(env, policy, args.held_out)}
+            result["held_out"] = {"learned": evaluate(env, policy_of(model), args.held_out)}
             print(label, seed, result["held_out"]["learned"], flush=True)
         result["cpu_s"] = time.process_time() - begin
         write_atomically(path, json.dumps(result, indent=1).encode())  # a file that exists counts as finished

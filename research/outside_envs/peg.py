@@ -21,7 +21,7 @@ from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
 OFFSETS = (0.025, 0.05)  # least and largest distance of the assumed hole from the true one in y [m]
 HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true one in z [m]
-MAX_LAG = 0.035  # lag of the hand at which the first attempt ends, because the peg presses on the box [m]
+MAX_LAG = 0.035  # lag of the hand at which the first two attempts end, because the peg presses on the box [m]
 MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table, for the highest assumed hole [m]
 
 
@@ -39,9 +39,13 @@ PARTS = {
     "grasp": Part(28, "object_start", close_at_end, dwell=22, lower=LOWER["object_start"]),
     "carry": Part(34, "assumed_goal", CLOSED, lower=LOWER["assumed_goal"]),
     "insert": Part(40, "assumed_goal", CLOSED, dwell=10, lower=LOWER["assumed_goal"], until=is_blocked),
-    # Second attempt: retract along the insertion and insert again, with the demonstrations of the first insertion.
+    # Two more attempts: retract along the insertion and insert again, with the demonstrations of the first insertion.
     "retract": Part(30, "assumed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["assumed_goal"]),
-    "insert again": Part(40, "assumed_goal", CLOSED, dwell=40, source="insert", lower=LOWER["assumed_goal"]),
+    "insert 2": Part(
+        40, "assumed_goal", CLOSED, dwell=10, source="insert", lower=LOWER["assumed_goal"], until=is_blocked
+    ),
+    "retract 2": Part(30, "assumed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["assumed_goal"]),
+    "insert 3": Part(40, "assumed_goal", CLOSED, dwell=40, source="insert", lower=LOWER["assumed_goal"]),
 }
 LENGTH = num_steps(PARTS)
 
@@ -60,7 +64,7 @@ class HiddenHole(HiddenGoal):
     """
 
     def __init__(self, seed: int = 0, length: int = LENGTH):
-        super().__init__(_Env(), seed, length, OFFSETS, HEIGHT_OFFSET, "box", 5.0)
+        super().__init__(_Env(), seed, length, OFFSETS, HEIGHT_OFFSET, "box", 5.0, is_blocked)
 
     def has_succeeded(self, info: dict[str, Any]) -> bool:
         """Return True if the peg is at least 5 cm deep in the hole."""
@@ -72,14 +76,14 @@ class HiddenHole(HiddenGoal):
         return self.unwrapped._get_site_pos("pegHead") - self.unwrapped._target_pos
 
     def observe(self) -> np.ndarray:
-        """Return the observation (19,)."""
+        """Return the observation (22,)."""
         env = self.unwrapped
         hand, peg, head = self.raw[:3], self.raw[4:7], env._get_site_pos("pegHead")
         axis = env.data.site("pegHead").xmat.reshape(3, 3)[:, 0]
         parts = [
             5 * (hand - self.assumed_goal), 10 * (head - self.assumed_goal), 10 * (peg - hand), 5 * axis[1:],
             [self.raw[3]], 20 * (env.data.mocap_pos[0] - hand), 5 * (self.object_start - hand)[:2], [axis[0]],
-            [hand[2]],
+            [hand[2]], self.last_blocked,
         ]  # fmt: skip
         return np.concatenate(parts).astype(np.float32)
 
@@ -111,5 +115,6 @@ TASK = OutsideTask(
     to_action=to_action,
     scripted=scripted(SawyerPegInsertionSideV3Policy()),
     schedule={name: np.array([0.0, -0.7, 0.3]) for name in ("reach", "grasp", "carry", "insert")}
-    | {name: np.array([0.0, 0.7, 0.3]) for name in ("retract", "insert again")},
+    | {name: np.array([0.0, 0.7, 0.3]) for name in ("retract", "insert 2")}
+    | {name: np.array([0.0, -0.7, 0.3]) for name in ("retract 2", "insert 3")},
 )

@@ -36,6 +36,7 @@ class HiddenGoal(gymnasium.Wrapper):
         height_offset: Largest distance in z [m].
         obstacle: Body whose contact force is measured.
         max_reward: Upper limit to which metaworld's reward is clipped before success.
+        is_blocked: (env, observation) → true if the object presses against the obstacle; None: never.
 
     Attributes:
         true_goal: Position (3,) of the goal [m].
@@ -45,12 +46,14 @@ class HiddenGoal(gymnasium.Wrapper):
         steps: Steps since the reset.
         length: Steps after which an episode is truncated.
         raw: Observation of metaworld.
+        last_blocked: y and z of the hand in the frame of the assumed goal when it was last blocked [1/20 m], and 1;
+            zeros before (3,).
         is_success: True after the step that succeeded.
     """
 
     def __init__(
         self, env: Any, seed: int, length: int, offsets: tuple[float, float], height_offset: float, obstacle: str,
-        max_reward: float,
+        max_reward: float, is_blocked: Callable[[Any, Any], bool] | None = None,
     ):  # fmt: skip
         env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
         env._partially_observable = False
@@ -60,6 +63,7 @@ class HiddenGoal(gymnasium.Wrapper):
         super().__init__(env)
         self.length, self.steps = length, 0
         self._offsets, self._height_offset, self._max_reward = offsets, height_offset, max_reward
+        self._is_blocked = is_blocked or (lambda env, observation: False)
         self._rng = np.random.default_rng([seed, 1])
         body = env.model.body(obstacle).id
         self._geoms = {g for g in range(env.model.ngeom) if env.model.body_rootid[env.model.geom_bodyid[g]] == body}
@@ -78,13 +82,20 @@ class HiddenGoal(gymnasium.Wrapper):
         self.true_goal = np.array(env._target_pos)
         self.assumed_goal = self.true_goal + [0.0, self.side * distance, height]
         self.object_start = self.raw[4:7] * [1, 1, 0]
-        self.steps, self._peak_force, self.is_success = 0, 0.0, False
+        self.steps, self._peak_force, self.is_success, self.last_blocked = 0, 0.0, False, np.zeros(3)
         return self.observe(), {}
+
+    @property
+    def hidden(self) -> np.ndarray:
+        """Offset of the true goal from the assumed one in y and z (2,) [1/20 m], for a privileged critic only."""
+        return 20.0 * (self.true_goal - self.assumed_goal)[1:]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Step the environment and measure success and force."""
         self.raw, package_reward, _, _, info = self.unwrapped.step(np.asarray(action, dtype=np.float32))
         self.steps += 1
+        if self._is_blocked(self, None):
+            self.last_blocked = np.append(20.0 * (self.raw[1:3] - self.assumed_goal[1:]), 1.0)
         self.is_success = success = self.has_succeeded(info)
         self._peak_force = max(self._peak_force, self._force())
         fraction = min(float(package_reward), self._max_reward) / 10.0

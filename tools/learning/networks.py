@@ -1,10 +1,12 @@
 """Networks of Stable-Baselines3 learners: images, activations, export, and critics that observe more than the actor."""
 
+from __future__ import annotations
+
 import copy
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -14,9 +16,11 @@ from sb3_contrib.common.torch_layers import BatchRenorm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.task_diagram import Symmetry
 
 
 class SpacesOnlyEnv(gymnasium.Env):

@@ -25,6 +25,8 @@ class Point(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
+    hidden = np.array([0.7])
+
     def __init__(self, seed=0):
         self.steps, self.length = 0, num_steps(PARTS)
 
@@ -144,6 +146,29 @@ def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
     print_table(tmp_path)
     assert "| peg | kgrl | 1 | 2 | 90% of 10 (60% to 98%) | 100%, 80% | 3, 2.0 | 30 |" in capsys.readouterr().out
     assert len(list(csv.DictReader((tmp_path / "outside_envs.csv").open()))) == 2
+
+
+def test_critics_observe_the_hidden_values_and_the_actor_does_not(segments):
+    env = TASK.make("kgrl", 0, segments)
+    model, rows = learn.train(env, 16, 0)
+    assert len(rows) == 16
+    assert model.num_timesteps > learn.LEARNING_STARTS
+    observation, _ = env.reset(seed=0)
+    known = [np.append(observation, value).astype(np.float32) for value in (0.0, 0.7)]
+    assert np.array_equal(*(model.predict(one, deterministic=True)[0] for one in known))
+    assert np.array_equal(learn.policy_of(model)(observation, {}), model.predict(known[0], deterministic=True)[0])
+    stored = model.replay_buffer.observations[: model.replay_buffer.pos, 0]
+    assert stored.shape[1] == len(observation) + 1
+    assert (stored[:, -1] == np.float32(0.7)).all()
+    inputs = model.critic.q_networks[0][0].in_features
+    assert inputs == len(observation) + 1 + 2  # and the action
+
+
+def test_demonstrated_transitions_have_the_hidden_values(segments, monkeypatch):
+    step = Point.step
+    monkeypatch.setattr(Point, "step", lambda self, action: (*step(self, action)[:4], {"is_success": True}))
+    rows = learn.demonstrate_transitions(TASK, TASK.make("none", 0, segments), 1)
+    assert all(first[0, -1] == next_[0, -1] == np.float32(0.7) for first, next_, *_ in rows)
 
 
 def test_interrupted_write_leaves_no_result(tmp_path, monkeypatch):
