@@ -94,7 +94,7 @@ outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, i
 	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 20 21 22 23 24 --out runs/outside; done
 	for task in peg assembly nut; do \
 	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method baselines --out runs/outside; \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 20 --out runs/outside; done
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 20 21 22 23 24 --out runs/outside; done
 	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13

@@ -88,7 +88,7 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     Partial folders that killed processes left for the same path are removed first.
 
     Raises:
-        InputError: If the folder cannot be written.
+        InputError: If the folder cannot be written. An OSError of another file is not changed.
     """
     temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
     for left in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
@@ -99,6 +99,9 @@ def atomic_folder(out: Path) -> Iterator[Path]:
         yield temporary
         temporary.rename(out)
     except OSError as error:
+        named = str(temporary if error.filename is None else error.filename)
+        if not (named.startswith(str(temporary)) or str(temporary).startswith(named)):
+            raise
         raise write_error(out, error) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

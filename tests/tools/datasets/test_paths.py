@@ -48,6 +48,12 @@ def test_atomic_folder_exists_only_when_complete(tmp_path):
     assert [one.relative_to(tmp_path).as_posix() for one in tmp_path.rglob("*")] == ["made", "made/all"]
 
 
+def test_error_of_another_file_is_not_one_of_the_folder(tmp_path):
+    with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "made"):
+        (tmp_path / "input.obj").read_bytes()
+    assert not list(tmp_path.iterdir())
+
+
 def test_atomic_folder_leaves_nothing_when_the_disk_is_full(tmp_path):
     with pytest.raises(InputError, match="No space left"):
         fail_while_writing(tmp_path / "made", OSError(28, "No space left on device"))
