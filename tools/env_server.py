@@ -34,7 +34,7 @@ def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
         options: Options of the environment by name; they override those of the run.
 
     Raises:
-        InputError: If there is no such task, or an option is invalid.
+        InputError: If there is no such task, the files of a run's task have changed, or an option is invalid.
     """
     if (Path(name) / "config.yaml").is_file():
         config = RunFolder(name).config()
