@@ -68,7 +68,10 @@ class AxisDistance(TransitionDistance):
 @register(TRANSITION_DISTANCES, "tilt_to_go")
 @dataclass(frozen=True)
 class TiltToGo(TransitionDistance):
-    """Remaining tilt towards F's z axis, until_deg minus the present tilt."""
+    """Remaining tilt towards F's z axis, until_deg minus the present tilt.
+
+    The tilt is in (−180°, 180°], so the distance jumps by 360° where the tilt passes 180°.
+    """
 
     frame: str  # F: frame of an object, or `world`
     until_deg: float  # tilt at which the distance is zero
