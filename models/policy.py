@@ -70,18 +70,18 @@ class Policy:
             self._image_shape = None if image is None else tuple(image)
             self._low, self._high = (np.asarray(description[f"action_{end}"], np.float32) for end in ("low", "high"))
         except (KeyError, TypeError, OverflowError) as error:
-            raise ValueError("a description has the observation's shape, and the action's limits as numbers") from error
+            raise ValueError("a description needs observation_shape, action_low and action_high, as numbers") from error
         self._check()
 
     def _check(self) -> None:
         """Raise a ValueError if description and layers are inconsistent."""
         image = self._image_shape
         if any(type(n) is not int or n < 1 for n in (*self._shape, *(image or ()), self.description.get("pool", 1))):
-            raise ValueError("a shape, and the side of a square of pixels, are positive whole numbers")
+            raise ValueError("observation_shape, image_shape and pool must be positive whole numbers")
         if self._low.ndim != 1 or self._low.shape != self._high.shape or not (self._low < self._high).all():
-            raise ValueError("an action has a lower limit below an upper one for each of its numbers")
+            raise ValueError("action_low and action_high must be vectors of one size, the first below the second")
         if image is not None and (len(image) != 3 or math.prod(image) > math.prod(self._shape)):
-            raise ValueError("an image has height, width and channels, and is part of the observation")
+            raise ValueError("image_shape must be (height, width, channels) and fit into the observation")
         if image is not None and "pool" not in self.description:
             raise ValueError("a policy of images needs `pool`, the side of the squares of pixels that are averaged")
         if any(bias.ndim != 1 for _, bias in (*self._encoder, *self._layers)):
@@ -89,10 +89,10 @@ class Policy:
         sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
         expected = [(out, into) for into, out in pairwise(sizes)]
         if not self._layers or [weight.shape for weight, _ in self._layers] != expected or sizes[-1] != len(self._low):
-            raise ValueError(f"layers lead from {sizes[0]} features to {len(self._low)} actions, one after the other")
+            raise ValueError(f"layers must be a chain from {sizes[0]} features to {len(self._low)} action entries")
         numbers = [self._low, self._high, *(array for layer in (*self._encoder, *self._layers) for array in layer)]
         if any(array.dtype != np.float32 or not np.isfinite(array).all() for array in numbers):
-            raise ValueError("weights and limits are finite and of single precision")
+            raise ValueError("weights and limits must be finite and of single precision")
 
     def _num_features(self) -> int:
         """Return the number of inputs of the first layer."""
@@ -103,7 +103,7 @@ class Policy:
         channels, sides = self._image_shape[2], [side // self.description["pool"] for side in self._image_shape[:2]]
         for weight, bias in self._encoder:
             if weight.shape != (len(bias), channels, 3, 3) or min(sides) < 3:
-                raise ValueError("convolutions are 3 × 3, one after the other, and fit into the image")
+                raise ValueError("convolutions must be a chain of 3 × 3 kernels that fit into the image")
             channels, sides = len(bias), [(side - 1) // 2 for side in sides]
         return channels * math.prod(sides) + math.prod(self._shape) - math.prod(self._image_shape)
 
@@ -119,8 +119,8 @@ class Policy:
         for path in (weights, description):
             if not path.is_file():
                 raise InputError(
-                    f"{folder} holds no {path.name}: train it first, or finish it with --resume (--episodes ends it "
-                    "early)"
+                    f"{folder} holds no {path.name}: train a policy first, or finish the run with --resume (--episodes "
+                    "ends it early)"
                 )
         try:
             values = json.loads(read_bytes(description, "description of a policy", MAX_DESCRIPTION_SIZE))
@@ -153,7 +153,7 @@ class Policy:
         write(folder / "policy.json", json.dumps(values, indent=2).encode() + b"\n")
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action for one observation, in the units of the action space.
+        """Return the action (A,) for one observation, in the units of the action space.
 
         Raises:
             ValueError: If the observation does not have the shape of the training's observations.

@@ -35,9 +35,9 @@ class SctStateMachine(LeafSystem):
     ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``initial_pose`` is the
     measured pose. It replaces ``pose`` at initialization, when a commanded ``pose`` may not be initialized yet.
     ``state`` is (1,), the number of the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_q of
-    the current state q in meters or radians. ``progress`` is (1,), the progress in the whole task: it accumulates over
-    the states, and increases in a step by the decrease of the transition distance (d_{t−1} − d_t of equation 3.2) times
-    the weight of the state.
+    the current state q in meters or radians. ``progress`` is (1,), the progress in the whole task, accumulated over the
+    states. Its increase in a step is the decrease d_{t−1} − d_t of the transition distance (equation 3.2) times the
+    weight of the state.
 
     Args:
         template: Shared control template.

@@ -103,7 +103,7 @@ def add_demonstration(
 ) -> LcNsKmpSystem:
     """Add the primitive without actions, constraints or history, which commands the mean of the reference.
 
-    The reference is the demonstrations', or the input ``reference_window`` if `takes_window` is True.
+    The reference is that of the demonstrations, or the input ``reference_window`` if `takes_window` is True.
     """
     primitive = config.primitive(history=False, constrained=False)
     kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
@@ -150,6 +150,9 @@ class KgrlGuidance(PrimitiveGuidance):
         """Construct the guidance; without constraints it is the guidance `residual_covariance`.
 
         With `takes_window`, mean and covariance come from the input ``reference_window``, not from the demonstrations.
+
+        Raises:
+            InputError: If there are limits of speed, acceleration or joints, but `constrained` is False.
         """
         super().__init__()
         task, builder = primitive_config_of(prior), DiagramBuilder()
@@ -190,7 +193,7 @@ class SkgrlGuidance(PrimitiveGuidance):
     """Guidance by sKGRL: null-space actions with a history of outputs, so that exploration is smooth.
 
     With an adaptive history, the motion passes through fewer past outputs during contact, so that it reacts to forces
-    as quickly as KGRL. The shortest history is the last output: every command starts where the previous one ended.
+    as quickly as KGRL. With the shortest history, the motion passes through the last output only.
     """
 
     def __init__(self, prior: PriorKnowledge):

@@ -27,7 +27,7 @@ HISTORY_SOURCES = ("commanded", "measured")
 
 
 def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.ndarray:
-    """Return limits (O,), given O limits, or one limit for all positions and a second one for all angles.
+    """Return one limit for each output, (O,), from O limits, or from one for positions and a second one for angles.
 
     Angles have no limit (infinity) if only one limit is given.
 
@@ -58,11 +58,11 @@ class PrimitiveConfig:
             measured history at a high rate, commands would follow the robot, and the force would vanish. Use measured
             poses if an operator may push a robot that tracks well.
         horizon: H, number of future points at which the constraints are satisfied.
-        lambda_: λ of the thesis's problem 4.5.
-        beta: β of the thesis's problem 4.5.
-        kernel: k of the movement primitive.
+        lambda_: Regularization λ of the thesis's problem 4.5.
+        beta: Weight β of a null-space action in the thesis's problem 4.5.
+        kernel: Kernel k of the movement primitive.
         action_scale: κ; a constant action of ±1 moves the outputs by √3 κ standard deviations of the demonstrations.
-        action_dims: Indices of the outputs that an action moves, one entry each; default: all.
+        action_dims: Indices of the outputs that the action moves; the action has one entry for each. Default: all.
         gains: Null-space action per unit of the policy's action, (O,); default: computed from κ.
         isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all
             outputs of a group. Default: one group.
@@ -99,7 +99,7 @@ class PrimitiveConfig:
 
     def __post_init__(self) -> None:
         if self.history_source not in HISTORY_SOURCES:
-            raise InputError(f"a history is {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
+            raise InputError(f"history_source must be {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
         if not (np.isfinite(self.action_scale) and self.action_scale > 0):
             raise InputError(f"action_scale must be positive, not {self.action_scale}")
         if self.progress is not None and self.constraints.num_steps is not None:
@@ -174,7 +174,7 @@ class PrimitiveConfig:
         return gains
 
     def residual_gains(self) -> np.ndarray:
-        """Return the displacement (O,) of a residual command by an action of one, equal in each isotropic group."""
+        """Return the displacement (O,) of a residual command per unit of the action, equal in each isotropic group."""
         return residual_gains(self.reference, self.action_scale, self.isotropic_groups or ())
 
 
@@ -196,7 +196,7 @@ class PlacedTemplate:
     max_tracking_error: float = np.inf
 
     def constrained(self, by_default: bool) -> bool:
-        """Return `active_constraints`, or the guidance's own `by_default` if it is None."""
+        """Return `active_constraints`; if that is None, the guidance's default, `by_default`."""
         return by_default if self.active_constraints is None else self.active_constraints
 
 

@@ -69,7 +69,7 @@ class ResidualDescent(Guidance):
 class ResidualGuidance(PrimitiveGuidance):
     """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t.
 
-    Motion constraints, such as limits of the speed, are not enforced.
+    Shapes among the motion constraints are not enforced; limits of speed, acceleration and joints are refused.
     """
 
     def __init__(
@@ -88,7 +88,8 @@ class ResidualGuidance(PrimitiveGuidance):
             takes_window: True to take the motion from the input ``reference_window`` instead of the demonstrations.
 
         Raises:
-            InputError: If the motion waits for the robot (``progress=state``).
+            InputError: If the motion waits for the robot (``progress=state``), or its speed, acceleration or joints are
+                limited.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()
@@ -117,7 +118,7 @@ class ResidualGuidance(PrimitiveGuidance):
     displaces=True,
 )
 def residual(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning with demonstrations, or with a scripted approach behind active constraints."""
+    """Build residual learning with demonstrations, or with a scripted approach and active constraints."""
     return ResidualGuidance(prior) if prior.demonstrations is not None else ResidualDescent(prior)
 
 
@@ -130,7 +131,7 @@ def residual(prior: PriorKnowledge) -> Diagram:
     displaces=True,
 )
 def safe_residual(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning behind a filter that stops the command at walls; see `SafetyFilter`."""
+    """Build residual learning with a filter that stops the command at walls; see `SafetyFilter`."""
     return ResidualGuidance(prior, lambda config, keep_out: SafetyFilter(keep_out, config.control_period))
 
 
@@ -144,7 +145,7 @@ def safe_residual(prior: PriorKnowledge) -> Diagram:
     options=BarrierOptions,
 )
 def residual_cbf(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning behind a control barrier function; see `BarrierFilter`."""
+    """Build residual learning with a control barrier function on the command; see `BarrierFilter`."""
     decay = prior.options["barrier_decay"]
     return ResidualGuidance(
         prior, lambda config, keep_out: CommandFilter(BarrierFilter(keep_out, decay), config.control_period)

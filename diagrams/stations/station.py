@@ -1,11 +1,13 @@
 """Base class of all stations, their ports, and the parts that they share.
 
-A *station* is a diagram with a robot, its controller and the objects of a task. All stations have these ports:
+A *station* is a diagram with a robot, its controller and the objects of a task. All stations have these ports, with
+poses of O coordinates and wrenches of W components. The table describes O = W = 6; on the plane station O = W = 2, and
+poses and wrenches have only x and y:
 
 =================  =====  ==========================================================================================
 input              size   meaning
 =================  =====  ==========================================================================================
-`desired_pose`     6      desired pose X_TP of the tool center P, [x y z Rz Ry Rx] in meters and radians
+`desired_pose`     O      desired pose X_TP of the tool center P, [x y z Rz Ry Rx] in meters and radians
 `command_time`     1      optional: time of `desired_pose` [s]; if it stops increasing, the last safe pose is held
 `max_wrench`       8      optional, only if the impedance is bounded: largest [fx fy fz tx ty tz], norm of the force
                           and norm of the torque [N, Nm]; lowers the bound of the impedance
@@ -14,8 +16,8 @@ input              size   meaning
 ===================  =====  ========================================================================================
 output               size   meaning
 ===================  =====  ========================================================================================
-`pose`               6      measured pose X_TP, in the same coordinates
-`wrench`             6      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
+`pose`               O      measured pose X_TP, in the same coordinates
+`wrench`             W      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
                             N and Nm, without the tool's weight and inertia, low-pass filtered
 `contact_force`      1      magnitude of the impedance's force [N], by which collisions are detected
 `saturation`         1      1 while the controller is at a limit of force or torque, otherwise 0
@@ -108,7 +110,7 @@ class Impedance:
 
 
 def max_wrench(force: float, torque: float = np.inf) -> np.ndarray:
-    """Return the value (8,) of a station's `max_wrench` that keeps the impedance below a force [N] and a torque [Nm].
+    """Return a station's `max_wrench` (8,) that limits the impedance's force [N] and torque [Nm], as norms.
 
     A torque is limited to 1/√3 of `torque` about each axis, so that the norm never exceeds `torque`.
 
@@ -156,7 +158,7 @@ class Station(Diagram):
         plant: The simulated plant.
         scene_graph: Its scene graph.
         control_period: Time between commands [s].
-        wraps_angles: True if the pose's angles jump at the ends of (−π, π]; the angles of a gantry are unbounded.
+        wraps_angles: True if the pose's angles jump at ±π; the angles of a gantry are unbounded.
     """
 
     plant: MultibodyPlant
@@ -210,9 +212,10 @@ class Station(Diagram):
         raise InputError("joint_margin needs the joints of an arm: choose station=arm, or leave it out")
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiply the friction and modulus of all contacts by factors until the next reset, in the root context.
+        """Multiply the friction and modulus of all contacts by factors until the next reset.
 
-        The modulus is Drake's hydroelastic modulus, or the contact stiffness of another engine.
+        `context` is the root context. The modulus is Drake's hydroelastic modulus, or the contact stiffness of another
+        engine.
         """
         own = self.scene_graph.GetMyMutableContextFromRoot(context)
         inspector = self.scene_graph.model_inspector()
@@ -236,13 +239,17 @@ class Station(Diagram):
 class ControllerPlant:
     """Model of a robot for its controller: with tool and workpiece, without fixture and offsets."""
 
-    plant: MultibodyPlant  # plant with the robot only
+    plant: MultibodyPlant  # plant with the robot, tool and workpiece
     target: Frame  # target frame T
     tool_center: Frame  # frame of the tool center P
     posture: np.ndarray  # joint positions to which the null space returns, (n,)
 
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
-        """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""
+        """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,).
+
+        Raises:
+            InputError: If the pose is out of reach.
+        """
         X_TP = pose_to_transform(pose)
         from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 
@@ -271,7 +278,7 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
         if numbers.shape != (size,) or not np.isfinite(numbers).all():
             raise ValueError
     except (TypeError, ValueError):
-        raise InputError(f"a robot is put to a pose of {size} finite numbers, not {brief(pose)}") from None
+        raise InputError(f"the robot's pose must be {size} finite numbers, not {brief(pose)}") from None
     return numbers
 
 

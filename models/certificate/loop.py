@@ -1,4 +1,4 @@
-"""Primitive in its feedback loop, the subject of a certificate, and its reachable motions without constraints."""
+"""Feedback loop that a certificate is about: its data, and the set of its motions without active constraints."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 @dataclass(frozen=True)
 class CertifiedLoop:
-    """Primitive in its feedback loop."""
+    """Feedback loop of a primitive: the next command depends on the past commands (with a history) and the action."""
 
     primitive: LcNsKmp  # movement primitive
-    gains: np.ndarray  # null-space units per action (O,); zero for outputs that no action moves
+    gains: np.ndarray  # null-space action per unit of the action (O,); zero for outputs that no action moves
     period: float  # time between two commands [s]
-    start: np.ndarray  # output at which the robot begins (O,)
-    start_within: np.ndarray  # largest offset of the robot from `start` (O,)
+    start: np.ndarray  # output at which the robot begins (O,) [unit of the output]
+    start_within: np.ndarray  # largest offset of the robot from `start` (O,) [unit of the output]
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of one regime at every step; infinite where a command has no bound."""
+    """Bounds of the commands at every step, for one regime of `bounds`; infinite where a command has no bound."""
 
     lower: np.ndarray  # smallest command (N, O) [unit of the output]
     upper: np.ndarray  # largest command (N, O) [unit of the output]
@@ -33,9 +33,9 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
     """Compute the zonotope of motions without active constraints.
 
     Returns:
-        Center and generators of the zonotope. The center (P + N, O) is the motion without actions and begins with P
-        copies of the start. The generators (P + N, O, B) are one for each action of each step and, with a history, one
-        for each output of the start.
+        Center (P + N, O) and generators (P + N, O, B) of the zonotope [unit of the output]. The center is the motion
+        without actions; it begins with P copies of the start. There is one generator for each entry of each step's
+        action and, with a history, one for each output of the start.
     """
     primitive, past = loop.primitive, loop.primitive.history
     steps, outputs = primitive.num_steps, primitive.num_outputs
@@ -58,7 +58,7 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
     """Return lower and upper bounds (N, O) from the constraints on a single output, widened by `TOLERANCE`.
 
-    The bounds are infinite where no constraint has this output alone.
+    The bounds [unit of the output] are infinite where no constraint is on this output alone.
     """
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))

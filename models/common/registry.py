@@ -20,9 +20,9 @@ Entry = TypeVar("Entry")
 class Registry(Generic[Entry]):
     """Registry of entries by name.
 
-    Listing the names imports nothing; getting an entry imports its module. An entry is added by `register`, as a
-    decorator or a call: in a module of `package`, which is found without being imported; in an installed package with
-    an entry point of the group `entry_points`; or in any other file that is imported.
+    Getting an entry imports its module; listing the names imports no module if `decorator` is given. `register`, as a
+    decorator or a call, adds an entry: in a module of `package`, which is found without being imported; in an installed
+    package with an entry point of the group `entry_points`; or in any other file that is imported.
 
     Args:
         noun: Kind of the entries for messages, such as "task".
@@ -64,7 +64,7 @@ class Registry(Generic[Entry]):
         is_used, place = name in self._entries and existing != origin, existing[0]
         if self._decorator is not None and name not in self._entries and name in self._declarations:
             place = self._declarations[name].module
-            # The entry is that of the declaring module, which is being imported, or is executed under another name.
+            # The declaring module itself may register the name: while it is imported, or runs under another name.
             is_used = place not in sys.modules and origin[0] != _file(place)
         if is_used:
             raise InputError(f"there is a {self.noun} {name!r} already, from {place}: choose another name")
@@ -110,7 +110,7 @@ class Registry(Generic[Entry]):
         return getattr(import_module(value.module), value.name) if isinstance(value, _ImportedName) else value
 
     def declares(self, name: str, keyword: str) -> bool:
-        """Return True if `declared` imports at most the module that defines the value."""
+        """Return True if `declared` does not import the entry's module."""
         return name in self._entries or (name in self._declarations and keyword in self._declarations[name].values)
 
     @cached_property

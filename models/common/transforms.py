@@ -68,8 +68,8 @@ class RigidTransform:
     """Pose X_AB.
 
     Args:
-        R: Rotation R_AB, an object or a matrix (3, 3); the identity by default. A transform, which is copied, or a
-            translation (3,) may be given alone.
+        R: Rotation R_AB, an object or a matrix (3, 3); the identity by default. Without `p`, it can also be a
+            transform, which is copied, or a translation (3,).
         p: Translation p_AB (3,) [m]; zero by default.
     """
 
@@ -161,7 +161,7 @@ _EPSILON = float(np.finfo(float).eps)
 
 
 def rpy_angles(R: RotationMatrix) -> np.ndarray:
-    """Return roll, pitch and yaw (3,) [rad] of a rotation, in (−π, π], [−π/2, π/2] and (−π, π]."""
+    """Return roll, pitch and yaw (3,) [rad] of a rotation, in [−π, π], [−π/2, π/2] and [−π, π]."""
     M = R.matrix()
     M00, M10, M20, M21, M22 = float(M[0, 0]), float(M[1, 0]), float(M[2, 0]), float(M[2, 1]), float(M[2, 2])
     w, x, y, z = quaternion(R)
@@ -235,7 +235,7 @@ def pose_to_transform(pose: np.ndarray) -> RigidTransform:
 
 
 def transform_to_pose(X: RigidTransform) -> np.ndarray:
-    """Return the pose (6,) of a transform, also one of Drake, with a and c in (−π, π], b in [−π/2, π/2] [m, rad]."""
+    """Return the pose (6,) [m, rad] of a transform or a Drake transform, Rz and Rx in [−π, π], Ry in [−π/2, π/2]."""
     return np.concatenate([X.translation(), rpy_angles(X.rotation())[::-1]])
 
 
@@ -251,7 +251,7 @@ def _wrapped(angle: float) -> float:
 
 
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Convert a generalized force along the coordinates of a pose to the wrench (6,) at P in T that does the same work.
+    """Convert a generalized force (6,) along a pose's coordinates to the wrench (6,) at P in T that does the same work.
 
     The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are
     linearly dependent for b = ±π/2, near which the result is large. The pose is X_TP as [x y z a b c] (6,) [m, rad].

@@ -1,1 +1,1 @@
-"""Control laws without Drake systems: impedance, wrenches, joint faults."""
+"""Control laws without Drake systems: impedance, wrenches, limits and filters of commands, and joint status."""

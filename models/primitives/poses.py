@@ -25,7 +25,8 @@ POSE_NAMES: dict[str, tuple[str, ...]] = {
 }
 """Names of the six outputs, by the representation of the orientation."""
 
-# Names of the last three of six outputs, without units; those of Euler angles also as recordings are imported.
+# Orientation by the names of the last three of six outputs, in lower case and without units. `guiderail dataset import`
+# names Euler angles Rz, Ry and Rx.
 _ANGLE_NAMES = {
     ("psi_z", "psi_y", "psi_x"): "euler_zyx",
     ("rz", "ry", "rx"): "euler_zyx",
@@ -45,10 +46,10 @@ def check_orientation(orientation: object) -> Orientation:
 
 
 def orientation_of_names(names: Sequence[str]) -> Orientation | None:
-    """Return the orientation that the names of outputs state.
+    """Return the representation of the orientation that belongs to the names of six outputs.
 
-    Names of Euler angles are "Rz [rad]", "Ry [rad]", "Rx [rad]", as `guiderail dataset import` writes them, and those
-    of `POSE_NAMES`. The result is None for other names, and unless there are six.
+    Accepted names are those of `POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
+    `guiderail dataset import` writes them. The result is None for other names or another number of names.
     """
     plain = tuple(name.partition("[")[0].strip().lower() for name in names)
     return cast("Orientation | None", _ANGLE_NAMES.get(plain[3:])) if len(plain) == 6 else None
@@ -69,10 +70,11 @@ def pose_outputs(
         quaternions_wxyz: R_WE (N, 4), of either sign and of any length except zero.
         target_position: p_WT (3,) [m].
         target_quaternion_wxyz: R_WT (4,).
-        orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", for rotations
-            of about a half turn.
-        near: Orientation (3,) [rad] that selects the branch of the first sample; that of least magnitude by default.
-            Demonstrations of one motion must share a branch, or their mean is meaningless.
+        orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", which is
+            regular there.
+        near: Orientation (3,) [rad], zero by default. Of the representations of the first sample, which differ by full
+            turns, the one nearest to `near` is returned. Demonstrations of one motion must share a branch: otherwise
+            their mean is meaningless.
 
     Raises:
         InputError: If shapes do not match, a quaternion is zero, a number is not finite, or Euler angles are singular.

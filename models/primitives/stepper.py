@@ -1,4 +1,4 @@
-"""Movement primitive in consecutive control steps: its progress, and the commands of an episode without a diagram."""
+"""Stepping of a movement primitive: its commands in an episode without a diagram, and a rule for its progress."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Command:
 
     Attributes:
         output: Command (O,).
-        violation: max(c − G y) of the command, or its violation of the motion's constraints if there is a motion
-            filter: negative if all constraints are slack, −inf without constraints.
-        is_fallback: True if no window within the constraints was found; the command is then the point within the
-            constraints of its step that is nearest to the last command. Also True if only braking was left.
+        violation: Largest violation of the constraints, max(c − G y), or of the motion's constraints if there is a
+            motion filter; negative if all constraints are slack, −inf without constraints.
+        is_fallback: True if no window within the constraints was found, or if the motion filter had to brake. Without a
+            window, the primitive's output is the point nearest to the last command within the constraints of its step.
     """
 
     output: np.ndarray
@@ -36,12 +36,12 @@ class Command:
 
 
 class PrimitiveStepper:
-    """Commands of a primitive in consecutive control steps, as `LcNsKmpSystem` computes them in a diagram.
+    """Stepper of a primitive: computes the command of each control step, as `LcNsKmpSystem` does in a diagram.
 
     Args:
         primitive: Primitive with O outputs.
-        pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first mean by
-            default.
+        pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first mean of
+            the reference by default.
         gain: Raw null-space action per unit of the action (O,); ones by default.
         history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
             or is pushed by an operator.
@@ -100,9 +100,9 @@ class PrimitiveStepper:
             return self.finish(None)
 
     def request(self, action: ArrayLike, pose: ArrayLike | None = None) -> tuple[int, np.ndarray, np.ndarray | None]:
-        """Return the arguments of `LcNsKmp.predict` for the next step, for a batch of several episodes.
+        """Return the arguments of `LcNsKmp.predict` for the next step, so that several episodes can form a batch.
 
-        `action` (O,) and `pose` (O,) are those of `step`.
+        `action` (O,) and `pose` (O,) are those of `step`. Call `finish` with the predicted output.
 
         Raises:
             InputError: As `step`.
@@ -150,10 +150,10 @@ class StateProgress:
 
         s_{k+1} = s_k + 1  if ‖y − x‖ ≤ tolerance  or  k + 1 − s_k > max_lag,  else  s_k
 
-    for the position and, for poses (6,), for the angles. Progress never decreases and is at most `max_lag` steps behind
-    the clock. A contact that keeps the robot from its command by design, such as pressing in a search, therefore delays
-    the motion by at most `max_lag` steps. The tolerance should cover the deviations that contact and tracking cause
-    while nothing blocks the robot.
+    Here y is the last command and x the measured pose. For poses (6,), position and angles must each be within their
+    tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. A contact that keeps the robot
+    from its command by design, such as pressing in a search, therefore delays the motion by at most `max_lag` steps.
+    The tolerance should cover the deviations that contact and tracking cause while nothing blocks the robot.
 
     Raises:
         InputError: If an argument is out of range.
@@ -166,7 +166,7 @@ class StateProgress:
         if len(self.tolerance) != 2 or not all(0.0 < one < np.inf for one in self.tolerance):
             raise InputError(f"the tolerance of progress is two positive numbers, not {brief(self.tolerance)}")
         if not is_whole(self.max_lag, 0):
-            raise InputError(f"the largest lag of progress is a number of steps from 0, not {brief(self.max_lag)}")
+            raise InputError(f"max_lag must be a whole number of steps, at least 0, not {brief(self.max_lag)}")
 
     def next_step(self, step: int, clock: int, command: np.ndarray, pose: np.ndarray) -> int:
         """Return the step of the next command.

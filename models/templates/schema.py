@@ -144,7 +144,7 @@ def _number(entry: Any, info: ValidationInfo) -> float:
     if not math.isfinite(value):
         raise ValueError(f"must be a finite number, not {brief(entry)}")
     if abs(value) > MAX_NUMBER:
-        raise ValueError(f"must be at most a million, not {brief(entry)}; check its unit")
+        raise ValueError(f"must be at most a million in magnitude, not {brief(entry)}; check its unit")
     return value
 
 
@@ -268,7 +268,7 @@ def _state(entry: Any, info: ValidationInfo) -> Any:
         raise ValueError(f"ends_at_{unit} is missing; give it a value")
     state.ends_at = state.transitions[0].below if state.ends_at is None else state.ends_at
     if not state.starts_at > state.ends_at:
-        raise ValueError(f"starts_at_{unit} must be greater than where the phase ends; distances decrease")
+        raise ValueError(f"starts_at_{unit} must exceed the distance at the phase's end, because distances decrease")
     return state
 
 

@@ -1,6 +1,6 @@
 """Chunk cloning: an ensemble learns to predict the next commanded poses from an observation.
 
-The objective is that of action chunking with transformers (ACT).
+As in action chunking with transformers (ACT), the targets are chunks of future commands.
 """
 
 from collections.abc import Mapping
@@ -25,10 +25,10 @@ MIN_SCALE = 1e-6  # smallest scale of an output, because the standard deviation 
 class ChunkLearner(BcLearner):
     """Learner of a base policy that maps an observation to the next K commanded poses (mean squared error, Adam).
 
-    The policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations. The
-    spread of their outputs is the uncertainty of the chunk (Zhao et al., "Learning Fine-Grained Bimanual Manipulation
-    with Low-Cost Hardware", RSS 2023; Lakshminarayanan et al., 2017). The networks are exported as one network with
-    block-diagonal layers. The learner does not act: its action is always zero.
+    Chunks are those of Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", RSS 2023. The
+    policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations. The spread of their
+    outputs is the uncertainty of the chunk (Lakshminarayanan et al., 2017). The networks are exported as one network
+    with block-diagonal layers. The learner does not act: its action is always zero.
     """
 
     Config = ChunkConfig
@@ -42,7 +42,7 @@ class ChunkLearner(BcLearner):
         """
         super().__init__(config, env, **arguments)
         if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
-            raise InputError("chunk reads the commands of its own environment: leave pipelined and num_envs out")
+            raise InputError("chunk needs a task's environment in this process: leave pipelined and num_envs out")
         self._env = cast(Any, env.unwrapped)
         dims = self._env.task.declaration.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)
@@ -123,7 +123,7 @@ class ChunkLearner(BcLearner):
 
     def _training_rows(self, random: np.random.Generator) -> np.ndarray:
         """Return the indices of the samples in a bootstrap sample of the demonstrations, for training one network."""
-        # Not `self.episodes`: a run that is resumed after further episodes trains again.
+        # Not `self.episodes`, which is larger if a run is resumed, and trains again, after further episodes.
         groups, number = np.array(self._groups), self.config.demonstration_episodes
         drawn = random.integers(1, number + 1, size=number)
         return np.concatenate([np.flatnonzero(groups == one) for one in drawn])
@@ -132,7 +132,8 @@ class ChunkLearner(BcLearner):
         """Return the base policy: the ensemble as one network, whose output is limited to the demonstrated range."""
         if not len(self.network):
             raise InputError(
-                f"chunk learns after {self.config.demonstration_episodes} demonstrations: give as many --episodes"
+                f"chunk trains after {self.config.demonstration_episodes} demonstrations: give at least that many "
+                "--episodes"
             )
         members: list[Any] = [
             [one for one in member.children() if hasattr(one, "weight")] for member in self.network.children()

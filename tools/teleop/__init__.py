@@ -1,1 +1,1 @@
-"""Teleoperation in the browser, with and without a recording, and supervision of a training."""
+"""Teleoperation in the browser, with or without a recording, and human supervision of training runs."""

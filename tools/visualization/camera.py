@@ -32,7 +32,7 @@ class Frames(EnvCallback):
     The environment must have been created with `render_mode="rgb_array"`.
 
     Attributes:
-        frames: Time [s], contact force [N] and image of each frame.
+        frames: Time [s], contact force [N] and image (height, width, 3) of each frame.
     """
 
     def __init__(self, env: Any, max_frames: int = MAX_FRAMES):
@@ -64,7 +64,7 @@ class Frames(EnvCallback):
 
 
 def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write `ROWS` × `COLUMNS` of its camera frames as one picture; return the episode's row.
+    """Run an episode and write `ROWS` × `COLUMNS` of its camera frames as one picture; return the row of its metrics.
 
     Raises:
         InputError: If this machine cannot render, or the picture cannot be written.
@@ -79,7 +79,7 @@ def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
 
 
 def write_video(video: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write its camera frames as an animated image that plays in real time; return its row.
+    """Run an episode and write its camera frames as an animated image in real time; return the row of its metrics.
 
     Raises:
         InputError: If this machine cannot render, or the video cannot be written.
@@ -105,7 +105,7 @@ def write_video(video: Path, episode: EpisodeSpec) -> dict[str, Any]:
 
 
 def record_frames(episode: EpisodeSpec, number: int) -> tuple[dict[str, Any], list[Any]]:
-    """Run an episode; return its row and `number` camera frames: time, force, image and path of each.
+    """Run an episode; return the row of its metrics and `number` camera frames: time, force, image and path of each.
 
     The path (n, 2) is the robot's path up to the frame, in pixels of the image.
 
@@ -119,7 +119,7 @@ def record_frames(episode: EpisodeSpec, number: int) -> tuple[dict[str, Any], li
 
 
 def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]:
-    """Run an episode; return its row and at most `max_frames` camera frames."""
+    """Run an episode; return the row of its metrics and at most `max_frames` camera frames."""
     env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
     env.reset(seed=episode.run_seed)
     frames, policy = Frames(env, max_frames), episode.policy(env)

@@ -139,7 +139,10 @@ def table_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) 
 
 
 def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
-    """Return the convex pieces of a hole's wall, chamfer and face, with the polygonal surface of `hole_mesh`."""
+    """Return the vertices (V, 3) [m] of the convex pieces of a hole's wall, chamfer and face.
+
+    The pieces have the polygonal surface of `hole_mesh`.
+    """
     d = dimensions
     profile = [
         [d.hole_radius + d.hole_chamfer, 0.0],
@@ -152,7 +155,7 @@ def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
 
 
 def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
-    """Return the convex pieces of the lip, with the polygonal surface of `lip_mesh`."""
+    """Return the vertices (V, 3) [m] of the convex pieces of the lip, with the polygonal surface of `lip_mesh`."""
     d = dimensions
     top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
     profile = [

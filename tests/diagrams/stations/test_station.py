@@ -25,7 +25,7 @@ def test_set_pose_raises_when_the_pose_is_not_finite(task, place):
     whole = np.zeros(station.pose_size)
     broken = [np.r_[np.nan, whole[1:]], np.r_[whole[1:], -np.inf], whole[1:], [*whole, 0.0], ["a"] * len(whole), None]
     for pose in broken:
-        with pytest.raises(InputError, match=f"put to a pose of {station.pose_size} finite numbers, not"):
+        with pytest.raises(InputError, match=f"pose must be {station.pose_size} finite numbers, not"):
             station.set_pose(context, pose)
 
 

@@ -182,7 +182,7 @@ def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
 
     with pytest.raises(Killed):
         run_training(folder, replace(bead_config, episodes=3), resume=True, report=kill)
-    with pytest.raises(InputError, match="finish it with --resume"):
+    with pytest.raises(InputError, match="finish the run with --resume"):
         Policy.load(folder.path)
     run_training(folder, replace(bead_config, episodes=3), resume=True)
     before = Policy.load(folder.path).description
