@@ -25,8 +25,8 @@ COLUMNS = (
 )  # fmt: skip
 README_COLUMNS = (
     "task", "guided, success [%]", "residual RL, success [%]", "scripted / random, success [%]",
-    "training episodes per seed (seeds)", "training episodes ended by force or collision, guided [%]",
-    "the same, residual RL [%]",
+    "training episodes per seed (seeds)", "stopped in training, guided [%]",
+    "stopped in training, residual RL [%]",
 )  # fmt: skip
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
