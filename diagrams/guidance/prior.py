@@ -32,11 +32,11 @@ def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.nd
     Angles have no limit (infinity) if only one limit is given.
 
     Raises:
-        InputError: If there are more than two limits but not O; `name` is their name in the message.
+        InputError: If there are no limits, or more than two but not O; `name` is their name in the message.
     """
     if len(limits) == outputs:
         return np.array(limits)
-    if len(limits) > 2:
+    if not 1 <= len(limits) <= 2:
         raise InputError(f"{name} is 1, 2 or {outputs} numbers for {outputs} outputs, not {len(limits)}")
     return np.where(np.arange(outputs) < 3, limits[0], (*limits, np.inf)[1])
 

@@ -88,14 +88,17 @@ def pose_outputs(
         raise InputError(
             f"poses need positions (N, 3) and quaternions (N, 4), not {positions.shape} and {quaternions.shape}"
         )
+    p_WT, q_WT = np.asarray(target_position, dtype=float), np.asarray(target_quaternion_wxyz, dtype=float)
+    if p_WT.shape != (3,) or q_WT.shape != (4,):
+        raise InputError(f"the target needs a position (3,) and a quaternion (4,), not {p_WT.shape} and {q_WT.shape}")
     if not (np.isfinite(positions).all() and np.isfinite(quaternions).all()):
         raise InputError("poses contain NaN or infinity: cut those samples out")
-    if not (np.isfinite(target_position).all() and np.isfinite(target_quaternion_wxyz).all()):
+    if not (np.isfinite(p_WT).all() and np.isfinite(q_WT).all()):
         raise InputError("the target's pose must be finite")
-    if np.linalg.norm(quaternions, axis=1).min() < 1e-6 or np.linalg.norm(target_quaternion_wxyz) < 1e-6:
+    if np.linalg.norm(quaternions, axis=1).min() < 1e-6 or np.linalg.norm(q_WT) < 1e-6:
         raise InputError("a quaternion of length zero has no orientation")
-    R_WT = Rotation.from_quat(target_quaternion_wxyz, scalar_first=True)
-    p_TE = R_WT.inv().apply(positions - np.asarray(target_position, dtype=float))
+    R_WT = Rotation.from_quat(q_WT, scalar_first=True)
+    p_TE = R_WT.inv().apply(positions - p_WT)
     R_TE = R_WT.inv() * Rotation.from_quat(quaternions, scalar_first=True)
     if orientation == "euler_zyx":
         if np.abs(R_TE.as_matrix()[:, 2, 0]).max() > SINGULAR:

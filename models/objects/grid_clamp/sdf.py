@@ -133,7 +133,7 @@ def table_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) 
         for number, (x, y) in enumerate(d.peg_positions)
         for side, hull in enumerate(hole_hulls(d))
     ]
-    lip = [Surface(f"lip_{side}", "lip", Hull(hull), BEAD.friction) for side, hull in enumerate(lip_hulls(d))]
+    lip = [Surface(f"lip_{side}", "lip", Hull(hull), LIP.friction) for side, hull in enumerate(lip_hulls(d))]
     slab = Box(d.table_width, d.table_width, d.table_thickness)
     return [*holes, *lip, Surface("slab", "slab", slab, friction, (0.0, 0.0, -d.table_thickness / 2))]
 

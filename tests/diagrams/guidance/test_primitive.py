@@ -11,7 +11,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import PrimitiveOptions
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
+from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
@@ -319,3 +319,12 @@ def test_one_number_limits_the_speed_of_all_positions():
     assert speeds == [(0.5,), (0.5,)]
     with pytest.raises(InputError, match="max_speed must be several numbers, such as"):
         EnvConfig.resolve("NarrowPassage", {"max_speed": True})
+
+
+def test_limits_are_one_or_two_or_one_for_each_output():
+    np.testing.assert_array_equal(limits_per_output("max_speed", [0.1], 6), [0.1] * 3 + [np.inf] * 3)
+    np.testing.assert_array_equal(limits_per_output("max_speed", [0.1, 2.0], 6), [0.1] * 3 + [2.0] * 3)
+    np.testing.assert_array_equal(limits_per_output("max_speed", [1.0, 2.0, 3.0, 4.0], 4), [1, 2, 3, 4])
+    for limits in [], [1.0, 2.0, 3.0]:
+        with pytest.raises(InputError, match=f"max_speed is 1, 2 or 6 numbers for 6 outputs, not {len(limits)}"):
+            limits_per_output("max_speed", limits, 6)

@@ -100,6 +100,9 @@ def test_pose_outputs_refuse_invalid_poses():
     for target in ([0.0, np.nan, 0.0], [1, 0, 0, 0]), (np.zeros(3), [np.nan, 0, 0, 0]):
         with pytest.raises(InputError, match="target's pose must be finite"):
             pose_outputs(positions, quaternions, *target)
+    for target in (np.zeros(2), [1, 0, 0, 0]), (np.zeros(3), [1, 0, 0]):
+        with pytest.raises(InputError, match=r"the target needs a position \(3,\) and a quaternion \(4,\), not"):
+            pose_outputs(positions, quaternions, *target)
     with pytest.raises(InputError, match="length zero"):
         pose_outputs(positions, quaternions, np.zeros(3), [1e-7, 0, 0, 0])
     pose_outputs(positions, quaternions, np.zeros(3), [1e-5, 0, 0, 0])
