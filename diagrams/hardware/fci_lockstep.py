@@ -1,9 +1,9 @@
 """Lockstep of a hardware station with a simulated Franka: each waits for the other, however slow the machine is.
 
-libfranka's protocol has no message that makes a robot wait. The simulated robot therefore listens on a second port
+libfranka's protocol has no message that makes a robot wait. The simulated robot therefore listens on `LOCKSTEP_PORT`
 for requests, one JSON object a line, and answers each with its time [s]. ``{"advance": h}`` is answered when the
-robot's clock has advanced by h [s]; then the robot waits. ``{"parts": [fixture, workpiece]}`` moves the task's parts by
-their offsets.
+robot's clock has advanced by h [s]; during a motion the robot then waits for the next request.
+``{"parts": [fixture, workpiece]}`` moves the task's parts by their offsets.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class FciLockstepClock(Clock):
         return self._time
 
     def move_parts(self, offsets: list[list[float]]) -> None:
-        """Move the task's fixture and workpiece by their offsets, as `InsertionTask.part_offsets` defines them."""
+        """Move the task's fixture and workpiece by their offsets, the arguments of `part_poses`."""
         self._request({"parts": offsets})
 
     def _follow(self, seconds: float) -> None:
@@ -82,10 +82,10 @@ class FciLockstepClock(Clock):
 
 
 class LockstepServer:
-    """The simulated robot's end of the connection, which never blocks."""
+    """Connection of the simulated robot to the station; no call waits for the station."""
 
     def __init__(self, host: str):
-        """Listen at the address `host`."""
+        """Listen on `LOCKSTEP_PORT` at the address `host`."""
         self._listener = socket.create_server((host, LOCKSTEP_PORT))
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
@@ -102,7 +102,7 @@ class LockstepServer:
         return self._client or self._listener
 
     def receive(self) -> dict[str, Any] | None:
-        """Return the next request, or None if there is none."""
+        """Return the next request, or None if there is none; accept a station that connects."""
         try:
             if self._client is None:
                 self._client, _ = self._listener.accept()

@@ -43,7 +43,8 @@ STEP = 0.001  # period of the protocol [s]
 # Steps of the engine in a period. With one step, a contact with a time constant of 2 ms lasts a single step: the tool
 # bounces from it every 5 ms, and joint velocities jump by 0.07 rad/s.
 SUBSTEPS = 4
-IDLE_RATE = 0.1  # rate of the robot's clock relative to the wall clock, without a motion and while the station computes
+# Rate of the robot's clock relative to the wall clock, in lockstep without a motion, between the station's requests.
+IDLE_RATE = 0.1
 REPEAT_INTERVAL = 0.2  # wall clock time after which the state of a waiting robot is sent again [s]
 RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "without gravity and friction"
 # A robot without motion is held by joint stiffness [Nm/rad] and damping [Nms/rad], in place of its brakes. With the
@@ -106,7 +107,7 @@ class WorkcellSimulator(MujocoSimulator):
         """Construct the simulator of a task's workcell, a `ConvexWorkcell`, with a friction of each joint [Nm].
 
         Raises:
-            InputError: If the workcell has no convex solids.
+            InputError: If the workcell has no convex solids, or more pairs of surfaces than MuJoCo distinguishes.
         """
         super().__init__()
         self.model_of_arm = ArmControllerPlant(workcell, "panda")
@@ -220,7 +221,11 @@ class _RobotServer(FrankaRobotServer):
         return state.replace(errors=errors, reflex_reason=errors, robot_mode=RobotMode.kReflex)
 
     def start_motion(self, controller_mode: Any, motion_generator_mode: Any, motion_id: int) -> None:
-        """Start a motion, unless a reflex has not been cleared."""
+        """Start a motion.
+
+        Raises:
+            RuntimeError: If a reflex has not been cleared.
+        """
         if self.reflex is not None:
             raise RuntimeError(f"a motion is requested after {self.reflex.name.lower()}")
         self._command = np.zeros(7)
@@ -271,16 +276,17 @@ def serve(
 ) -> None:
     """Simulate the robot and answer libfranka's protocol, in lockstep with a `FciLockstepClock` if one is connected.
 
-    In lockstep the robot's clock waits for the station's requests, and for the client's answer to each state of a
-    motion. Without a motion the clock never stops, but runs slowly: every read of a state in libfranka waits for a new
-    state. Without a station in lockstep the clock follows the wall clock, or falls behind it on a slow machine.
+    In lockstep and during a motion, the robot's clock waits for the station's requests, and for the client's answer to
+    each state. In lockstep without a motion, the clock runs slowly (`IDLE_RATE`) between requests and never stops,
+    because every read of a state in libfranka waits for a new state. Without a station in lockstep the clock follows
+    the wall clock, or falls behind it on a slow machine.
 
     Args:
         simulator: Simulator of the robot and the parts.
         pose: Initial pose of the tool center, (6,).
         parts: Poses of the parts, the arguments of `WorkcellSimulator.move_parts`.
         seconds: Simulated time to run [s].
-        rate: Rate of the robot's clock relative to the wall clock.
+        rate: Rate of the robot's clock relative to the wall clock, positive; not used in lockstep.
         host: Address of this machine to listen on.
         log: Function that shows the address when clients can connect, and the reason of each reflex.
     """

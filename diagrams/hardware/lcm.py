@@ -27,8 +27,8 @@ MICROSECOND = 1e-6  # unit of a message's time [s]
 HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
 HEARTBEAT_FORMAT = struct.Struct(">q?q")
-# A safety monitor has ended if this many heartbeats of others arrived after its last one. `MAX_SENDERS` monitors send
-# this number of heartbeats in `FORGET_TIME`.
+# A safety monitor has ended if more than this number of heartbeats of others arrived after its last one. `MAX_SENDERS`
+# monitors send this number of heartbeats in `FORGET_TIME`.
 MAX_HEARTBEATS_MISSED = MAX_SENDERS * round(FORGET_TIME / STATUS_PERIOD)
 
 
@@ -85,11 +85,11 @@ def check_handlers() -> None:
 
 
 class MessageCounter:
-    """Counter of the messages of a channel; messages of the same type and time count once, whatever their torques.
+    """Counter of the messages of a channel; consecutive messages of the same type and time count once.
 
     Attributes:
-        count: Number of different messages.
-        repeats: Number of repeated messages.
+        count: Number of messages that differ from their predecessor in type or time.
+        repeats: Number of the other messages.
         head: Type and time of the newest message, which identify it.
     """
 
@@ -194,7 +194,10 @@ class LcmDriver(Driver):
         self.lcm.Publish(self.command_channel, message)
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive the messages that have arrived; if there are none, wait at most `timeout` [s]."""
+        """Receive the messages that have arrived; if there are none, wait at most `timeout` [s].
+
+        LCM waits for whole milliseconds: a positive timeout is rounded down, to at least 1 ms.
+        """
         self.lcm.HandleSubscriptions(max(1, int(1000 * timeout)) if timeout > 0.0 else 0)
 
     def check_usable(self) -> None:
@@ -208,12 +211,12 @@ class LcmDriver(Driver):
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
         """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`.
 
-        A monitor is left out after others have sent `MAX_HEARTBEATS_MISSED` heartbeats without one of its own.
+        A monitor is left out after others have sent more than `MAX_HEARTBEATS_MISSED` heartbeats since its last one.
         """
         return tuple(heartbeat for heartbeat, *_ in self._heartbeats.values())
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Send a heartbeat of the safety monitor, on a channel on which no other monitor has been received."""
+        """Send a heartbeat of the safety monitor, if possible on a channel that no other monitor uses."""
         taken = {number for other, number, _ in self._heartbeats.values() if other.sender != heartbeat.sender}
         if self._number in taken:
             # Two monitors that see each other choose at random, because the same choice would collide again.

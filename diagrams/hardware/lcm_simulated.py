@@ -66,7 +66,7 @@ class SimulatedIiwa(Diagram):
             directives: Model directives of the surroundings.
 
         Raises:
-            InputError: If the directives cannot be followed.
+            InputError: If the time step is not positive, or the directives cannot be followed.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -173,7 +173,7 @@ def serve_in_lockstep(
         lcm: Bus shared with the other process.
         seconds: Simulated time to run [s].
         command_timeout: Longest wall clock time to wait for an acknowledgement [s]; ten times as long for the first.
-        after_status: Function that is called after every status, for a safety monitor.
+        after_status: Function that is called before and after every step, such as `SafetyMonitor.check`.
 
     Returns:
         The simulated time of the end [s]; less than `seconds` if acknowledgements stopped.
@@ -252,7 +252,7 @@ def serve_in_real_time(
     Args:
         simulator: Simulator of the arm, initialized.
         seconds: Simulated time to run [s].
-        after_status: Function that is called after every status, for a safety monitor.
+        after_status: Function that is called after every step, such as `SafetyMonitor.receive`.
         rate: Rate of the robot's clock relative to the wall clock.
         log: Function that shows a message.
 

@@ -42,7 +42,8 @@ class SafetyMonitor:
     `StateEstimator` as the station, by a clock of its own, and sends a heartbeat with every check, so that a commanding
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
     (`CommandSequence`): the arm is damped, and then has no torque until only one program sends. During a
-    stop the monitor sends torques even if no status arrives, so that the driver never repeats a torque.
+    stop the monitor sends torques even if no status arrives, so that the driver never repeats a torque. If the status
+    is wrong and the driver can hold the arm, the monitor calls `Driver.hold` instead.
 
     Attributes:
         state: Current state.
@@ -60,9 +61,12 @@ class SafetyMonitor:
 
         Args:
             driver: The monitor's own connection to the robot.
-            plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
-            limits: Torque limits, and durations of the phases of a stop.
+            plant: Controller plant of the arm and its tool, finalized; its dynamics and velocity limits are used.
+            limits: Limits of the arm, of which torque limits, damping time and decay time are used.
             clock: Function that returns the local time [s].
+
+        Raises:
+            InputError: If the driver cannot receive in this environment, or cannot read other programs' commands.
         """
         driver.check_usable()
         self.state, self.fault = MonitorState.IDLE, Fault.NO_STATUS

@@ -37,7 +37,7 @@ WATCHDOG_FREQUENCY = 10.0  # the controller ends its program when commands arriv
 MAX_ZEROED_FORCE = 15.0  # largest force that a drifted sensor may show before it is zeroed [N]
 MAX_POSE_DIFFERENCE = 0.02  # largest distance of the robot's calibrated tool center from the model's [m]
 NO_TRANSFORM = 2  # argument `type` of forceMode: the force frame is not transformed
-RECOVERY_TIME = 2.0  # longest wait for the status after a recovery [s]
+RECOVERY_TIME = 2.0  # longest wait until the robot reports no stop after a recovery [s]
 NUM_ATTEMPTS = 10  # attempts to read values that belong to one message
 # The controller's frame "base" is rotated by 180° about z from the model's base frame. In the model's frame, the arm
 # points along +x if all joint positions are zero.
@@ -98,6 +98,8 @@ class RtdeDriver(PoseDriver):
 
     def configure(self, impedance: RobotImpedance) -> None:
         """Set tool center and payload, zero the force sensor and start the controller's program; nothing moves.
+
+        Call it after `read` has returned a status. While poses are commanded, only the impedance is replaced.
 
         Raises:
             InputError: If the robot cannot be connected or refuses a setting, or if its force sensor measures more than
@@ -170,7 +172,7 @@ class RtdeDriver(PoseDriver):
         return ""
 
     def check_setup(self) -> list[Check]:
-        """Check state, kinematics and program of the robot."""
+        """Check state, program and kinematics of the robot, after `read` has returned a status."""
         distance = self._kinematic_distance()
         speed, acceleration, jerk = self.motion_limits.linear
         return [
@@ -190,7 +192,14 @@ class RtdeDriver(PoseDriver):
         ]
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
-        """Command the wrench of the impedance towards a pose of the tool center in the robot's base frame."""
+        """Command the wrench of the impedance towards a pose of the tool center in the robot's base frame.
+
+        `time` is not used: force mode has no time stamps.
+
+        Raises:
+            InputError: If the driver is not configured, the robot refuses its watchdog, or before the first command the
+                robot's tool center differs from the model's by more than `MAX_POSE_DIFFERENCE`.
+        """
         del time
         impedance, status = self._impedance, self._status
         if impedance is None or status is None:
@@ -234,7 +243,7 @@ class RtdeDriver(PoseDriver):
         """End a protective stop, and start the controller's program again; the arm does not move.
 
         Raises:
-            InputError: If the robot still accepts no commands.
+            InputError: If the connection is lost, or the robot still accepts no commands.
         """
         self._is_active = False
         if self._is_lost:

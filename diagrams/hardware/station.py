@@ -56,12 +56,13 @@ from guiderail.systems.wrench_tare import WrenchTare
 
 @register_station("hardware", workcell_kind="insertion", options=HardwareOptions, is_simulated=False)
 class HardwareStation(Station):
-    """A real arm under the impedance controller of this program, behind a `Driver`.
+    """A real arm with an impedance at its tool center, connected by a `Driver`.
 
-    Commands are joint torques, statuses are joint states. The robot's own controller compensates gravity in torque
-    mode, so this station does not. The wrench is estimated from the external joint torques; there is no wrist sensor.
-    `start` waits for the first status. Nothing is sent until statuses have been valid for the settling time; then the
-    torques are blended in, and the arm stays where it is.
+    Statuses are joint states. Commands are the joint torques of this station's impedance controller. If the driver is a
+    `PoseDriver`, they are desired poses, and the robot's own program runs the impedance controller. The robot's own
+    controller compensates gravity in torque mode, so this station does not. The wrench is estimated from the external
+    joint torques; there is no wrist sensor. `start` waits for the first status. Nothing is sent until statuses have
+    been valid for the settling time; then the torques are blended in, and the arm stays where it is.
 
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
     `TorqueSafetyLimiter` measurements and torques. Each of them can stop the arm; the output ``fault`` is then the
@@ -77,7 +78,7 @@ class HardwareStation(Station):
     `velocity_estimated`   n      joint velocities [rad/s]
     `state_estimated`      2n     joint positions and velocities
     `torque_external`      n      torques of the surroundings on the joints [Nm], with the same sign for every driver
-    `torque_commanded`     n      torques that are sent [Nm]
+    `torque_commanded`     n      limited torques of this station's controller [Nm]; not sent to a `PoseDriver`
     =====================  =====  =====================================================================================
 
     Attributes:
@@ -246,7 +247,7 @@ class HardwareStation(Station):
         """Wait for the robot's first status, and initialize a simulator that contains this station.
 
         Raises:
-            InputError: If no status arrives in time.
+            InputError: If no status arrives in time, or a `PoseDriver` cannot be configured.
         """
         end = time.monotonic() + self._robot_timeout
         self.driver.receive()
@@ -323,7 +324,10 @@ class HardwareStation(Station):
         )
 
     def estimate_force(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:
-        """Return the force (3,) [N] on the tool at rest, from joint positions and external torques (n,) [rad, Nm]."""
+        """Return the force on the tool at rest in the axes of the target frame, (3,) [N], without a filter.
+
+        Joint positions [rad] and external torques [Nm] are (n,).
+        """
         J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 

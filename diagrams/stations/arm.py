@@ -270,7 +270,7 @@ class ArmStation(Station):
         return estimate.get_wrench_output_port()
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
-        """Sample the errors of joint torques, if the wrench is estimated from them."""
+        """Sample the errors of joint torques, if the wrench is estimated from them; return some of them by name."""
         if self._joint_torque is None:
             return {}
         a, sensor, plant = self._joint_torque, self._torque_sensor, self._controller_plant.plant

@@ -203,13 +203,14 @@ def disturbed(
 
     Args:
         build: Builder of the station; it needs the parameter `impedance` for an `impedance` or a stiffness factor.
-        disturbances: Disturbances.
+        disturbances: Disturbances of the station; for a robot only `sensing` and `tare`, of which the tare applies.
         is_simulated: False for a robot.
         name: Name of the station, for messages.
-        impedance: Impedance of the task; the station's own by default.
+        impedance: Impedance of the task; the station's own by default, or `Impedance()` with a stiffness factor.
 
     Raises:
-        InputError: If the station does not support a disturbance, or has no impedance to set.
+        InputError: If the station does not support a disturbance, has no impedance to set, or is a robot and there are
+            other disturbances than `sensing` and `tare`.
     """
     has_impedance = "impedance" in inspect.signature(build).parameters
     if impedance is not None and not has_impedance:

@@ -40,9 +40,10 @@ def add_controller(
     *,
     compensate_gravity: bool,
 ) -> tuple[CartesianImpedanceController, ImpedanceMonitor, EnergyTank | None]:
-    """Add a robot's controller, sampled with `period` [s], the monitor of its impedance wrench, and its energy tank.
+    """Add a robot's controller, the monitor of its impedance wrench, and its energy tank.
 
-    There is a tank only if the impedance is bounded. The tank, not the controller, then receives the desired pose.
+    The controller checks its commands every `period` [s], which is also the period of the tank. There is a tank only if
+    the impedance is bounded. The tank, not the controller, then receives the desired pose.
     """
     limits = to_wrench_order(impedance.limits)
     gains = ImpedanceGains(
@@ -122,7 +123,7 @@ def add_impedance_control(
     wrench: OutputPort,
     compensate_gravity: bool = True,
 ) -> OutputPort:
-    """Add the controller of a robot, sampled with `period` [s], and export the ports of a station.
+    """Add the controller of a robot, which checks its commands every `period` [s], and export a station's ports.
 
     `state` is the port of the joint positions and velocities, (2n,), and `wrench` that of the measured wrench, (6,).
     Returns the port of the joint torques, (n,).
@@ -159,6 +160,8 @@ def add_joint_impedance(
     control_period: float,
 ) -> OutputPort:
     """Add watchdog, tank, governor and monitor of six joints with an impedance, and export the ports of a station.
+
+    There are a tank and a governor only if the impedance is bounded.
 
     Args:
         builder: Builder of the station.

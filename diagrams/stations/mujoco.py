@@ -67,10 +67,11 @@ def mujoco_model(
 ) -> mujoco.MjModel:
     """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
-    Surfaces and inertia of a body are in its frame. The engine's time step divides the station's `period` [s].
+    Surfaces of a body, and the workpiece's inertia, are in the frame of the body. Products of inertia about the center
+    of mass are neglected. The engine's time step divides the station's `period` [s].
 
     Raises:
-        InputError: If MuJoCo is not installed, or there are more kinds of pairs than a contact mask has bits.
+        InputError: If MuJoCo is not installed, or the surfaces have more pairs than a contact mask has bits.
     """
     mujoco = import_extra("mujoco")
     masks = _contact_masks((*fixture, *workpiece))
@@ -208,13 +209,14 @@ class MujocoStation(Station):
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
             time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine steps faster.
-            wrench_time_constant: Time constant of the wrench's low-pass filter [s].
+            wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             contact: Parameters of contact and integration.
             control_period: Time between commands [s], a whole multiple of the time step.
 
         Raises:
-            InputError: If MuJoCo is not installed, the workcell is not described by convex solids, or the control
-                period is no multiple of the time step.
+            InputError: If MuJoCo is not installed, the workcell is not described by convex solids, its fixture has more
+                than one body, its surfaces have more than `MAX_PAIRS` pairs, or the control period is no multiple of
+                the time step.
         """
         super().__init__()
         time_step, self.control_period = PLANT_PERIOD if time_step is None else time_step, control_period

@@ -91,7 +91,8 @@ class HardwareOptions(Options):
 Sensing = Literal["exact", "wrist", "robot"]
 
 TARE_SKIPPED, TARE_AVERAGED = 3, 5
-"""Numbers of control steps before and during the tare. Every shipped task begins with a longer free motion."""
+"""Times before and during the tare, in multiples of `CONTROL_PERIOD`. Every shipped task begins with a longer free
+motion."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,10 @@ class JointTorqueAccuracy:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of the measured wrench and pose, in pairs of force [N] and torque [Nm], or length [m] and angle [rad]."""
+    """Errors of the measured wrench and pose.
+
+    Pairs are of force [N] and torque [Nm], or of length [m] and angle [rad], except for ranges of scale and delay.
+    """
 
     # Smallest and largest factor of the measured wrench, sampled every episode.
     wrench_scale: tuple[float, float] = (1.0, 1.0)

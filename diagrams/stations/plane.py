@@ -65,7 +65,7 @@ class PlaneConfig:
         """Position gain [N/m] for critical damping of the discrete loop.
 
         With a = m/(m + d h) and b = k h²/(m + d h) the loop's characteristic polynomial is z² − (1 + a − b) z + a;
-        both roots are √a where b = (1 − √a)².
+        both roots are √a if b = (1 − √a)².
         """
         inertia = self.mass + self.damping * self.plant_period
         return (1 - np.sqrt(self.mass / inertia)) ** 2 * inertia / self.plant_period**2

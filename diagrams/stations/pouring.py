@@ -61,7 +61,11 @@ class PouringConfig:
 
     @cached_property
     def arm(self) -> Robot:
-        """Data of the arm."""
+        """Data of the arm.
+
+        Raises:
+            InputError: If the data have no drives or no level posture.
+        """
         robot = find_robot(self.robot)
         if robot.drives is None or robot.level_posture is None:
             raise InputError(f"robot {robot.name!r} can't pour: its data have no drives or no level posture")
@@ -123,12 +127,13 @@ class PouringStation(Station):
 
     ``desired_pose`` and ``pose`` are X_TP of the thermos's tip P, (6,) [x y z Rz Ry Rx] in meters and radians; T is the
     tip of the nominal mug. ``wrench`` (6,) is the wrench of balls and surroundings on the thermos at P in the axes of
-    T, without the thermos's weight and inertia; ``contact_force`` (1,) is the contact force of arm or thermos with
-    table or mug [N]; ``saturation`` (1,) is 1 while the controller cannot follow.
+    T, without the thermos's weight and inertia; ``contact_force`` (1,) is the largest contact force of arm or thermos
+    with table or mug [N]; ``saturation`` (1,) is 1 while the controller cannot follow.
 
     ``tip_in_mug`` is the tip's pose in the actual mug's frame, (6,), position and rotation vector; ``balls_in_mug`` and
-    ``balls_in_thermos`` are the poses of all balls in the vessels' tip frames in the same form. ``collision`` is 1
-    while the arm or the thermos touches table or mug, ``touched`` from the first such plant step on; both (1,).
+    ``balls_in_thermos`` are the poses of all n balls in the vessels' tip frames, (6 n,), in the same form.
+    ``collision`` is 1 while the arm or the thermos touches table or mug, ``touched`` from the first such plant step on;
+    both (1,).
     """
 
     wraps_angles = True
@@ -213,12 +218,15 @@ class PouringStation(Station):
         builder.BuildInto(self)
 
     def set_mug(self, root_context: Context, X_TMug: RigidTransform) -> None:
-        """Move the mug so that its tip is at X_TMug."""
+        """Move the mug and its stand so that the tip frame of the mug is at X_TMug."""
         context = self.plant.GetMyMutableContextFromRoot(root_context)
         self._mount.SetPoseInParentFrame(context, self.config.X_WT @ X_TMug)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
+        """Put the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright.
+
+        `context` is the root context.
+        """
         self._controller_plant.place(self.plant, self.arm, context, pose)
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         X_WP = self._tip.CalcPoseInWorld(plant_context)
