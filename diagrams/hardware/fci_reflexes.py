@@ -50,14 +50,15 @@ class ReflexDetector:
         external_torque: np.ndarray,
         external_wrench: np.ndarray,
     ) -> Reflex | None:
-        """Return the first reason of a reflex in this millisecond, or None.
+        """Return the reason of a reflex in this millisecond, or None; of several reasons, the one checked first counts.
 
         Args:
             command: Commanded torque without gravity (7,) [Nm].
             position: Joint positions (7,) [rad].
             velocity: Joint velocities (7,) [rad/s].
             external_torque: External joint torques (7,) [Nm].
-            external_wrench: External wrench at the tool center (6,): force [N], torque [Nm].
+            external_wrench: External wrench at the tool center, in the axes of its thresholds (6,): force [N], then
+                torque [Nm].
         """
         step = np.abs(command - self._last_command)
         self._last_command = np.array(command)

@@ -132,10 +132,10 @@ class LcmDriver(Driver):
         self._status: JointStatus | None = None  # newest status
         self._sequence = StatusSequence(self.period)
         self._num_contested = 0  # foreign commands after the first command of this program
-        # By sender: newest heartbeat, number of its channel, and number of heartbeats of all senders up to it. The last
-        # entry is the sender that was received last.
+        # By sender: newest heartbeat, number of its channel, and value of `_num_heartbeats` when it arrived. The last
+        # entry belongs to the sender of the last heartbeat.
         self._heartbeats: dict[int, tuple[Heartbeat, int, int]] = {}
-        self._num_heartbeats = 0
+        self._num_heartbeats = 0  # heartbeats received from all senders
         self._number = 0  # number of the channel of this program's heartbeat
         self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
         self._listeners: list[CommandCallback] = []

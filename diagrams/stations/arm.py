@@ -125,7 +125,11 @@ class ArmControllerPlant(ControllerPlant):
 def add_gripper_control(
     builder: DiagramBuilder, plant: MultibodyPlant, arm: ArmModel, end_effector: EndEffector, period: float
 ) -> tuple[InputPort, OutputPort]:
-    """Add the drives of a gripper, sampled with `period` [s]; return the ports of desired positions and state."""
+    """Add the drives of a gripper with n actuated joints, sampled with `period` [s].
+
+    Returns:
+        Input port of the desired positions (n,), and output port of positions and velocities (2n,).
+    """
     joints = [actuator.joint() for actuator in arm.gripper]
     lower = np.concatenate([joint.position_lower_limits() for joint in joints])
     upper = np.concatenate([joint.position_upper_limits() for joint in joints])

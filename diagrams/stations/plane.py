@@ -149,7 +149,7 @@ class PlaneStation(Station):
         set_at_rest(self.plant, self._robot, context, check_pose(pose, 2))
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
-        """Put the obstacles at (n, 2) [m], in a workcell with moving obstacles; `context` is the root context."""
+        """Put the n moving obstacles of the workcell at `obstacles`, (n, 2) [m]; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         for frame, (x, y) in zip(self._obstacle_frames, obstacles, strict=True):
             frame.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))

@@ -29,7 +29,7 @@ from guiderail.systems.wrench_sensor import WrenchSensor
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
 MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 
-# Above the speed of any guidance, so that the controller does not limit it.
+# Above the speed of any guidance, so that the controller does not slow a guidance down.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
 
 WRENCH_TIME_CONSTANT = 0.02  # time constant of the wrench sensor's low-pass filter [s]
