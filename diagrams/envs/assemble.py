@@ -49,8 +49,8 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """Return the prior knowledge that a task provides to guidance on a station.
 
     Raises:
-        InputError: If the time steps of the reference trajectory differ from the control period, or its angles come
-            near ±180°, where the station's pose jumps.
+        InputError: If the time steps of the reference trajectory differ from the control period, its angles come near
+            ±180°, where the station's pose jumps, or an option of the primitive does not fit the task or the station.
     """
     provides = task.provides()
     primitive = None
@@ -110,7 +110,8 @@ def _motion_constraints(task: Task, constraints: LinearConstraints, station: Sta
     """Return a task's motion constraints with the limits from its options, or None if it has neither.
 
     Raises:
-        InputError: If the station has no joints for `joint_margin`, or `min_singular_value` is given without it.
+        InputError: If the station has no joints for `joint_margin`, `min_singular_value` is given without
+            `joint_margin`, or the number of limits does not fit the outputs.
     """
     motion, options = task.motion_constraints(), task.config.part("primitive")
     limits: dict[str, Any] = {}
@@ -195,7 +196,8 @@ class Loop:
         guidance: Diagram with the ports of `Guidance`.
 
     Raises:
-        InputError: If a signal that the task names does not exist, or a port has the wrong size.
+        InputError: If a signal that the task names does not exist, a port has the wrong size, or the station or the
+            guidance does not support the task's observation or the template's wrench limits.
 
     Attributes:
         builder: Builder of the root diagram.
@@ -240,7 +242,7 @@ class Loop:
             self.builder.Connect(bound, self.station.GetInputPort("max_wrench"))
 
     def _add_reference(self, task: Task) -> None:
-        """Add the system that predicts the reference from the observation.
+        """Add the system that predicts the guidance's reference window from the observation.
 
         Raises:
             InputError: If the observation is an image.
@@ -271,7 +273,7 @@ class Loop:
         """Add the diagram `name` of observation terms; return the space and the port of its output.
 
         Raises:
-            InputError: If a term names a signal that does not exist.
+            InputError: If a term names a signal that does not exist, or as `Observation`.
         """
         user = f"the {name} of {task.name}"
         names = [term.signal for term in terms if term.signal not in CLOCKS]
@@ -298,8 +300,7 @@ def build_task_diagram(
         render_mode: "rgb_array" exports the image of the task's camera; a browser view is not part of the diagram.
 
     Raises:
-        InputError: If a signal that the task names does not exist, a port has the wrong size, or the name of a reward
-            term is reserved.
+        InputError: As `Loop`, or if the name of a reward term is reserved, or "rgb_array" is given without a camera.
     """
     loop = Loop(task, station, guidance)
     builder, signals, period = loop.builder, loop.signals, station.control_period
@@ -372,11 +373,11 @@ class SkillDiagram:
     """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station."""
 
     # Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench, contact_force,
-    # held_action, constraint_violation and fallback.
+    # held_action, constraint_violation and fallback, and rgb_image if it was built with a camera.
     diagram: Diagram
     control_period: float  # control period [s]
     num_steps: int  # number of control steps of an episode
-    # As in `TaskDiagram`; call it with the root context before `Simulator.Initialize`.
+    # Function as in `TaskDiagram`, to be called with the root context before `Simulator.Initialize`.
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]]
     meshcat: Meshcat | None = None  # Meshcat page that the diagram publishes to; None if there is none
 
@@ -464,10 +465,8 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
 def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
     """Return the function `TaskDiagram.randomize`.
 
-    It samples an episode's conditions, writes them into the root context, and returns them by name.
-
-    The function raises an InputError if a reset option is invalid, or the task's `reset` returns something other than
-    values by name, or a reserved name.
+    The function raises an InputError if a reset option is invalid, or if the task's `reset` does not return values by
+    name or returns a value with a reserved name.
     """
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:

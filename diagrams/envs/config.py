@@ -49,11 +49,12 @@ class EnvConfig:
 
         Args:
             task: Name of the task, or path of a task folder.
-            options: Options by name, as `gymnasium.make` takes them. They override the
-                options of the difficulty, which override the task's defaults.
+            options: Options by name, as `gymnasium.make` takes them. They override the options of the difficulty, which
+                override the task's defaults.
 
         Raises:
-            InputError: If a task, an option or a choice is unknown, a value is out of range, or two are incompatible.
+            InputError: If a task, an option or a choice is unknown, a value is out of range, or options are
+                incompatible.
         """
         if task not in TASKS.names() and is_task_folder(task):
             task = register_task_folder(task)
@@ -131,10 +132,10 @@ def _cache_key(task: type[Task], options: Mapping[str, Any]) -> Hashable:
 
 
 def freeze(value: Any) -> tuple[str, Any]:
-    """Return a plain value with its type, because True, 1 and 1.0 are equal.
+    """Return a hashable pair of a value's type and content, because True, 1 and 1.0 are equal.
 
     Raises:
-        TypeError: If the value is not plain.
+        TypeError: If the value is not None, a bool, int, float or str, or a list, tuple or dict of such values.
     """
     if isinstance(value, dict):
         return "dict", tuple(sorted((name, freeze(entry)) for name, entry in value.items()))

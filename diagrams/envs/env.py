@@ -43,7 +43,7 @@ INFO_KEYS = (
     "control_steps",
     "simulation_failure",
 )
-"""Keys of `info` in every task; no reward term and no value that a reset samples can have one of these names."""
+"""Reserved keys of `info`: no reward term and no value that a task's reset samples can have one of these names."""
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
@@ -64,13 +64,14 @@ class DiagramEnv(DrakeGymEnv):
     It keeps `DrakeGymEnv`'s interface and replaces its `reset` and `step`. The diagram is built once. A reset restores
     the default context, writes the neutral action, lets the task randomize the context with `self.np_random`, and
     initializes the simulator. A step checks the action before anything moves, and advances `action_repeat` control
-    steps, which are counted by an integer. Every port is read at the end of each control step, before the events of
-    that instant.
+    steps, which are counted by an integer. The ports are read at the end of each control step, before the events of
+    that instant; the observation is read at the end of the last control step only.
 
     `info` has, at every step and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
     `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `contact_force` (maximum of
     the step [N]), `fallback` (True if guidance fell back to a safe command), every reward term by name (summed over the
-    step), and `control_steps` since the reset. The `info` of a reset also has the values that the task sampled.
+    step), and `control_steps` since the reset. Here a step is a call of `step`, with all its control steps. The `info`
+    of a reset also has the values that the task sampled.
 
     An episode that reaches the task's number of control steps is truncated with `termination` "time_limit".
 
@@ -111,7 +112,7 @@ class DiagramEnv(DrakeGymEnv):
             InputError: If `action_repeat` is not a positive integer, or the task cannot be rendered in this mode.
         """
         if isinstance(action_repeat, bool) or not isinstance(action_repeat, int | np.integer) or action_repeat < 1:
-            raise InputError(f"action_repeat is the number of control steps of an action, from 1, not {action_repeat}")
+            raise InputError(f"action_repeat must be a whole number of control steps, at least 1, not {action_repeat}")
         diagram = task.diagram
         _check_view(task, render_mode)
         view = None if render_mode != "human" or task.query is None else View(task.query)
@@ -185,14 +186,15 @@ class DiagramEnv(DrakeGymEnv):
         raise InputError(f"an environment holds a simulation and cannot be pickled: call {call} in the worker instead")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; return its first observation and `info`.
 
         Args:
             seed: Seed of this and all later episodes; default: continue the random stream.
             options: Options of the task's `Reset` by name.
 
         Raises:
-            InputError: If an option is unknown, a value is out of range, or the environment is closed.
+            InputError: If an option is unknown, a value is out of range, the environment is closed, or the observation
+                is not finite although the simulation did not fail.
         """
         if self._closed:
             raise InputError("the environment is closed: make another one")
@@ -255,9 +257,10 @@ class DiagramEnv(DrakeGymEnv):
                 raise RuntimeError(f"the simulation failed: a joint moves at {speed:g} m/s or rad/s")
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply `action` for `action_repeat` control steps, or until the episode ends.
+        """Apply `action`, (A,), for `action_repeat` control steps, or until the episode ends.
 
         Raises:
+            ResetNeeded: If the episode is over, or none has begun.
             InputError: If the action is not finite or has the wrong shape (a finite action outside [-1, 1] is clipped),
                 or if a reward term or the observation is not finite although the simulation did not fail.
         """

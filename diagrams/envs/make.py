@@ -42,7 +42,8 @@ def make_station(task: Task) -> Station:
     """Build the station that a task is configured with, including its workcell.
 
     Raises:
-        InputError: If the task's `workcell` or `num_steps` cannot be used.
+        InputError: If the task has no workcell, its `num_steps` is not a positive whole number, or the station has a
+            fixed control period other than the option `control_period`.
     """
     config, kind = task.config, task.config.station_kind
     check_num_steps(task.name, getattr(task, "num_steps", None))
@@ -69,21 +70,28 @@ def make_station(task: Task) -> Station:
 
 
 def make_guidance(task: Task, station: Station) -> Diagram:
-    """Build the guidance that a task is configured with."""
+    """Build the guidance that a task is configured with.
+
+    Raises:
+        InputError: As `build_prior_knowledge` and `build_guidance`.
+    """
     return build_guidance(task.config.guidance, build_prior_knowledge(task, station), task.name)
 
 
 def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledge:
     """Return the prior knowledge that an environment's guidance is built from, such as its primitive or template.
 
-    The arguments and errors are those of `make_env`.
+    `task` and `options` are those of `make_env`. The station may also be a real robot.
+
+    Raises:
+        InputError: If a name is unknown, a value is out of range, or options are incompatible.
     """
     declared = _config(task, options).make_task()
     return build_prior_knowledge(declared, make_station(declared))
 
 
 def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
-    """Build the environment `gymnasium.make("guiderail/<Task>-v0", ...)`.
+    """Build the environment that `gymnasium.make("guiderail/<Task>-v0", ...)` returns without its wrappers.
 
     From this call on, numerical libraries use one thread in this process. Matrices are small here: if other processes
     use the cores, threads that wait for each other take eighty times as long. The number of threads also changes the
@@ -95,7 +103,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
         options: Options of the environment, if `task` is not a configuration; `guiderail list TASK` lists them.
 
     Raises:
-        InputError: If a name is unknown, a value is out of range, or options are incompatible.
+        InputError: If a name is unknown, a value is out of range, options are incompatible, or the station is a real
+            robot.
     """
     check_render_mode(render_mode)
     config = _config(task, options)
@@ -135,13 +144,14 @@ def make_skill(
     """Build a learned skill as a diagram for a `Simulator`: observation → policy → guidance → station.
 
     Args:
-        task: Configuration, or name of the task that the policy was trained on.
+        task: Configuration, or name or folder of the task that the policy was trained on.
         policy: Saved `Policy`, function from observation to action, or system with ports `observation` and `action`.
         render_mode: None, "human" (browser view) or "rgb_array" (output `rgb_image`).
-        options: Options of the environment that the policy was trained in, if `task` is a name.
+        options: Options of the environment that the policy was trained in, if `task` is not a configuration.
 
     Raises:
-        InputError: As `make_env`, or if the sizes of the policy's ports do not match the environment.
+        InputError: If a name is unknown, a value is out of range, options are incompatible, or the sizes of the
+            policy's ports do not match the environment.
     """
     check_render_mode(render_mode)
     declared = _config(task, options).make_task()
@@ -193,7 +203,7 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
 
 
 def _base_policy_key(source: str | None) -> Hashable:
-    """Return a key of the base policy that an option names, which a later training run or registration may replace."""
+    """Return a key that changes if another policy replaces the base policy `source`; None without a base policy."""
     if not source:
         return None
     if source in BASE_POLICIES.names():

@@ -28,9 +28,9 @@ END_TIMEOUT = 5.0  # longest wait for the gateway to exit before it is killed [s
 class MeshcatPage(Meshcat):
     """Meshcat with its page at a secret address; everything else is as in the base class.
 
-    The page and its websocket are at a path with a random token. A connection is refused without the token, or with an
-    origin other than this page's. The gateway parses the messages of browsers: Meshcat receives only inputs of controls
-    that exist, within their range.
+    The page and its websocket are at a path with a random token. A request without the token is refused, and so is a
+    websocket whose origin is not this page. The gateway parses the messages of browsers: Meshcat receives only the
+    states of gamepads, and inputs of existing controls within their range.
 
     Args:
         is_served: True if browsers may connect; if False, the page can only be exported with `StaticHtml`.

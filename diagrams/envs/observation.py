@@ -30,7 +30,7 @@ class ObservationTerm:
         signal: Name of a port of station, guidance or task, or one of `CLOCKS`.
         center: Finite number, or one per entry (n,), in the signal's unit.
         scale: Finite number, or one per entry (n,), in the signal's unit; not 0.
-        entries: Indices of the observed entries of the signal, a negative one from its end; default: all.
+        entries: Indices of the observed entries of the signal; negative ones count from its end; default: all.
     """
 
     signal: str
@@ -83,15 +83,15 @@ class Observation(Diagram):
 
         Args:
             terms: Terms of the observation, at least one.
-            sizes: Sizes of the signals by name.
+            sizes: Sizes of the signals by name, without `CLOCKS`.
             duration: Duration of an episode [s].
             clip: Largest absolute value of an entry, positive.
             task_name: Name of the task, for error messages.
             waits: True if `CLOCKS` are computed from the input `motion_time` instead of the simulation time.
 
         Raises:
-            InputError: If there is no entry, an index is out of range, or a center or a scale would not map finite
-                signals to finite numbers.
+            InputError: If there is no entry, an index is out of range, or a center or a scale has the wrong shape or
+                would not map finite signals to finite numbers.
         """
         super().__init__()
         builder = DiagramBuilder()

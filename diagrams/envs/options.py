@@ -101,13 +101,17 @@ class PrimitiveOptions(Options):
     action_dims: Integers | None = Field(
         None, description="indices of the outputs that an action moves; default: all", examples=[(0, 1)]
     )
-    # The factorization of a step takes O(P² + H³) time. The limits of P and H keep a task with six outputs below half a
-    # minute and 1 GB.
-    history: Integer = Field(10, ge=1, le=200, description="P, number of past outputs through which sKGRL moves")
+    # The factorization of a step takes O(P² + H³) time. With the limits of P and H, the factorizations of a task with
+    # six outputs take less than half a minute and 1 GB.
+    history: Integer = Field(
+        10, ge=1, le=200, description="P, number of past outputs that sKGRL's motion passes through"
+    )
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], variance of the past outputs")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="poses that form the history")
     adaptive_history: bool = Field(False, description="shorten the history during contact")
-    gains: Numbers | None = Field(None, description="raw null-space units per action; default: computed from κ")
+    gains: Numbers | None = Field(
+        None, description="null-space action per unit of the action, one number per output; default: computed from κ"
+    )
     horizon: Integer = Field(40, ge=0, le=200, description="H, number of future points with constraints")
     lambda_: Number = Field(6.0, ge=0, description="λ of the thesis's problem 4.5")
     beta: Number = Field(6.0, gt=0, description="β of the thesis's problem 4.5")
@@ -119,7 +123,7 @@ class PrimitiveOptions(Options):
         {}, validate_default=True, description="further parameters of a kernel that has more than a length scale"
     )
     via_points: Numbers = Field(
-        (), description="via-points of the mean: control step and output of each, one via-point after another"
+        (), description="via-points of the mean: control step and all outputs of each, one via-point after another"
     )
     max_speed: PositiveNumbers = Field(
         (),
@@ -171,7 +175,9 @@ class TemplateOptions(Options):
     """Options of every guidance built from a shared control template."""
 
     active_constraints: bool | None = Field(
-        None, description="keep commands inside the template's active constraints; default: with sct only"
+        None,
+        description="keep commands inside the template's active constraints; default: true, but false with guidance "
+        "none",
     )
 
 
@@ -181,11 +187,11 @@ class BasePolicyOptions(Options):
     base_policy: str = Field(
         "",
         description="base policy: folder of a run of the learner chunk, or a registered name; default: the "
-        "demonstrations, as without a base policy",
+        "demonstrations instead of a base policy",
     )
     replan_steps: Integer = Field(5, ge=1, le=1000, description="control steps between two chunks")
     covariance_floor: Number = Field(
-        1.0, gt=0, description="share of the demonstrations' covariance that is added to the spread of the chunks"
+        1.0, gt=0, description="multiple of the demonstrations' covariance that is added to the chunks' variance"
     )
 
     @field_validator("base_policy")

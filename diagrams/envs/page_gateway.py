@@ -232,7 +232,7 @@ class Gateway:
             sender.cancel()
             del self._queues[browser]
             print(len(self._queues), flush=True)
-            if browser is self._gamepad_owner:  # Meshcat would keep the last deflection of its sticks
+            if browser is self._gamepad_owner:  # Meshcat would keep the sticks' last deflection
                 self._gamepad_owner = None
                 with suppress(ConnectionClosed):
                     await self._meshcat.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": {}}))

@@ -20,7 +20,7 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """Station and recorder; the desired pose (6,) is the output of a system, sampled once per control period.
+    """Station and recorder; the desired pose (6,) is the output of a system, sampled once per `CONTROL_PERIOD`.
 
     Attributes:
         station: Driven station.
@@ -35,7 +35,10 @@ class DrivenStation:
         Args:
             station: Station; it becomes part of the diagram.
             source: System with the desired pose as first output, such as a trajectory, an input device or a policy.
-            num_samples: Largest number of control periods to record.
+            num_samples: Largest number of control periods to record, at least 1.
+
+        Raises:
+            InputError: If `num_samples` is below 1.
         """
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
@@ -83,7 +86,7 @@ def linear_motion(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
 def drive_along(
     station: Station, times: np.ndarray, poses: np.ndarray, prepare: Callable[[Any, Any], None] | None = None
 ) -> tuple[DrivenStation, Recording]:
-    """Drive a station along poses (N, 6) at times (N,) [s]; return the driven station and the recording.
+    """Drive a station along poses (N, 6) at times (N,) from 0 [s]; return the driven station and the recording.
 
     `prepare` is called with the plant and its context before the start.
     """

@@ -36,7 +36,7 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 
 _OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
-PUBLISH_PERIOD = 1 / 50  # period of a browser view [s]
+PUBLISH_PERIOD = 1 / 50  # simulated time between two publications of a browser view [s]
 
 
 # Observations have Drake's default light, from the camera. Pictures have a white background and light from above, which
@@ -109,8 +109,8 @@ def add_camera(
 ) -> OutputPort:
     """Add a camera and return the port of its color image, an `ImageRgba8U`.
 
-    `plant` has the frame of a camera that is not fixed in the world. With `is_picture` the scene is lit for a picture
-    instead of an observation. An image is rendered only when the port is evaluated.
+    `plant` is only needed for a camera that is fixed in one of its frames. With `is_picture` the scene is lit for a
+    picture instead of an observation. An image is rendered only when the port is evaluated.
 
     Raises:
         InputError: If this machine lacks the library that renders without a display, or the station's plant lacks the
@@ -198,7 +198,7 @@ def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisual
     """Open a browser view on this machine, by default on a new page; return its page and its visualizer.
 
     Raises:
-        InputError: If the environment forbids Drake to open a network port.
+        InputError: If a new page cannot be opened, for example because `DRAKE_ALLOW_NETWORK` forbids Meshcat.
     """
     try:
         meshcat = meshcat or MeshcatPage()
@@ -235,7 +235,7 @@ class View:
         """Open the view of a scene graph's query port, on a new page if none is given.
 
         Raises:
-            InputError: If the environment forbids Drake to open a network port.
+            InputError: As `open_meshcat`.
         """
         self._query = query
         self.meshcat, self._visualizer = open_meshcat(meshcat)

@@ -30,7 +30,11 @@ PORTS = (
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Rotations and reflections under which a task is invariant, except for details such as the demonstrated mean."""
+    """Rotations and reflections under which a task is invariant, except for details such as the demonstrated mean.
+
+    Raises:
+        ValueError: If the numbers of matrices differ, or a matrix is not a signed permutation.
+    """
 
     observations: np.ndarray  # signed permutation of the observation for each of K symmetries, (K, n, n)
     actions: np.ndarray  # signed permutation of the action, (K, A, A)
@@ -49,7 +53,7 @@ class Symmetry:
                 raise ValueError("each matrix of a symmetry is a signed permutation")
 
     def pad(self, count: int) -> Symmetry:
-        """Return the symmetry for an observation with `count` further entries at its end, which it leaves unchanged."""
+        """Return the same symmetry for observations with `count` more entries at their end, which do not change."""
         if count == 0:
             return self
         size = self.observations.shape[1]
@@ -89,7 +93,7 @@ class TaskDiagram:
     ``rgb_image``           an abstract `ImageRgba8U`; only if the diagram was built with a camera
     ======================= ================================================================================
 
-    The environment reads the outputs at the end of each control step, before the events of that instant. Build the
+    The environment reads the outputs at the end of control steps, before the events of that instant. Build the
     plant with ``use_sampled_output_ports=False``, so that systems that sample the plant at control steps read the same
     numbers. With sampled output ports the plant's step is an unrestricted update, which Drake runs before the discrete
     updates of the same instant: these would read the plant's state one plant step later.
@@ -110,6 +114,10 @@ class TaskDiagram:
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
         near_symmetry: `symmetry`, extended by symmetries that hold only for most of an episode.
         declaration: `Task` that the diagram was built from, if there is one.
+
+    Raises:
+        ValueError: If the diagram lacks a port, `control_period` or `num_steps` is not positive, or the size of a
+            symmetry does not match the observation and the action.
     """
 
     diagram: Diagram

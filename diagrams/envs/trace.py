@@ -26,7 +26,14 @@ class EpisodeTrace:
     """
 
     def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
-        """Construct an empty trace of at most `num_steps` control steps; `signals` maps signal names to sizes."""
+        """Construct an empty trace.
+
+        Args:
+            num_steps: Largest number of control steps.
+            num_outputs: Size O of a pose.
+            period: Control period [s].
+            signals: Sizes of further signals by name.
+        """
         self.period = period
         self._length = 0
         self._commanded = np.empty((num_steps, num_outputs))

@@ -59,7 +59,11 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
 
 
 class ChunkExecutionGuidance(PrimitiveGuidance):
-    """Guidance that commands chunks, with a guard by default; the action has no effect. A guard exports ``rate``."""
+    """Guidance that commands chunks, with a guard by default; the action has no effect.
+
+    With a guard there is the output ``rate`` (1,) of `ChunkSafetyLimiter`. Without a guard (``guard=none``), bounds and
+    limits of the motion are not enforced.
+    """
 
     def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False):
         """Construct the guidance; with `takes_window`, the chunks come from the input ``reference_window``.
@@ -67,7 +71,8 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
         Without this input, the chunks are parts of the demonstrations' mean.
 
         Raises:
-            InputError: If the guard does not support the limits and constraints, or the motion waits for the robot.
+            InputError: If the motion waits for the robot (``progress=state``), or the guard does not support the limits
+                and constraints.
         """
         super().__init__()
         config, options, builder = primitive_config_of(prior), prior.options, DiagramBuilder()
@@ -129,7 +134,7 @@ class _ChunkGuidance:
 
 
 class KgrlBasePolicyGuidance(_ChunkGuidance, KgrlGuidance):
-    """KGRL whose mean is the chunk of a base policy, and whose covariance is widened by the chunks' spread."""
+    """KGRL with the chunks of a base policy as its mean; their variance is added to the covariance."""
 
 
 class ResidualBasePolicyGuidance(_ChunkGuidance, ResidualGuidance):

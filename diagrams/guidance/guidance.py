@@ -13,7 +13,7 @@ output                  size   meaning
 ======================  =====  =====================================================================================
 `desired_pose`          O      commanded pose
 `held_action`           A      action of the current control period
-`constraint_violation`  1      max(c − G y) of the command over the known constraints; negative is slack
+`constraint_violation`  1      max(c − G y) of the command y over all constraints G y ≥ c; negative is slack
 `fallback`              1      1 if a safe pose is commanded instead of the requested one
 ======================  =====  =====================================================================================
 
@@ -57,7 +57,7 @@ class Guidance(Diagram):
     """
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of objects in this episode, by name; guidance without objects does nothing."""
+        """Set the poses of objects by name in the root context; guidance without objects ignores them."""
 
     def make_reference(self, observation_size: int) -> System | None:
         """Return the system that computes ``reference_window`` from the observation (n,); None without this input.
@@ -81,14 +81,14 @@ class Guidance(Diagram):
 class FunctionGuidance(Guidance):
     """Guidance that commands law(action, pose, wrench) once per control step; see `FunctionGuidanceSystem`.
 
-    The command is not constrained; ``constraint_violation`` is the command's violation of the task's constraints.
+    The command is not constrained; ``constraint_violation`` is its violation of the prior knowledge's `constraints`.
     """
 
     def __init__(self, prior: PriorKnowledge, law: GuidanceFunction, action_size: int):
         """Construct the guidance.
 
         Args:
-            prior: Prior knowledge, for the control period, the station's sizes and the task's constraints.
+            prior: Prior knowledge, for the control period, the station's sizes and the linear constraints.
             law: Pure function from an action (A,), the measured pose (O,) and wrench (W,) to a desired pose (O,).
             action_size: A, at least 1.
 
@@ -115,7 +115,7 @@ def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, ki
     The error message names the `kind` of guidance, or the diagram if `kind` is empty.
 
     Raises:
-        InputError: If a port of all guidance is missing or has another size.
+        InputError: If one of the ports `INPUTS` and `OUTPUTS` is missing or has another size.
     """
     name_of_guidance = f"guidance '{kind or guidance.get_name()}'"
     missing_inputs = [name for name in INPUTS if not guidance.HasInputPort(name)]

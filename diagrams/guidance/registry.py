@@ -83,6 +83,8 @@ def register_guidance(
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
     """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
 
+    The decorator raises an `InputError` if another kind of guidance has this name.
+
     Args:
         name: Value of the option `guidance`.
         needs: See `GuidanceKind`.
@@ -102,7 +104,7 @@ def register_guidance(
 
 
 def possible_guidance(provided: Collection[str]) -> list[str]:
-    """Return the names of all kinds of guidance whose requirements are `provided`."""
+    """Return the sorted names of all kinds of guidance whose requirements are `provided`."""
     return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
 
 

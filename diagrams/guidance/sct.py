@@ -49,8 +49,9 @@ class ActiveConstraintFilter(Diagram):
     ):
         """Construct the diagram.
 
-        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. If the robot is
-        farther than `max_tracking_error` [m] from its command, only commands closer to the robot replace the last one.
+        `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. `period` is the
+        control period [s]. If the robot is farther than `max_tracking_error` [m] from its command, only commands closer
+        to the robot replace the last one.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -74,7 +75,7 @@ class ActiveConstraintFilter(Diagram):
         builder.BuildInto(self)
 
     def export_ports(self, builder: DiagramBuilder, hold: ZeroOrderHold) -> None:
-        """Export the ports of a guidance diagram that contains this filter and the hold of its action."""
+        """Export the ports of the guidance diagram in `builder`, which contains this filter and the action's `hold`."""
         builder.ExportInput(hold.get_input_port(), "action")
         builder.ExportInput(self.GetInputPort("pose"), "pose")
         # The wrench is unused, but all guidance has this port.
@@ -95,9 +96,10 @@ class ActiveConstraintFilter(Diagram):
 class SctGuidance(Guidance):
     """Shared control: input mapping and active constraints of the template's current state.
 
-    ``action`` is (n,), from a policy or a user's input device. ``constraint_violation`` is the largest violation
-    of an active constraint by the command, in meters or radians; 0 inside. In addition to the ports of all guidance
-    there are ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
+    ``action`` is (n,), the n inputs of the template, from a policy or a user's input device. ``constraint_violation``
+    is the largest violation of an active constraint by the command, in meters or radians; 0 inside, or if the active
+    constraints are not enforced. In addition to the ports of all guidance there are ``state``,
+    ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
 
     def __init__(
@@ -118,7 +120,7 @@ class SctGuidance(Guidance):
             period: Control period [s].
             input_mapping: Second template, whose initial state maps the inputs instead of `template`. The active
                 constraints of `template` are then a safety filter, for example of an end-effector velocity.
-            active_constraints: False commands the requested pose without constraints.
+            active_constraints: True to enforce the active constraints; False to command the requested pose.
             max_tracking_error: Distance between robot and command beyond which the last command is repeated, unless the
                 new one is closer to the robot [m].
         """

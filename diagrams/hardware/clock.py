@@ -48,7 +48,7 @@ class Clock(ABC):
 
     @abstractmethod
     def _wait_for_step(self) -> float | None:
-        """Wait until the next step is due; return its time [s], or None to count it as one period."""
+        """Wait until the next step is due; return its time [s], or None for one period after the previous step."""
 
 
 def check_rate(rate: float) -> None:
@@ -78,7 +78,7 @@ class IntervalHistogram:
         self.longest = max(self.longest, seconds)
 
     def quantile(self, share: float) -> float:
-        """Return the `share` quantile of the intervals [s], with a resolution of 0.1 ms; NaN without intervals.
+        """Return the quantile of the intervals [s] at a `share` in [0, 1], to 0.1 ms; NaN without intervals.
 
         Intervals of more than 0.1 s count as 0.1 s.
         """

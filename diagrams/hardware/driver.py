@@ -111,7 +111,7 @@ class Driver(ABC):
         """
 
     def check_setup(self) -> list[Check]:
-        """Check the configuration of the robot before the first motion; nothing is sent."""
+        """Return checks of the robot's configuration before the first motion; nothing is sent."""
         return []
 
     def check_usable(self) -> None:  # noqa: B027 (optional hook)
@@ -188,7 +188,7 @@ DRIVERS: Registry[type[Driver]] = Registry(
     decorator="register_driver",
     entry_points="guiderail.drivers",
 )
-"""Driver classes by the name of their robot."""
+"""Driver classes by name: that of a robot for its default driver, otherwise that of an interface, such as "fci"."""
 
 register_driver = DRIVERS.register
 
@@ -199,7 +199,11 @@ def describe_stop(fault: Fault, driver: Driver) -> str:
 
 
 def find_driver(robot: Robot | str) -> type[Driver]:
-    """Return the driver class of a robot; raise an InputError if no driver is registered for it."""
+    """Return the default driver class of a robot, or the driver class of a name.
+
+    Raises:
+        InputError: If no driver has this name, or the name of the robot.
+    """
     return DRIVERS.get(robot if isinstance(robot, str) else robot.name)
 
 

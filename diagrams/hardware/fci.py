@@ -35,7 +35,7 @@ RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [
 # least that of libfranka's examples [N], because the robot's estimate is off by some newtons. In simulation a plug that
 # drops from a rim into its hole ends with an impact of 1.9 times that wrench (28 N instead of 15 N; eight episodes).
 FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 2.5, 20.0
-MAX_TOOL_ERROR = 1e-4  # largest error of the tool center that the robot reports [m]
+MAX_TOOL_ERROR = 1e-4  # largest error of an entry of the tool frame's matrix that the robot reports [m, 1]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
 REALTIME_FILE = Path("/sys/kernel/realtime")  # contains 1 on a kernel with real-time priorities
 TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # collision thresholds [Nm] of libfranka's examples
@@ -134,7 +134,11 @@ class FciDriver(PoseDriver):
         return None
 
     def check_setup(self) -> list[Check]:
-        """Check mode, tool, payload and thresholds of the robot, and this machine's kernel."""
+        """Return checks of the robot's mode, tool and payload and of this machine's kernel, with the limits in use.
+
+        Raises:
+            InputError: If the driver is not configured.
+        """
         impedance, state = self._impedance, self._read_state()
         if impedance is None:
             raise InputError("the driver fci is used before it is configured")
@@ -175,7 +179,11 @@ class FciDriver(PoseDriver):
         ]
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
-        """Make the impedance follow a pose of the tool center in the robot's base frame."""
+        """Make the impedance follow a pose of the tool center in the robot's base frame; `time` is not used.
+
+        Raises:
+            InputError: If the driver is not configured.
+        """
         del time
         franky, impedance = self._franky, self._impedance
         if impedance is None:
@@ -205,7 +213,7 @@ class FciDriver(PoseDriver):
         return motion
 
     def stop(self) -> None:
-        """Damp the arm to rest by the robot's own loop; the brakes hold it afterwards."""
+        """Damp the arm to rest by libfranka's loop; the brakes hold it afterwards."""
         if self._motion is not None:
             self._motion = None
             try:
