@@ -249,6 +249,17 @@ class RtdeDriver(PoseDriver):
         if self._is_lost:
             raise InputError(f"the connection to the robot at {self.url} is lost: restart guiderail")
         self._finish_stop()
+        try:
+            self._end_protective_stop()
+        except Exception as error:  # the client raises RuntimeError and its own types
+            raise InputError(f"the robot at {self.url} cannot recover: {error}") from None
+        end = clock.monotonic() + RECOVERY_TIME
+        while self.error and clock.monotonic() < end:
+            clock.sleep(0.01)
+        if self.error:
+            raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
+
+    def _end_protective_stop(self) -> None:
         if self._receiver.isProtectiveStopped():
             dashboard = self._client.DashboardClient(self.url)
             dashboard.connect()
@@ -258,11 +269,6 @@ class RtdeDriver(PoseDriver):
         if self._control is not None and (self._has_failed_to_stop or not self._control.isProgramRunning()):
             self._control.reuploadScript()
             self._has_failed_to_stop = False
-        end = clock.monotonic() + RECOVERY_TIME
-        while self.error and clock.monotonic() < end:
-            clock.sleep(0.01)
-        if self.error:
-            raise InputError(f"the robot at {self.url} cannot recover: {self.error}")
 
     def _keep_alive(self, time: float) -> None:
         """Reset the controller's watchdog at each new status while no wrench is commanded."""

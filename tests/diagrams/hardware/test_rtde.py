@@ -192,6 +192,14 @@ def test_protective_stop_is_a_fault_until_recovery(robot, driver, monkeypatch):
         driver.recover()
 
 
+def test_recovery_that_the_robot_does_not_answer_is_refused(robot, driver, monkeypatch):
+    robot.safety_bits = 1 + 4
+    monkeypatch.setattr(driver._client, "DashboardClient", lambda url: SimpleNamespace(connect=fail), raising=False)
+    with pytest.raises(InputError, match="cannot recover: connection lost"):
+        driver.recover()
+    assert driver.error == "protective stop"
+
+
 @pytest.mark.parametrize(("share", "is_refused"), [(0.9, False), (1.1, True), (np.nan, True)])
 def test_other_kinematics_are_refused(robot, driver, model, share, is_refused):
     robot.calibration = np.array([0.0, share * rtde.MAX_POSE_DIFFERENCE, 0.0])
