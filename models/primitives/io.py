@@ -24,10 +24,10 @@ import numpy as np
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import in_order, read_bytes, write_atomically
 
-MAX_NUMBERS = 2_000_000  # times and outputs together: five minutes of six outputs at a kilohertz
+MAX_NUMBERS = 2_000_000  # numbers in one file, such as four minutes of six outputs at a kilohertz
 MAX_DEMONSTRATIONS = 1_000
-MAX_LINES = 400_000  # number of lines of text: six minutes at a kilohertz
-MAX_FILE_SIZE = 32_000_000  # [bytes]
+MAX_LINES = 400_000  # lines of one text file, or samples of one folder: six minutes at a kilohertz
+MAX_FILE_SIZE = 32_000_000  # size of one file, or of all files of a folder [bytes]
 _MAX_LINE_LENGTH = 100_000  # [characters]
 _MAX_HEADER_SIZE = 1_000  # largest header of an array [bytes]; NumPy writes 118
 _MAX_NAMES_SIZE = 1_000_000  # [bytes]
@@ -47,7 +47,7 @@ class Recording(NamedTuple):
 
 
 def read(path: Path) -> Recording:
-    """Read a file by its ending, or all `.csv` files of a folder.
+    """Read a file by its ending, or all `.csv` files of a folder except hidden ones.
 
     Raises:
         InputError: If there is no such file, it is damaged or too large, or it does not hold demonstrations.
@@ -78,7 +78,17 @@ def _read_file(path: Path, max_size: int) -> Recording:
 
 
 def write_npz(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    """Write demonstrations to an .npz file: their concatenated samples, their `lengths` and the outputs' names."""
+    """Write demonstrations to an .npz file: their concatenated samples, their `lengths` and the outputs' names.
+
+    Args:
+        path: File to write.
+        times: M clocks (N_m,) [s or phase].
+        outputs: M arrays (N_m, O).
+        names: Names of the O outputs.
+
+    Raises:
+        InputError: If the file cannot be written.
+    """
     content = io.BytesIO()
     np.savez_compressed(
         content,
@@ -91,7 +101,10 @@ def write_npz(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndar
 
 
 def write_csv(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    """Write demonstrations to a .csv file with one row per sample: demonstration, time, outputs."""
+    """Write demonstrations to a .csv file with one row per sample: demonstration, time, outputs.
+
+    Arguments and errors are those of `write_npz`.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(["demonstration", "time", *names])
@@ -123,7 +136,10 @@ def _read_npz(data: bytes) -> Recording:
 
 
 def _check_directory(data: bytes) -> None:
-    """Raise an InputError for an archive of many arrays: every entry of its directory costs time and memory."""
+    """Raise an InputError for data that are not a whole archive, and for an archive of many arrays.
+
+    Every entry of an archive's directory costs time and memory.
+    """
     if data[:6] == b"\x93NUMPY":
         raise InputError("it is a single array (.npy): save `times` and `outputs` with numpy.savez")
     end = data[-22:]
@@ -273,7 +289,7 @@ def _read_csv(data: bytes) -> Recording:
 
 
 def find_repeated(names: Iterable[str]) -> str:
-    """Return the first name that occurs twice, or an empty text; several columns may have no name."""
+    """Return the first name that repeats an earlier one, or an empty text; several columns may have no name."""
     names = list(names)
     return next((name for number, name in enumerate(names) if name and name in names[:number]), "")
 
@@ -312,7 +328,7 @@ def _split_samples(samples: np.ndarray) -> list[np.ndarray]:
 
 
 def _read_folder(folder: Path) -> Recording:
-    """Read every `.csv` file of a folder, in the order of the numbers in the files' names."""
+    """Read every `.csv` file of a folder, sorted by name with the numbers in the names by value."""
     times: list[np.ndarray] = []
     outputs: list[np.ndarray] = []
     names: Sequence[str] | None = None

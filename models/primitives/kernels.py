@@ -39,7 +39,7 @@ def make_kernel(
     length_scale: float = DEFAULT_LENGTH_SCALE,
     parameters: Mapping[str, float] | None = None,
 ) -> Kernel:
-    """Build a registered kernel; equal arguments return the same object.
+    """Build a registered kernel; the last 100 kernels are cached and shared.
 
     Args:
         name: Registered name of the kernel.
@@ -113,7 +113,7 @@ class SquaredExponential(_StationaryKernel):
 class Matern52(_StationaryKernel):
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
-    Motions with this kernel are only twice differentiable. The kernel suits motions for which the squared
+    Random motions with this covariance are only twice differentiable. The kernel suits motions for which the squared
     exponential kernel is too smooth, such as motions with a contact in the middle.
 
     Args:

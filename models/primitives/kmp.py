@@ -20,22 +20,26 @@ class _Point:
 class Kmp:
     """Kernelized movement primitive with E(ζ) = k*(K + λΣ)⁻¹μ and cov(ζ) = N/λ_c (k** − k*(K + λ_cΣ)⁻¹k*ᵀ).
 
+    k* and k** are the kernel between a query ζ and the N points, and at ζ itself. K, Σ and μ are the kernel, the
+    covariances and the means of the points. N counts via-points too.
+
     `LcNsKmp` solves for a window of steps; this class uses the whole reference at once, for primitives driven by a
-    state instead of time, and for via-points. The solution is stored as weights of the kernel's features, whose number
-    is the rank of the kernel and not the number of points. The weights are solved for with the triangular factor of a
-    QR decomposition. The factor of the reference is stored: a change of a via-point only appends the O rows of each
-    via-point to it.
+    state instead of time, and for via-points. The solution is stored as weights of the kernel's features. The number of
+    features is the numerical rank of K, which can be much smaller than N. A QR decomposition gives the weights. The
+    triangular factor of the reference is stored: a change of a via-point only appends O rows for each via-point to it,
+    unless a via-point far from the reference adds features.
 
     Args:
         inputs: Times or states, (N,) or (N, I).
         means: Means (N, O).
-        covariances: Covariances (N, O, O), positive definite.
+        covariances: Covariances (N, O, O), symmetric and positive definite.
         kernel: Kernel k; `SquaredExponential(length_scale=0.5)` by default.
         lambda_: λ, positive.
         covariance_lambda: λ_c, positive; λ by default.
 
     Raises:
-        InputError: If an argument is out of range or shapes do not match.
+        InputError: If λ or λ_c is out of range, shapes do not match, a number is not finite, or a covariance is not
+            symmetric or not positive definite.
     """
 
     def __init__(
@@ -71,12 +75,20 @@ class Kmp:
         self._factor_reference()
 
     def mean(self, inputs: np.ndarray) -> np.ndarray:
-        """Compute means (n, O) at `inputs` (n,) or (n, I) (equation 2.17)."""
+        """Compute means (n, O) at `inputs` (n,) or (n, I) (equation 2.17).
+
+        Raises:
+            InputError: If the inputs have another dimension than those of the reference, or are not finite.
+        """
         F = self._basis.features(self._queries(inputs))
         return (F @ self._weights.reshape(-1, self.num_outputs)).reshape(-1, self.num_outputs)
 
     def covariance(self, inputs: np.ndarray) -> np.ndarray:
-        """Compute covariances (n, O, O) at `inputs` (n,) or (n, I) (equation 2.18)."""
+        """Compute covariances (n, O, O) at `inputs` (n,) or (n, I) (equation 2.18).
+
+        Raises:
+            InputError: As `mean`.
+        """
         queries = self._queries(inputs)
         F = self._basis.features(queries)
         unexplained = np.maximum(self._basis.residual(queries, F), 0)
@@ -94,13 +106,14 @@ class Kmp:
         Args:
             input_: Input (I,).
             mean: Output (O,) that the motion passes through.
-            covariance: Covariance (O, O) of that output, positive definite.
+            covariance: Covariance (O, O) of that output, symmetric and positive definite.
 
         Returns:
             An identifier for `move_via_point` and `remove_via_point`.
 
         Raises:
-            InputError: If shapes do not match, a number is not finite, or the covariance is not positive definite.
+            InputError: If shapes do not match, a number is not finite, or the covariance is not symmetric or not
+                positive definite.
         """
         identifier = self._next_identifier
         self._via[identifier] = self._check_point(input_, mean, covariance)
@@ -109,7 +122,7 @@ class Kmp:
         return identifier
 
     def move_via_point(self, identifier: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Replace the via-point of an identifier by one with an input (I,), a mean (O,) and a covariance (O, O).
+        """Replace a via-point by one with another input (I,), mean (O,) and covariance (O, O).
 
         Raises:
             InputError: As `add_via_point`, or if there is no such via-point.

@@ -37,7 +37,7 @@ class LcNsKmp:
     """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
     The input is the reference's clock, so that every matrix depends on the step alone. Each step is factored at its
-    first use. A prediction is two small products; a QP is solved only if their result violates a constraint.
+    first use. A prediction takes two small matrix products; a QP is solved only if the result violates a constraint.
 
     Args:
         reference: Means and covariances of the demonstrations, N steps of O outputs.
@@ -49,8 +49,8 @@ class LcNsKmp:
         history_variance: Variance ρ of the past outputs [output²], positive.
         constraints: Constraints G y ≥ c at every future point; none by default.
         solver: "daqp", "piqp" or "osqp".
-        cache_bytes: Memory limit of factored steps, after which the oldest is dropped [bytes].
-        max_deviation: Largest accepted `deviation`; infinity accepts all.
+        cache_bytes: Memory limit of the factored steps [bytes]; beyond it, the steps factored first are dropped.
+        max_deviation: `deviation` above which a motion is refused if it also misses by `MAX_MISS` (`check_deviation`).
 
     Raises:
         InputError: If an argument is out of range, sizes do not match, the history's variance is too small for its
@@ -136,7 +136,7 @@ class LcNsKmp:
             history: Outputs at step−P … step−1, oldest first, (P, O); None if P = 0.
 
         Raises:
-            InputError: If an argument has the wrong shape or is not finite.
+            InputError: If an argument has the wrong shape or is not finite, or the step is negative or not whole.
             UnsolvableError: If no window within the constraints was found; repeat the last safe command.
         """
         factor = self._cache.get(step) or self._factor(step)
@@ -145,7 +145,7 @@ class LcNsKmp:
     def predict_batch(
         self, steps: ArrayLike, null_space_actions: np.ndarray | None = None, histories: np.ndarray | None = None
     ) -> BatchPrediction:
-        """Compute the outputs of B predictions at once, each equal to that of `predict`.
+        """Compute the outputs of B predictions at once, equal to those of `predict` up to rounding.
 
         Predictions at the same step take two matrix products; a QP is solved only for those that violate a constraint.
 
@@ -155,7 +155,7 @@ class LcNsKmp:
             histories: (B, P, O), as in `predict`; None if P = 0.
 
         Raises:
-            InputError: If an argument has the wrong shape or is not finite.
+            InputError: If an argument has the wrong shape or is not finite, or a step is negative or not whole.
         """
         x, at = self._stack_batch(steps, null_space_actions, histories)
         outputs = np.empty((len(x), self.num_outputs))
@@ -201,12 +201,12 @@ class LcNsKmp:
         """Compute the output at inputs that are not on the reference's clock, such as a state; nothing is cached.
 
         Args:
-            inputs: Inputs of the window, (H+1,) or (H+1, I), the executed point first.
+            inputs: Inputs of a window of any length, (H+1,) or (H+1, I), the executed point first.
             means: Reference means at these inputs (H+1, O).
             covariances: Reference covariances at these inputs (H+1, O, O).
             null_space_action: ξ̂ (O,), as in `predict`.
             history: (P, O), as in `predict`.
-            history_inputs: Inputs of the history, (P,) or (P, I).
+            history_inputs: Inputs of the history, (P,) or (P, I); None if P = 0.
 
         Raises:
             InputError: As `predict`, if shapes do not match, a covariance is not positive definite, or the constraints
@@ -237,7 +237,7 @@ class LcNsKmp:
         """Compute the output at a step from a given window, such as that of a base policy; nothing is cached.
 
         Args:
-            step: As in `predict`; it selects the constraints.
+            step: As in `predict`; it selects the constraints and the times of the window.
             means: Reference means of the window (H+1, O), the executed point first.
             covariances: Reference covariances of the window (H+1, O, O), positive definite.
             null_space_action: ξ̂ (O,), as in `predict`.
@@ -272,7 +272,7 @@ class LcNsKmp:
         """Compute the window at a step under null-space actions at several of its points (equations 4.17 and 4.18).
 
         With one action at `step` itself this is the window of `predict` (equation 4.21). Between the points, actions
-        are interpolated by the minimum-norm weights of the kernel that reach all of them.
+        are interpolated by the kernel's function of minimum norm that passes through all of them.
 
         Args:
             step: Executed point n ≥ 0; past the end, the last step.
@@ -281,8 +281,8 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: If an argument has the wrong shape, is not finite or is not a step of the window, or if steps
-                are so close that their kernel matrix is singular.
+            InputError: As `predict`, if `at` holds a step twice or one outside of the window, or if its steps are so
+                close that their kernel matrix is singular.
             UnsolvableError: If no window within the constraints was found.
         """
         factor, step = self._factor(step), min(int(step), self.num_steps - 1)
@@ -351,7 +351,10 @@ class LcNsKmp:
         return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
 
     def free_constraints(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the map (m, PO+O) of [history, ξ̂] and its bounds (m,), within which a window needs no correction."""
+        """Return the map (m, PO+O) from [history, ξ̂] to the constrained directions, and their two bounds (m,).
+
+        A window whose directions are within the bounds needs no correction.
+        """
         factor = self._factor(step)
         return factor.constraint_map, factor.lower, factor.upper
 
@@ -360,7 +363,7 @@ class LcNsKmp:
         return self._factor(step).output_sizes()
 
     def factor_all(self) -> int:
-        """Factor every step in advance; return the memory of all factors [bytes]."""
+        """Factor every step in advance; return `cached_bytes`, which does not count steps that were dropped."""
         for step in range(self.num_steps):
             self._factor(step)
         return self.cached_bytes

@@ -10,7 +10,7 @@ from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 
-NUM_BASIS = 60  # default number of basis functions; at most a fourth of the number of steps
+NUM_BASIS = 60  # default number of basis functions, if the number of steps is at least four times as large
 RIDGE = 1e-8  # regularization of the weights, relative to the largest eigenvalue of the features
 
 
@@ -36,10 +36,11 @@ class ProMp:
 
         Args:
             demonstrations: Demonstrations on one clock (`Demonstrations.resampled`).
-            num_basis: K; default: `NUM_BASIS`.
+            num_basis: K; by default `NUM_BASIS`, but at most a fourth of the number of steps, and at least 2.
 
         Raises:
-            InputError: If the clocks differ, or K is less than 2 or more than half the number of steps.
+            InputError: If the clocks differ, or K is less than 2 or more than half the number of steps (2 is accepted
+                for any number of steps).
         """
         steps = len(demonstrations.times[0])
         if any(not np.array_equal(t, demonstrations.times[0]) for t in demonstrations.times):
@@ -71,11 +72,11 @@ class ProMp:
         Args:
             phase: Phase of the via-point, in [0, 1].
             output: Output (O,) to pass through.
-            covariance: Covariance (O, O) of that output, positive definite.
+            covariance: Covariance (O, O) of that output, symmetric and positive definite.
 
         Raises:
-            InputError: If the phase is out of range, shapes do not match, or the covariance is not symmetric or not
-                positive definite.
+            InputError: If the phase is out of range, shapes do not match, a number is not finite, or the covariance is
+                not symmetric or not positive definite.
         """
         output, covariance = as_numbers(output, "a via-point"), as_numbers(covariance, "a via-point's covariance")
         if not 0.0 <= phase <= 1.0:

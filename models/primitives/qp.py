@@ -1,12 +1,12 @@
 """Quadratic program of a constrained primitive in least-norm form, and its solvers.
 
 In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = ḠᵀSḠ, the Hessian is rank-deficient and badly scaled
-(largest eigenvalue 6e-6 for a connector): a first-order solver misses the bound by up to millimeters. With S = L Lᵀ the
-same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
-length, so that a solver's tolerance is a tolerance on the output itself.
+(largest eigenvalue 6e-6 for a connector): a first-order solver misses the bound by up to millimeters. With S = L Lᵀ and
+the unconstrained window y, the same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity. Its
+constraints can be scaled to unit rows, so that a solver's tolerance is a tolerance on the output itself.
 
 The package `qpsolvers` is not used. Its constraints are one-sided, which doubles the rows (DAQP takes 1.8 times as
-long), and it has no second tolerance, no margin and no check of an inaccurate result.
+long). It neither retries with a second tolerance or a margin, nor checks an inaccurate result.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError, import_extra
 
 RELAXATIONS = (1e-10, 1e-9)
-"""Relaxations of the bounds, tried in turn until a solver succeeds, relative to the largest required correction."""
+"""Relaxations of the bounds, tried in turn until the solver succeeds, relative to the largest required correction."""
 
 Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 

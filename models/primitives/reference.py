@@ -89,17 +89,17 @@ class ReferenceTrajectory:
         circling search; `prior_std` adds the variance that other demonstrations would have shown.
 
         Args:
-            demonstrations: Demonstrations, resampled to one clock if their clocks differ.
+            demonstrations: Demonstrations, resampled to one uniform clock of N steps if they do not have it already.
             components: Number of components C of the mixture; chosen by the Bayesian information criterion by default.
             seed: Seed of the mixture's initialization.
-            num_steps: Number of steps N; that of the longest demonstration by default.
+            num_steps: Number of steps N, at least 2; the largest number of samples of a demonstration by default.
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
                 such as the resolution of a sensor or a controller if demonstrations differ by less.
             prior_std: Standard deviations (O,) of a single demonstration, a scalar, or rows as in `interpolate_prior`;
                 required for one demonstration, refused for several.
             model: "gmr", or "promp" with the default number of basis functions (`ProMp`).
             gap_scale: Factor of the standard deviation in a gap of all recordings, positive. Below 1, exploration in
-                the gap is narrower; above 1, it is wider. At the step n the factor is `gap_scale` to the power of
+                the gap is narrower; above 1, it is wider. At each step the factor is `gap_scale` to the power of
                 `unobserved_share`.
             kernel: Kernel of `unobserved_share`; `SquaredExponential()` by default.
 
@@ -155,7 +155,7 @@ class ReferenceTrajectory:
             floor: Standard deviation, (O,) or scalar, as in `from_demonstrations`.
 
         Raises:
-            InputError: If the times are wrong, the floor is negative, or a covariance is singular: give a floor.
+            InputError: If the times do not increase, the floor is negative, or a covariance is singular: give a floor.
         """
         times = as_numbers(times, "times")
         if times.ndim != 1 or len(times) < 2 or not times[-1] > times[0]:
@@ -223,7 +223,8 @@ class ReferenceTrajectory:
     def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
         """Return this trajectory with a `period` [s] between steps and `time_scale` times its duration.
 
-        Means and covariances are interpolated linearly. The number of steps times the period is the new duration.
+        The clock of this trajectory must be uniform, which is not checked. Means and covariances are interpolated
+        linearly. The number of steps is the new duration divided by the period, rounded.
 
         Raises:
             InputError: If an argument is not positive, or fewer than two steps remain.
@@ -273,7 +274,7 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
         num_outputs: Number of outputs O.
 
     Raises:
-        InputError: If the number of values does not fit, phases do not increase or are not in 0 to 1, or a standard
+        InputError: If the number of values does not fit, phases do not increase or are not in [0, 1], or a standard
             deviation is not positive and finite.
     """
     numbers = np.ravel(np.asarray(prior_std, dtype=float))
@@ -291,7 +292,7 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
     if not (np.isfinite(rows).all() and (deviations > 0).all()):
         raise InputError("prior_std is a standard deviation: give positive numbers")
     if phases[0] < 0 or phases[-1] > 1 or (np.diff(phases) <= 0).any():
-        raise InputError(f"the phases of prior_std must increase from 0 to 1, not {phases.tolist()}")
+        raise InputError(f"the phases of prior_std must increase and lie from 0 to 1, not {phases.tolist()}")
     at = np.linspace(0.0, 1.0, num_steps)
     return np.column_stack([np.interp(at, phases, column) for column in deviations.T])
 
@@ -353,7 +354,7 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
 
 @dataclass(frozen=True)
 class Mixture:
-    """Joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations."""
+    """Joint Gaussian mixture of (time, outputs), standardized by `center` and `scale`."""
 
     weights: np.ndarray  # weights of the components (C,)
     means: np.ndarray  # means (C, 1 + O)
@@ -371,12 +372,13 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     Args:
         times: Common clock (N,) [s].
         outputs: Outputs (M, N, O).
-        components: Number of components C. By default the number from 1 to 20 with the least Bayesian information
-            criterion; the search stops once two numbers in a row are not better than the best before.
+        components: Number of components C, from 1 to half the number of steps. By default the number with the least
+            Bayesian information criterion, at most 20; the search stops once two numbers in a row are worse than the
+            best before.
         seed: Seed of scikit-learn's generator.
 
     Raises:
-        InputError: If there are fewer points than the components need.
+        InputError: If there are fewer than two steps for each component, or less than one component.
     """
     _, center, scale = _standardize(times, outputs)
     candidates = [components] if components is not None else range(1, min(_MAX_COMPONENTS, len(times) // 2) + 1)
@@ -389,7 +391,7 @@ def information_criteria(
 ) -> dict[int, float]:
     """Compute the Bayesian information criterion of mixtures by number of components; less is better.
 
-    `candidates` are increasing; the search stops once two in a row are not better than the best before. The other
+    `candidates` are increasing; the search stops once two in a row are worse than the best before. The other
     arguments and the errors are those of `fit_mixture`.
     """
     return {count: criterion for count, (_, criterion) in _fit_candidates(times, outputs, candidates, seed).items()}
@@ -398,7 +400,7 @@ def information_criteria(
 def _fit_candidates(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, tuple[GaussianMixture, float]]:
-    """Return mixtures and their criteria by number of components; the search stops after two that are not better."""
+    """Return mixtures and their criteria by number of components; the search stops after two that are worse."""
     for count in candidates:
         if not 1 <= count <= len(times) // 2:
             raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")

@@ -68,10 +68,10 @@ class _Solution:
 class StepFactor:
     """Factored problem 4.5 of the thesis for one window; its solution depends on x = [history, null-space action].
 
-    With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w. Its QR factor
-    gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ with ħ = λ + β directly, without forming Σ⁻¹ or K⁻¹ (equation 4.12 for weights). The
-    window is affine in x, and so are the executed point and the constrained directions. Only their maps are stored; the
-    rest of the window is computed again on request.
+    With y = W̄h + F̄w for standard normal weights w, problem 4.5 is a regularized least-squares problem in w. The QR
+    factor of this problem gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ, with ħ = λ + β and K = F̄F̄ᵀ, without forming Σ⁻¹ or K⁻¹
+    (equation 4.12 for weights). The window is affine in x, and so are the executed point and the constrained
+    directions. Only the maps of these two are stored; the rest of the window is computed again on request.
 
     Args:
         window: Reference and constraints.
@@ -87,7 +87,8 @@ class StepFactor:
         constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled so that a correction of norm one
             changes it by at most one.
         lower, upper: Bounds (m,) of the constrained directions, minus their offset and scaled in the same way.
-        constraint_rows: Unit rows (m, r), the map from a correction v to the constrained directions.
+        constraint_rows: Unit rows (m, r), the map from a correction v to the constrained directions; zero where no
+            correction changes the direction. Set by `factor_corrections`, like the next one.
         correction_map: Map (O, r) from a correction v to the executed point.
     """
 
@@ -246,7 +247,8 @@ class StepFactor:
             UnsolvableError: If the solver finds no correction.
         """
         solution = self._solve()
-        # β/ħ (K̂ − K A K̂) K̲⁻¹ ξ̂: the projection of the actions into the null space of the demonstrations.
+        # β/ħ (K̂ − K A K̂) K̲⁻¹ ξ̂ with A = (K + ħΣ)⁻¹: the projection of the actions into the null space of the
+        # demonstrations.
         whitened = np.einsum("joi,ji->jo", solution.whiten, action).ravel()
         projected = action - (solution.L @ (solution.Lw.T @ whitened)).reshape(action.shape)
         pull = self._beta / self._hbar * projected
@@ -271,7 +273,7 @@ class StepFactor:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the stored arrays [bytes]."""
+        """Memory of the stored arrays [bytes], without kernel features and constraints, which steps usually share."""
         arrays = (*vars(self).values(), self._window.means, self._window.covariances)
         return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))
 
@@ -309,7 +311,7 @@ class Prediction:
         factor: Factored problem of the step's window.
         x: History and null-space action of the prediction ((P + 1) O,).
         correction: Smallest correction v (r,) with which the window satisfies the constraints, or None if it satisfies
-            them uncorrected. It moves output i by at most ‖v‖ `LcNsKmp.output_sizes`[i].
+            them uncorrected. It moves output i by at most ‖v‖ times `LcNsKmp.output_sizes`[i].
         signed_multipliers: Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower
             bound, or None.
     """
@@ -344,7 +346,7 @@ class BatchPrediction:
 
     Attributes:
         outputs: Outputs to execute (B, O); NaN where `is_solved` is false.
-        is_constrained: True where a constraint of the window is active (B,).
+        is_constrained: True where the window violates a constraint without a correction (B,).
         is_solved: False where no window within the constraints was found (B,); repeat the last safe command there.
     """
 

@@ -17,11 +17,11 @@ AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 def solve_inverse_kinematics(
     plant: MultibodyPlant, reference: Frame, tool_center: Frame, X: RigidTransform, posture: np.ndarray
 ) -> np.ndarray:
-    """Return the joint positions (n,) nearest to `posture` that put the tool center at X in the reference frame.
+    """Return the joint positions (n,) [rad] near `posture` that put the tool center at X in the reference frame.
 
-    Minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`, so that the result is
-    deterministic. If no solution is found, further searches start at random postures and the solution nearest
-    to `posture` is returned.
+    A local search minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`. If it finds
+    no solution, further searches start at random postures, and the solution nearest to `posture` is returned. The
+    random postures have a fixed seed, so that the result is deterministic.
 
     Args:
         plant: Finalized plant; the solution may move all of its joints.
@@ -31,7 +31,7 @@ def solve_inverse_kinematics(
         posture: Joint positions (n,) [rad].
 
     Raises:
-        InputError: If the pose is out of reach, or can only be reached beyond the joint limits.
+        InputError: If no solution is found: the pose is out of reach, or can only be reached beyond the joint limits.
     """
     problem = _Problem(plant, reference, tool_center, X, np.asarray(posture, dtype=float))
     solution = problem.search(within_limits=True)
@@ -99,7 +99,7 @@ class _Problem:
     def _refine(self, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
         """Refine the solver's solution to the exact pose, with joints at their limits fixed; None if it fails.
 
-        The method is Levenberg-Marquardt with damping proportional to the error: it converges quadratically at a
+        The method is Levenberg-Marquardt, damped by the squared norm of the error: it converges quadratically at a
         regular pose and takes no large steps at a singular one.
         """
         is_free = (q > lower + AT_LIMIT) & (q < upper - AT_LIMIT)

@@ -22,9 +22,10 @@ class JointRange:
     """Joint positions at a commanded pose [x y z Rz Ry Rx], and constraints on them.
 
     The joint positions of a pose are those nearest to the posture, because null-space control brings an arm there.
-    Near a command y they are q(z) ≈ q(y) + J⁺ (z − y), so that limits of the joints are linear constraints on the next
-    command. The second-order error of these constraints is not bounded in advance: `violation` computes the joint
-    positions of the command itself, and a command with a violation is not executed (`MotionConstraintFilter`).
+    Near a command y they are q(z) ≈ q(y) + J⁺ (z − y) for the Jacobian J from joint positions to the pose, so that
+    limits of the joints are linear constraints on the next command z. The second-order error of these constraints is
+    not bounded in advance: `violation` computes the joint positions of the command itself, and a command with a
+    violation is not executed (`MotionConstraintFilter`).
 
     Args:
         plant: Finalized plant with the arm only.
@@ -37,7 +38,7 @@ class JointRange:
             [m]; 0 for no constraint.
 
     Raises:
-        InputError: If the posture is not within the limits and the margin, or an argument is negative.
+        InputError: If the posture is not within the limits and the margin, or an argument is negative or infinite.
     """
 
     def __init__(
@@ -63,7 +64,8 @@ class JointRange:
     def solve(self, pose: np.ndarray) -> np.ndarray | None:
         """Return the joint positions (n,) [rad] of a pose (6,), nearest to the posture; None if none is found.
 
-        None is found for a pose that is not finite. The array is read-only, because results are cached.
+        The positions may be beyond the limits. The result for a pose that is not finite is None. The array is
+        read-only, because results are cached.
         """
         return self._solve_once(np.asarray(pose, dtype=float).tobytes())
 
@@ -109,8 +111,8 @@ class JointRange:
     def violation(self, output: np.ndarray) -> float:
         """Return the largest violation of a pose (6,), negative inside; infinite if it cannot be reached.
 
-        The violation of a joint limit is an angle [rad]. The violation of the singular value [m] is converted to an
-        angle by `LEVER`, like rotations in the scaled Jacobian.
+        The violation of a joint limit is an angle [rad]. The violation of the singular value [m] is divided by `LEVER`
+        [m] to give an angle too.
         """
         q = self.solve(output)
         if q is None:

@@ -46,7 +46,7 @@ class MountedEndEffector:
 
 
 def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
-    """Add a robot with its base at the world's origin.
+    """Add a robot; its base is welded to the world's origin, unless the model file mounts it.
 
     Raises:
         InputError: If its model file is missing, can't be read, or does not match the robot's data.
@@ -74,7 +74,7 @@ def add_end_effector(
         robot: Robot, whose `tool_turn` defines the orientation of the mount.
         mounted: The robot in the plant.
         end_effector: End effector to mount.
-        as_rigid: Add an open gripper as one rigid body, for a controller's plant.
+        as_rigid: Add a gripper, opened, as one rigid body, for a controller's plant; no effect on a rigid tool.
 
     Raises:
         InputError: If its model file is missing, can't be read, or does not match its data.

@@ -1,6 +1,6 @@
 """Robots and end effectors as data, and their registries.
 
-A robot consists of a Python file of this package and a model file. The Python file constructs a `Robot` and calls
+A robot of this package consists of a Python file and a model file. The Python file constructs a `Robot` and calls
 `register_robot`; `find_robot(name)` then returns it. An installed package adds robots by an entry point of the group
 `guiderail.robots` (end effectors: `guiderail.end_effectors`), a script by calling `register_robot`.
 """
@@ -19,7 +19,11 @@ from guiderail.models.common.registry import Registry
 
 @dataclass(frozen=True)
 class JointDrives:
-    """Position control of joints by springs and dampers."""
+    """Position control of joints by springs and dampers.
+
+    Raises:
+        InputError: If the numbers of values differ, or a value is not positive and finite.
+    """
 
     stiffness: tuple[float, ...]  # stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic one
     # Typical inertia of each joint including its rotor, (n,) [kg m²] or [kg], for critical damping.
@@ -47,9 +51,9 @@ class Robot:
         model: URDF or SDF file, or a file of Drake model directives (.yaml) with its packages in the same folder. Each
             joint needs an actuator with effort limit, rotor inertia and gear ratio: without reflected inertia an
             impedance controller is unstable at a step of milliseconds.
-        base_frame: Frame that is welded to the world's origin, unless the model file welds it to the world.
+        base_frame: Frame that is welded to the world's origin, unless a joint of the model file moves or fixes it.
         flange_frame: Frame to which tools are mounted; its z axis points away from the arm.
-        joints: Names of the joints from the base to the flange.
+        joints: Names of the joints (n,) from the base to the flange, each once.
         home: Joint positions (n,) [rad] with the flange pointing down in front of the robot, far from limits and
             singularities; inverse kinematics starts there.
         tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with the
@@ -60,6 +64,10 @@ class Robot:
         level_posture: Joint positions (n,) [rad] with a horizontal z axis of the flange, for a gripper that holds an
             upright cup; None if unknown.
         source: Source of the model's numbers.
+
+    Raises:
+        InputError: If there are fewer than six joints, a joint occurs twice, the number of joint positions or drives
+            differs from that of joints, a position is not finite, or `apparent_rotor_inertia` is not in (0, 1].
     """
 
     name: str
@@ -94,7 +102,12 @@ class Robot:
 
 @dataclass(frozen=True)
 class EndEffector:
-    """End effector: a rigid tool or a gripper."""
+    """End effector: a rigid tool or a gripper.
+
+    Raises:
+        InputError: If there are no bodies, a position in `opening` is not finite, that of an actuated joint is missing,
+            or the number of drives differs from that of actuated joints.
+    """
 
     name: str  # name in the registry
     title: str  # name for users
@@ -149,7 +162,7 @@ def find_robot(name: str | Robot) -> Robot:
     """Return the robot with a name; a `Robot` is returned unchanged.
 
     Raises:
-        InputError: If no entry has this name; the message suggests the nearest name.
+        InputError: If no entry has this name; the message suggests a similar name or lists all.
     """
     return name if isinstance(name, Robot) else _ROBOTS.get(name)
 
@@ -167,7 +180,7 @@ def find_end_effector(name: str | EndEffector) -> EndEffector:
     """Return the end effector with a name; an `EndEffector` is returned unchanged.
 
     Raises:
-        InputError: If no entry has this name; the message suggests the nearest name.
+        InputError: If no entry has this name; the message suggests a similar name or lists all.
     """
     return name if isinstance(name, EndEffector) else _END_EFFECTORS.get(name)
 

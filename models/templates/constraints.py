@@ -301,7 +301,7 @@ class TiltConstraint(FrameConstraint):
         """Return the bounds of the tilt [deg] at a distance from F's origin."""
 
     def tilt(self, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the tilt [rad] of the nearest orientation that is only tilted towards F's axis."""
+        """Return the tilt [rad], in [−π, π], of the nearest orientation that is only tilted towards F's z axis."""
         R_FE, p_FE = pose_in(self.frame, X_WE, frames)
         return self._tilt(self._heading(p_FE), R_FE)
 
@@ -385,7 +385,7 @@ class TiltByDistance(TiltConstraint):
 class Arc(FrameConstraint):
     """Circle about F's z axis; the orientation turns with the angle along the circle, as for a door handle.
 
-    At angle 0 the end effector is on F's x axis with R_FE = rpy_deg.
+    At angle 0 the end effector is above, below or on F's positive x axis, with R_FE = rpy_deg.
     """
 
     frame: str  # F: frame of an object, or `world`

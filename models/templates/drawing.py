@@ -69,7 +69,9 @@ def draw(template: SharedControlTemplate, path: str | Path) -> None:
         write_atomically(path, to_dot(template).encode())
         return
     if path.suffix not in (".png", ".svg", ".pdf"):
-        raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
+        raise InputError(
+            f"A state machine can't be drawn to '{path.name}': use the ending .png, .svg, .pdf, .dot or .gv."
+        )
     content = io.BytesIO()
     draw_figure(template).savefig(content, format=path.suffix[1:], dpi=120)
     write_atomically(path, content.getvalue())

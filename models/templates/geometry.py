@@ -24,7 +24,7 @@ WORLD = "world"
 
 
 class StatePart:
-    """Mapping, constraint or distance of a template's state, with at most one frame, the field `frame`."""
+    """Mapping, constraint or distance of a template's state, with at most one frame of its own, the field `frame`."""
 
     own_frames: ClassVar[tuple[str, ...]] = (WORLD,)  # frames that are not those of objects
 

@@ -1,7 +1,7 @@
 """Registries of the kinds of input mapping, active constraint and transition distance.
 
-A kind is a frozen dataclass whose fields are the entries that a template file may give, with the unit in the name of
-each. A kind is registered under the name that the file uses:
+A kind is a frozen dataclass whose fields are the entries that a template file may give. The name of an entry with a
+unit contains the unit. A kind is registered under the name that the file uses:
 
     @register(ACTIVE_CONSTRAINTS, "half_space")
     @dataclass(frozen=True)

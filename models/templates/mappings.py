@@ -25,7 +25,7 @@ class InputMapping(StatePart, ABC):
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        """Return ΔH of one period; `inputs` are all inputs of the template, each in [−1, 1]."""
+        """Return ΔH of one period [s]; `inputs` (n,) are all inputs of the template, each in [−1, 1]."""
 
     @property
     def used_inputs(self) -> tuple[int, ...]:
@@ -46,7 +46,7 @@ def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) 
 
 
 def _require_object(frame: str) -> None:
-    require(frame != TOOL, "frame must be that of an object, not the tool's own.")
+    require(frame != TOOL, "frame must be that of an object or world, not the tool's own.")
 
 
 @register(INPUT_MAPPINGS, "translation")
@@ -108,7 +108,7 @@ class TiltTowards(InputMapping):
 
     inputs: tuple[int, ...]  # numbers of two inputs, from 0
     speed_rad_per_s: float  # speed at full input
-    frame: str  # frame of the object to tilt towards
+    frame: str  # frame to tilt towards: that of an object, or `world`
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -144,9 +144,9 @@ class ScaledMapping(InputMapping):
 class Scaled(ScaledMapping):
     """Another mapping with its inputs multiplied by a factor that depends on the distance to a frame."""
 
-    frame: str  # frame of the object to which the distance is measured
+    frame: str  # frame to which the distance is measured: that of an object, or `world`
     distance_m: tuple[float, ...]  # distances to the frame's origin, increasing
-    factor: tuple[float, ...]  # factors in [0, 1], one for each distance; linear in between
+    factor: tuple[float, ...]  # factors in [0, 1], one for each distance; linear in between, constant beyond
     of: InputMapping  # mapping whose inputs are scaled, an entry with its own kind
 
     def __post_init__(self) -> None:

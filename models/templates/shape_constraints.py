@@ -18,8 +18,9 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, requi
 class Outside(PositionConstraint):
     """Base class of constraints to stay outside of a convex shape in F.
 
-    The constraint is linearized at the last command: a request is projected into a half-space outside of the shape.
-    Hence the straight line from a command outside to the next one is outside too.
+    `SharedControlTemplate.command` linearizes the constraint at the last command: it projects a request into a
+    half-space outside of the shape. The straight line from a command outside to the next one is therefore outside too.
+    `project` and `violation` use the nearest point of the shape's surface.
     """
 
     @property
@@ -70,7 +71,10 @@ class OutsideCylinder(Outside):
 
     def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
-        require(self.min_m < self.max_m and self.margin_m >= 0, "min_m < max_m, and margin_m is not negative.")
+        require(
+            self.min_m < self.max_m and self.margin_m >= 0,
+            "min_m must be less than max_m, and margin_m must not be negative.",
+        )
 
     @cached_property
     def shape(self) -> shapes.ConvexShape:

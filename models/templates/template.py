@@ -17,7 +17,7 @@ from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]
-BACKTRACKS = 8  # attempts with a shortened displacement before the last command is repeated
+BACKTRACKS = 8  # attempts to find an allowed displacement, each shorter than the one before
 
 
 @dataclass(frozen=True)
@@ -160,11 +160,12 @@ class SharedControlTemplate:
 
         If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
         orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. The displacement is also scaled down if one constraint undoes another; after `BACKTRACKS` attempts the
-        last command is repeated. Constraints that keep the end effector outside of a shape are linearized at the last
-        command, so that the line to the new command is outside too. If the last command is inside the constraints, so
-        is the new one. If the last command is outside (at the start of an episode, or after an object moved), the
-        commands move inside at the largest speed. The pose is not finite if that of an object is not; callers check it.
+        object. The displacement is also scaled down if one constraint undoes another. After `BACKTRACKS` attempts, the
+        last command is repeated if it is inside the constraints. Constraints that keep the end effector outside of a
+        shape are linearized at the last command, so that the line to the new command is outside too. If the last
+        command is inside the constraints, so is the new one. If the last command is outside (at the start of an
+        episode, or after an object moved), the commands move inside at the largest speed. The pose is not
+        finite if that of an object is not; callers check it.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
@@ -265,7 +266,7 @@ class SharedControlTemplate:
 
     @cached_property
     def _initial_progress(self) -> tuple[float, ...]:
-        """Progress at the beginning of each state, the sum over the states before it."""
+        """Progress at the beginning of each state, summed over the states before it along first transitions; else 0."""
         progress = [0.0] * len(self.states)
         number, visited = self.initial_state, {self.initial_state}
         while self.states[number].transitions:
@@ -281,10 +282,12 @@ class SharedControlTemplate:
     def progress(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
         """Return the progress in the task.
 
-        It is the progress of previous phases plus the weighted decrease of this phase's distance.
+        It is the progress of previous phases plus the weighted decrease of this phase's distance. The previous phases
+        are those that lead to this one from the initial state by the first transition of each.
 
         An increase of progress is d_{t−1} − d_t of equation 3.2, on one scale for all phases. Progress is continuous at
-        a transition if the distance of the next phase equals its `starts_at` there.
+        a transition if, there, the distance of the phase equals its `ends_at` and that of the next phase its
+        `starts_at`.
         """
         phase = self.states[state]
         return self._initial_progress[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))
