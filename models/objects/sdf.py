@@ -13,7 +13,7 @@ from guiderail.models.common.errors import InputError
 
 
 def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
-    """Return points (N, 3) [m] from cylindrical coordinates about z.
+    """Return points (N, 3) [m] from cylindrical coordinates about z, or one point (3,) from three numbers.
 
     Radius [m], angle [rad] and height [m] are (N,) or numbers; they are broadcast.
     """
@@ -160,7 +160,7 @@ def box(x: float, y: float, z: float) -> str:
 
 
 def mesh(file: str) -> str:
-    """Return the SDF geometry of a surface from an OBJ file in the folder of the SDF file."""
+    """Return the SDF geometry of a mesh from an OBJ or VTK file in the folder of the SDF file."""
     return f"<mesh><uri>{file}</uri></mesh>"
 
 
@@ -170,7 +170,7 @@ def convex_mesh(file: str) -> str:
 
 
 def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, pitch: float = 0.0) -> str:
-    """Return the SDF text of a pose in the link [m, rad]."""
+    """Return the SDF text of a pose in the link: position [m], and rotation about y by `pitch` [rad]."""
     return f"{x:g} {y:g} {z:g} 0 {pitch:.6g} 0"
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from guiderail.models.common.transforms import MM
 
-# If neighbouring convex pieces only touched, their seam would catch a sliding body: there, the shortest way out of a
-# piece is sideways. Each piece therefore extends by SHOULDER into its neighbours and slopes down, by nine degrees, to
-# a depth BELOW under their surface.
+# If neighbouring convex pieces only touched, their seam would catch a sliding body, because the shortest way out of a
+# piece is sideways at the seam. Each piece therefore has a shoulder: it extends by SHOULDER [m] into its neighbours and
+# slopes down, by nine degrees, to the depth BELOW [m] under their surface.
 SHOULDER, BELOW = 0.3 * MM, 0.05 * MM
 
 

@@ -37,7 +37,7 @@ class InsertionMotion:
         return self.advance * 2.0 * np.pi / abs(self.turn)
 
     def path(self, steps: int = 24) -> list[tuple[float, float]]:
-        """Return heights [m] and angles [rad] from the rim to the target."""
+        """Return heights [m] and angles [rad] from the rim to the target: `steps` down, and `steps` - 1 in a turn."""
         down = [(float(z), -self.turn) for z in np.linspace(self.rim, self.advance, steps)]
         if not self.turn:
             return down
@@ -94,13 +94,15 @@ def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, a
     """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] and `advance` [m] at the end.
 
     Raises:
-        InputError: If the plug at its target does not reach into the socket, or not beyond the advance.
+        InputError: If the plug at its target reaches less than 0.5 mm into the socket, or less than `TOUCH` deeper than
+            the advance.
     """
     rim = float(socket.bounds[1, 2] - plug.bounds[0, 2])
     if rim < 5e-4:
         raise InputError(
-            f"the plug ends {max(-rim, 0.0) * 1e3:.1f} mm above the socket at the target and is not inserted: draw "
-            "them assembled, place the plug with --plug-pose, or give the direction in which it comes out with --axis"
+            f"the plug ends {1e3 * abs(rim):.1f} mm {'above' if rim < 0.0 else 'inside'} the socket at the target and "
+            "is not inserted: draw them assembled, place the plug with --plug-pose, or give the direction in which it "
+            "comes out with --axis"
         )
     if advance and advance > rim - TOUCH:
         raise InputError(
@@ -178,6 +180,7 @@ def check_target(plug: Part, socket: Part) -> None:
 
     Raises:
         OverlapError: If they overlap, with the depth, the position, and the distance that `shrink` would need.
+        InputError: As `make_solids`.
     """
     plug_solids, socket_solids = make_solids(plug), make_solids(socket)
     thickness, where = measure_overlap(plug_solids, socket_solids)
@@ -200,13 +203,13 @@ def check_target(plug: Part, socket: Part) -> None:
 
 
 def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
-    """Return the largest distance of a point of the common volume from the surface of the second part [m]."""
+    """Return the largest distance of a sampled point of the common volume from the surface of the second part [m]."""
     deepest = 0.0
     for one in first:
         for other in second:
             common = one ^ other
             if not common.is_empty():
-                # Corners of the common volume lie on both surfaces: the deepest points are between the corners.
+                # Vertices where the surfaces cross lie on both of them, so points between vertices are sampled, too.
                 points, _ = sample_surface(*to_arrays(common), _VOLUME_SAMPLES)
                 deepest = max(deepest, float(SurfaceLocator(*to_arrays(other)).find_nearest(points)[1].max()))
     return deepest
@@ -215,10 +218,11 @@ def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
 def shrink(part: Part, distance: float) -> Part:
     """Return a part whose faces are moved inwards by a distance [m].
 
-    The motion of each vertex is a least-squares solution: the planes of its faces move by the distance.
+    The motion of each vertex is the least-squares solution for which the planes of its faces move by the distance. It
+    is at most twice the distance.
 
     Raises:
-        InputError: If the part would have no volume left.
+        InputError: If a body would have no volume left.
     """
     bodies = []
     for vertices, triangles in part.bodies:
@@ -270,6 +274,7 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
     """Return the names of the symmetries of both parts, and of further ones that nearly hold on the rim.
 
     The parts are in the target frame, the plug at its target. On the rim, the plug is turned by minus `motion.turn`.
+    With a turn, the first tuple is empty.
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
     socket_solids, plug_solids = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]

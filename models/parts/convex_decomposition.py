@@ -1,8 +1,8 @@
-"""Exact decomposition of a solid into convex pieces.
+"""Decomposition of a solid into convex pieces.
 
 Contact of a compliant mesh needs tetrahedra, and a convex piece has few. An approximate decomposition would lose
-clearances of a tenth of a millimeter. The solid is therefore cut along its own faces at concave edges, and no surface
-moves.
+clearances of a tenth of a millimeter. The solid is therefore cut along its own faces at concave edges, which moves no
+surface. Only the fine decomposition and the sectors of a screw fill concavities.
 """
 
 import itertools
@@ -13,7 +13,7 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.parts.solids import SCALE, SurfaceLocator, measure_distance, to_arrays
 
-MAX_PIECES = 300  # largest number of pieces; the base of two gears with a third between them has 282
+MAX_PIECES = 300  # largest number of pieces; a base with two gears, between which a third is inserted, has 282
 MAX_FINE_PIECES = 800  # largest number of pieces of a fine decomposition; few of them are in contact at a time
 _FINE_SLIVER = 1e-8  # fraction of the whole volume below which a piece of a fine decomposition is a rounding error
 _SLIVER = 1e-6  # fraction of the whole volume below which a piece is a rounding error
@@ -37,10 +37,12 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
         solid: Solid of `manifold3d`.
         max_pieces: Largest number of pieces.
         depth: Depth below which a concavity is filled [mm]; None: volumes decide instead. With a depth, smaller parts
-            are kept, and a part that no plane of a face cuts is cut by planes that halve the angles between faces.
+            are kept, and a part that no plane of a face cuts is cut by planes that halve the angles between faces. A
+            part that no plane cuts is replaced by its hull.
 
     Returns:
-        The pieces; None if more than `max_pieces` are necessary, or if hulls fill a concavity that no cut removes.
+        The pieces; None if more than `max_pieces` are necessary, or, without a depth, if hulls fill a concavity that no
+        cut removes.
     """
     total, filled, uncut, pieces = solid.volume(), 0.0, [solid], []
     sliver = (_SLIVER if depth is None else _FINE_SLIVER) * total
@@ -64,10 +66,13 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
 
 
 def cut_into_sectors(solid: Any, number: int, max_pieces: int = MAX_PIECES) -> list[Any] | None:
-    """Cut a solid by planes through the z axis into `number` sectors, at least 3, and each at a radius into hulls.
+    """Cut a solid by planes through the z axis into `number` sectors, at least 3, and each sector in two.
 
-    The radius is that with the smallest concave volume, the root of a thread: the faces of a thread are curved, so that
-    cuts along them would be too many. The hulls fill concavities. Returns None if more than `max_pieces` are necessary.
+    The second cut is across the sector, at the radius with the smallest concave volume, which is the root of a thread.
+    Cuts along the curved faces of a thread would be too many. The pieces are convex hulls, which fill concavities.
+
+    Returns:
+        The pieces; None if more than `max_pieces` are necessary.
     """
     pieces: list[Any] = []
     for angle in 2.0 * np.pi / number * np.arange(number):

@@ -1,7 +1,7 @@
 """Scripted demonstrator of an insertion: a straight motion for tests, and a search for demonstrations.
 
 Poses [x y z Rz Ry Rx] are those of the plug in the target frame [m, rad]. A command lies below the surface that stops
-the plug; under impedance control, the distance between them determines the push.
+the plug; under impedance control, the distance of the command from the surface determines the push.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ _CENTERING = 0.9  # fraction of the mean of the random curves that is subtracted
 def plan_straight_insertion(
     travel: float, rim: float, turn: float, push: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] and poses (N, 6) of an insertion.
+    """Return times (N,) [s] and poses (N, 6) [m, rad] of an insertion.
 
     The plug moves down, slowly past the rim, is pushed, turns, and moves to the target.
 
@@ -57,9 +57,10 @@ def plan_straight_insertion(
 def plan_search(
     travel: float, rim: float, turn: float, push: float, press: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] and poses (N, 6) of a demonstration.
+    """Return times (N,) [s] and poses (N, 6) [m, rad] of a demonstration without its random deviations.
 
-    The plug moves to the rim, searches there, is inserted, and turns.
+    The plug moves to the rim, stays there for the time `SEARCH`, is inserted, and turns. `demonstrator_motions` adds
+    the lateral motion of the search.
 
     Args:
         travel: Height of the start [m].
@@ -89,10 +90,11 @@ def demonstrator_motions(
 ) -> np.ndarray:
     """Return different searches (D, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
-    The random deviations are wide while the command is above the height `press_from` [m]. Below it, each search ends at
-    a socket of its own (`socket_offsets`), so that the variance of the demonstrations is that of the socket's position,
-    and actions can follow a displaced socket down to the target. With a `search_turn` [rad] the sockets are also turned
-    (`socket_turns`), and each motion has its socket's turn from the start.
+    The random deviations are wide while the command is above the height `press_from` [m]. They become narrow over the
+    3 mm below it, and each search ends at a socket of its own (`socket_offsets`). The variance of the demonstrations is
+    then that of the socket's position, so that actions can follow a displaced socket down to the target. With a
+    `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its socket's turn from the
+    start.
     """
     rng = np.random.default_rng(seed)
     script_times, poses = script
@@ -116,7 +118,7 @@ def socket_offsets() -> np.ndarray:
 
 
 def socket_turns(largest: float) -> np.ndarray:
-    """Return the turns (D,) [rad] of the sockets of the demonstrations, up to the `largest` one either way.
+    """Return the turns (D,) [rad] of the sockets of the demonstrations, from minus `largest` to `largest` [rad].
 
     Their mean is zero, and they are not correlated with the offsets.
     """

@@ -37,10 +37,10 @@ _SECONDS = 20  # largest CPU time of a check [s]
 
 
 def accepted_pieces(pieces: Sequence[Piece]) -> list[Piece] | None:
-    """Return pieces that Drake accepts, the refused ones rounded to a grid or left out if negligible.
+    """Return pieces that Drake accepts; a refused piece is rounded to a grid, or left out if it is negligible.
 
     Returns:
-        The pieces; None if one can be neither rounded nor left out.
+        The pieces; None if a refused piece can be neither rounded nor left out; one of tetrahedra never can.
     """
     refused = _refused(pieces)
     if not refused:
@@ -71,7 +71,7 @@ def _hull(points: np.ndarray) -> Any:
 
 
 def _rounded(piece: Piece) -> list[Piece]:
-    """Return copies of a piece with vertices rounded to coarser and coarser grids, if they span a volume."""
+    """Return copies of a convex piece with vertices rounded to each of `_GRIDS`, if they span a volume."""
     hulls = [_hull(np.unique(np.round(piece.points, digits), axis=0)) for digits in _GRIDS]
     arrays = [to_arrays(hull) for hull in hulls if not hull.is_empty()]
     return [replace(piece, points=points, cells=cells) for points, cells in arrays]

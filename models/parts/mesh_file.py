@@ -85,7 +85,8 @@ def load_part(path: Path, unit: str) -> Part:
     """Read a mesh file (STL, OBJ, PLY, GLB or STEP) whose coordinates are in `unit`, one of `UNITS`.
 
     Raises:
-        InputError: If the file can't be read, the part can't be made a solid, or its size is out of bounds.
+        InputError: If the file can't be read or has too many triangles, the part can't be made a solid, its size is out
+            of bounds, or software for the format is not installed.
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
@@ -126,7 +127,7 @@ def load_part(path: Path, unit: str) -> Part:
 
 
 def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return vertices (V, 3), triangles (T, 3) and the number of triangles; too many triangles are not returned.
+    """Return vertices (V, 3), triangles (T, 3) and the number of triangles; empty arrays if there are too many.
 
     Without a path and materials, a parser opens no other file and decodes no image.
     """
@@ -145,7 +146,7 @@ def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
 class Surface(Protocol):
     """Mesh with the contact parameters of one surface.
 
-    A `modulus` [Pa] makes it compliant, None rigid; `dissipation` is that of Hunt and Crossley [s/m].
+    A surface with a `modulus` [Pa] is compliant, one with None rigid. `dissipation` is that of Hunt and Crossley [s/m].
     """
 
     file: str

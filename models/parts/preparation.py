@@ -99,7 +99,8 @@ def prepare_surfaces(
         motion: Motion of the plug.
         tolerance: Largest deviation of the result from the drawing [m].
         moved: Deviation of the given parts from the drawing [m].
-        snapping: Indices of bodies of the plug that deflect; they are neither united nor cropped.
+        snapping: Indices of bodies of the plug that deflect; they are not united with the others. If there are any,
+            neither part is cropped.
         yaw: Largest rotation of the plug in the socket about its axis in a search [rad].
     """
     plug_solids, socket_solids = make_solids(plug), make_solids(socket)
@@ -137,7 +138,7 @@ def prepare_surfaces(
 
 
 def _count_sectors(plug: Part, socket: Part, motion: InsertionMotion, tolerance: float) -> int:
-    """Return the number of sectors whose chords deviate from the thread's circle by the tolerance [m]."""
+    """Return the number of sectors whose chords deviate from the thread's circle by at most the tolerance [m]."""
     radii = []
     for part in (plug, socket):
         corners = part.corners[(part.corners[:, 2] >= 0.0) & (part.corners[:, 2] <= motion.rim)]
@@ -162,11 +163,11 @@ def make_compliant(
 ) -> Iterator[tuple[str, list[Piece], float]]:
     """Yield the compliant geometries to try, the part with fewer triangles first.
 
-    A geometry is the name of the part, its pieces, and their largest measured distance from its surface [m].
+    A geometry is the name of the part, its pieces, and the pieces' largest measured distance from its surface [m].
 
     Args:
         kind: One of `KINDS`.
-        surfaces: Surfaces by name; only these parts may be compliant.
+        surfaces: Surfaces of the parts that may be compliant, by the part's name.
         tolerance: Largest deviation [m].
         log: Function called with a sentence on each part that does not decompose or that Drake refuses.
     """
@@ -199,7 +200,8 @@ def make_compliant(
 def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") -> tuple[list[Piece], float] | None:
     """Return convex pieces of all bodies, and the largest measured distance of added material from the surface [m].
 
-    The result is None if there are too many pieces or they deviate too much. `kind` is one of `KINDS`, not tetrahedra.
+    The result is None if there are too many pieces, or if they deviate by more than about twice the tolerance [m].
+    `kind` is one of `KINDS`, but not "tetrahedra".
     """
     cutters: dict[str, Callable[[Any], list[Any] | None]] = {
         "convex": cut_into_convex_pieces,
@@ -253,8 +255,9 @@ _SLIVER = 1e-4  # volume below which a cropped piece is a rounding error [mm³]
 def simplify(solid: Any, tolerance: float, start: float = 1.0) -> tuple[Any, float]:
     """Return a solid with fewer triangles, and its measured deviation [mm].
 
-    `manifold3d` may exceed its bound for thin parts. The deviation is therefore measured, and a smaller bound than the
-    tolerance [mm] is tried if it is too large. The first bound is the fraction `start` of the tolerance.
+    `manifold3d` may exceed its bound for thin parts. The deviation is therefore measured, and if it exceeds the
+    tolerance [mm], a smaller bound is tried. The first bound is the fraction `start` of the tolerance. If all bounds
+    fail, the solid is returned unchanged.
     """
     drawn = to_arrays(solid)
     for fraction in (start, 0.3 * start, 0.1 * start):
@@ -282,7 +285,7 @@ def as_hull_if_near(solid: Any, tolerance: float) -> tuple[Any, float]:
 
 
 def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plug: bool) -> Any:
-    """Return the region of a part that can come within `margin` of the other while the plug moves down along z.
+    """Return the region of a part that can come within `margin` of the other part while the plug moves down along z.
 
     A slab of the plug above z0 meets only the region of the socket above z0. A slab of the socket below z1 meets only
     the region of the plug below z1. Each slab keeps the projection of that region along z, widened by the margin.

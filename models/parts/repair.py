@@ -1,6 +1,7 @@
 """Repair of meshes exported from CAD programs to closed solids: slivers, open seams, doubled faces, cavities.
 
-The repair of open edges moves no vertex: loose triangles are removed, and flat faces are triangulated again.
+Open edges are first closed without moving a vertex: loose triangles are removed, and flat faces are triangulated again.
+If that fails, fTetWild gives a new surface, which differs from the old one by at most `MAX_MOVED`.
 """
 
 from __future__ import annotations
@@ -59,11 +60,12 @@ def close_surface(
 
     Args:
         name: Name of the file, for error messages.
-        vertices: Vertices (V, 3) [m]; equal points are one vertex.
+        vertices: Vertices (V, 3) [m], no two of them equal.
         triangles: Triangles (T, 3).
 
     Raises:
-        InputError: If the mesh cannot be closed, or only by moving its surface by more than `MAX_MOVED`.
+        InputError: If the mesh encloses no volume, or cannot be closed without moving its surface by more than
+            `MAX_MOVED`.
     """
     edges = find_open_edges(triangles)
     open_edges, where = len(edges), vertices[edges].reshape(-1, 3).mean(axis=0) if len(edges) else np.zeros(3)
@@ -172,10 +174,10 @@ def find_open_edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the triangles of a mesh (V, 3), (T, 3) after the repair of its open edges; some may remain.
+    """Return the triangles of a mesh (V, 3), (T, 3) after the repair of its open edges; some edges may remain open.
 
-    If the triangles of one plane are removed, the open edges of the others enclose the face in that plane, provided
-    that no triangle is missing elsewhere. The face is replaced only if fewer edges are open afterwards.
+    If the triangles in one plane are removed, the open edges of the other triangles enclose the face in that plane,
+    provided that no triangle is missing elsewhere. The face is replaced only if fewer edges are open afterwards.
     """
     triangles = _without_loose_triangles(triangles)
     left = find_open_edges(triangles)

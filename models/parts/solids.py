@@ -34,7 +34,7 @@ def to_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def join_surfaces(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) and triangles (T, 3) of several surfaces as one surface."""
+    """Return vertices (V, 3) [m] and triangles (T, 3) of several surfaces, at least one, as one surface."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
     triangles = [t + start for (_, t), start in zip(surfaces, starts, strict=False)]
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(triangles)
@@ -54,7 +54,7 @@ class SurfaceLocator:
         self._tree.init(self._vertices, self._triangles)
 
     def find_nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the nearest points (P, 3) to `points` (P, 3), their distances (P,) and triangles (P,)."""
+        """Return the nearest points (P, 3) to `points` (P, 3), their distances (P,) and triangles' indices (P,)."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if not len(points):
             return points, np.empty(0), np.empty(0, int)
@@ -64,10 +64,9 @@ class SurfaceLocator:
 
 
 def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (P, 3) of a surface and their triangles (P,): uniform samples, and corners of triangles.
+    """Return points (P, 3) of a surface and the indices of their triangles (P,): uniform samples, and corners.
 
-    There are `count` samples and fewer than `2 * count` corners, every n-th one of the mesh. The samples are the
-    same in every call.
+    There are `count` samples, the same in every call, and fewer than `2 * count` corners, every n-th one of the mesh.
     """
     corners = vertices[triangles]
     cumulative = np.cumsum(0.5 * np.linalg.norm(area_vectors(vertices, triangles), axis=1))
@@ -84,7 +83,10 @@ def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> t
 def measure_distance(
     points_of: tuple[np.ndarray, np.ndarray], surface: tuple[np.ndarray, np.ndarray], count: int = NUM_SAMPLES
 ) -> float:
-    """Return the largest distance of sampled points of one surface from another, each as in `measure_deviation`."""
+    """Return the largest distance of sampled points of one surface from another one [m].
+
+    The arguments are those of `measure_deviation`.
+    """
     points, _ = sample_surface(*points_of, count)
     return float(SurfaceLocator(*surface).find_nearest(points)[1].max())
 
@@ -92,7 +94,10 @@ def measure_distance(
 def measure_deviation(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray], count: int = NUM_SAMPLES
 ) -> float:
-    """Return the sampled Hausdorff distance of two surfaces, each as vertices (V, 3) and triangles (T, 3)."""
+    """Return the sampled Hausdorff distance of two surfaces [m].
+
+    Each surface is a pair of vertices (V, 3) [m] and triangles (T, 3); `count` is that of `sample_surface`.
+    """
     return max(measure_distance(first, second, count), measure_distance(second, first, count))
 
 

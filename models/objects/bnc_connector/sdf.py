@@ -60,7 +60,8 @@ def jack_sdf(
 ) -> str:
     """Return the jack's model: link `jack` is frame J, with geometry `barrel`, `pad`, `lug_0` and `lug_1`.
 
-    The collision geometry of the barrel is an inscribed polygon, or with `equal_area` a polygon of the same area.
+    `friction` and `margin` [m] are those of barrel and lugs. The collision geometry of the barrel is an inscribed
+    polygon, or with `equal_area` a polygon of the same area.
     """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
@@ -79,7 +80,10 @@ def jack_sdf(
 
 
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
-    """Return the plug's model: link `plug` is frame P, with geometry `bore`, `slots` and `seat`."""
+    """Return the plug's model: link `plug` is frame P, with geometry `bore`, `slots` and `seat`.
+
+    `friction` is that of bore and slots.
+    """
     d, ring = dimensions, replace(RING, friction=friction)
     seat = (at(z=d.seat_height + d.seat_thickness / 2), box(d.seat_width, d.seat_width, d.seat_thickness))
     shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
@@ -94,7 +98,7 @@ def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
 def files(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> dict[str, str]:
-    """Return the content of each file by name."""
+    """Return the content of each file by name; the arguments are those of `jack_sdf`."""
     return {
         "bnc_bore.obj": bore_mesh(dimensions, equal_area=equal_area).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
@@ -107,14 +111,17 @@ def files(
 def folder_of(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> Path:
-    """Return the folder with a connector's files: that of this module, or a temporary one for other dimensions."""
+    """Return the folder with a connector's files: that of this module for the default arguments, else a temporary one.
+
+    The arguments are those of `jack_sdf`; default dimensions are `BncDimensions()`.
+    """
     if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
         return FOLDER
     return generate_assets(files, dimensions, friction, margin, equal_area)
 
 
-MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism about the axis; its flat face is then 7 µm inside the circle
-# A rigid disc on a spring models the gasket, with the force of Drake's pad within 15 % up to 0.6 mm.
+MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism between the slots; its face is then 7 µm inside the circle
+# A rigid disc on a spring models the gasket, with the force of Drake's pad within 20 % up to 0.6 mm.
 PAD_STIFFNESS = 1.5e5  # [N/m]
 
 
@@ -148,7 +155,7 @@ def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
 
 
 def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """Return the convex pieces of the ring around the barrel, with the polygonal surface of `bore_mesh`."""
+    """Return the vertices (20, 3) [m] of the convex pieces of the ring, with the polygonal surface of `bore_mesh`."""
     d = dimensions
     profile = [
         [d.bore_radius + d.mouth_chamfer, 0.0],
@@ -161,7 +168,10 @@ def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
 
 
 def slot_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """Return the convex pieces of the ring with both slots cut: prisms over, under and between the slots."""
+    """Return the vertices (V, 3) [m] of the convex pieces of the ring with both slots cut.
+
+    The pieces are prisms over, under and between the slots.
+    """
     outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_between_the_slots(dimensions)]
     return [_prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines]
 

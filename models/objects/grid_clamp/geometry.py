@@ -39,13 +39,13 @@ class GridClampDimensions:
 
     hole_radius: float = 4.15 * MM
     hole_chamfer: float = 0.5 * MM
-    hole_land: float = 3.0 * MM  # height of the wall; the hole is wider below
+    hole_land: float = 3.0 * MM  # depth to which the collision geometry of the wall reaches
     hole_depth: float = 13.0 * MM
     face_radius: float = 14.0 * MM  # radius of the face around a hole, for a misaligned peg
 
     lip_radius: float = 4.15 * MM
-    lip_depth: float = 0.6 * MM  # depth of the narrow part
-    lip_land: float = 0.4 * MM
+    lip_depth: float = 0.6 * MM  # depth of the upper end of the narrow part
+    lip_land: float = 0.4 * MM  # height of the narrow part
     lip_flank: float = 0.4 * MM  # size of the flanks, at 45 degrees
     bead_radius: float = 4.35 * MM
     bead_depth: float = 1.5 * MM  # depth of the bead's crest with the shoulder on the table
@@ -59,16 +59,16 @@ class GridClampDimensions:
 
     @property
     def clearance(self) -> float:
-        """Clearance between a peg and its hole on each side."""
+        """Clearance between a peg and its hole on each side [m]."""
         return round(self.hole_radius - self.peg_radius, 9)
 
     def with_clearance(self, clearance: float) -> "GridClampDimensions":
-        """Return the same clamp with holes of another clearance."""
+        """Return the dimensions with the holes' radius changed to another clearance [m]; the lip does not change."""
         return self if clearance == self.clearance else replace(self, hole_radius=self.peg_radius + clearance)
 
     @property
     def peg_positions(self) -> np.ndarray:
-        """Centers (5, 2) of the pegs in C and of the holes in G: the middle one, then the corners."""
+        """Centers (5, 2) [m] of the pegs in C and of the holes in G: the middle one, then the corners."""
         corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
         return np.concatenate([np.zeros((1, 2)), self.spacing * corners])
 

@@ -1,8 +1,9 @@
 """Nine synthetic demonstrations through the narrow passage.
 
 They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), which are not published. Like those,
-they are smooth, have the same start, goal and duration, vary where the plane is free and agree in the passage. They
-ignore the obstacle and the restricted zone: their mean crosses the obstacle, and two of them enter the zone.
+they are smooth, have the same duration, vary where the plane is free, and agree in the passage. Their starts and goals
+differ by about 1 cm (standard deviation). They ignore the obstacle and the restricted zone: their mean crosses the
+obstacle, and two of them enter the zone.
 """
 
 from pathlib import Path

@@ -13,8 +13,8 @@ from guiderail.models.primitives import LinearConstraints
 class PassageGeometry:
     """Positions and sizes in meters; the walls bound the position of the robot's center.
 
-    The obstacles are discs on the path of the demonstrations, which were recorded without them. They have a cost, and
-    the robot can pass through them.
+    The obstacles are discs on the path of the demonstrations, which ignore them. The robot can pass through an
+    obstacle, at a cost.
     """
 
     start: tuple[float, float] = (0.30, 0.05)  # start (x, y) of the robot
@@ -33,12 +33,12 @@ class PassageGeometry:
 
     @property
     def obstacles(self) -> np.ndarray:
-        """Positions (n, 2) of the discs."""
+        """Centers (n, 2) [m] of the obstacles."""
         return np.array([self.obstacle] if self.second_obstacle is None else [self.obstacle, self.second_obstacle])
 
     @property
     def walls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners (2, 2) of the walls, for the robot's center."""
+        """Lower corners (2, 2) and upper corners (2, 2) [m] of the two walls, for the robot's center."""
         (bottom, top), (left, right) = self.wall_y, self.gap_x
         lower = np.array([[left - self.wall_length, bottom], [right, bottom]])
         upper = np.array([[left, top], [right + self.wall_length, top]])
@@ -50,31 +50,42 @@ class PassageGeometry:
         return LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-self.zone_x]))
 
     def keep_out(self, margin: float = 0.02) -> KeepOut:
-        """Return the keep-out region of safe residual learning, `margin` [m] before walls and zone (section 4.4.1)."""
+        """Return the keep-out region of safe residual learning, `margin` [m] before walls and zone (section 4.4.1).
+
+        Raises:
+            InputError: If the margin is negative or not finite.
+        """
         lower, upper = self.walls
         return KeepOut(lower, upper, self.constraints, margin)
 
     def at_goal(self, pose: np.ndarray) -> bool:
-        """Return True within `goal_radius` of the goal."""
+        """Return True if the robot's center `pose` (2,) [m] is less than `goal_radius` from the goal."""
         return bool(np.hypot(pose[0] - self.goal[0], pose[1] - self.goal[1]) < self.goal_radius)
 
     def in_passage(self, pose: np.ndarray) -> bool:
-        """Return True in the gap and just before it, where the walls may block the robot."""
+        """Return True close to the walls along y, where they may block the robot, at any x.
+
+        The robot's center `pose` (2,) [m] is then less than 5 cm before the walls, between them, or less than 2 cm
+        behind them.
+        """
         return bool(self.wall_y[0] - 0.05 < pose[1] < self.wall_y[1] + 0.02)
 
     def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
         """Return the distance d_t [m] of the robot's center from an obstacle's edge, negative inside (equation 4.24).
 
-        `pose` (2,) [m] is the robot's center, and `obstacle` (2,) [m] that of the obstacle; default: the attribute.
+        `pose` (2,) [m] is the robot's center, and `obstacle` (2,) [m] that of the obstacle; default: `self.obstacle`.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius
 
     def obstacle_cost(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
-        """Return the cost r_o of one obstacle as a negative reward (equation 4.24)."""
+        """Return the cost r_o of one obstacle as a reward, zero or negative (equation 4.24).
+
+        The arguments are those of `obstacle_distance`.
+        """
         return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose, obstacle), 0.0)
 
 
 def action_cost(displacement: np.ndarray) -> float:
-    """Return the cost r_a of a displacement (2,) [m] in a control step, as a negative reward (equation 4.23)."""
+    """Return the cost r_a of a control step's displacement (2,) [m], as a reward, zero or negative (equation 4.23)."""
     return -10.0 * float(displacement @ displacement)

@@ -35,7 +35,7 @@ class Vessel:
     def __post_init__(self) -> None:
         for name in ("inner_diameter", "depth", "wall", "bottom", "mass"):
             if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"a vessel's {name} must be positive, not {getattr(self, name)}")
+                raise InputError(f"a vessel's {name} must be positive and finite, not {getattr(self, name)}")
 
     @property
     def outer_radius(self) -> float:
